@@ -2,7 +2,7 @@
 
 One process, the daemon, drives the robot with one asyncio event loop. It exchanges lines with a
 microcontroller on a serial port, and messages with clients on a Zenoh bus. It runs a control step
-every 10 ms. TLS connections from the network end in a second process, the gateway.
+every 10 ms. A second process, the gateway, terminates TLS connections from the network.
 
       one task, every 10 ms (earlier if a new command or feedback has arrived)
 
@@ -30,7 +30,7 @@ Where to look: each package may import only the packages below it in this list.
     client/          follows and drives a robot from Python, synchronously or with asyncio; its
                      follower and commander have the rules and time limits that all tools use
     daemon/          the daemon's process: control loop, latch file, shutdown
-    daemon/gateway/  `acsard gateway`: the process in which TLS connections end
+    daemon/gateway/  `acsard gateway`: the process that terminates TLS connections
     daemon/bus/      the Zenoh sessions: subscriptions, publications, replies, access rules
     daemon/serial/   the serial port
     recording/       the black box: writes the steps to MCAP files, deletes old files, reads the
@@ -55,7 +55,7 @@ Inside `core/`, in the same order:
                      and the remedy
     core/values.py   the values in SI units: Instant, Twist, Pose, Command, Inputs, Outputs
     core/formatting.py  safe text, figures, durations and counts for every message
-    core/thinning.py    curves and paths of any length in a bounded number of points
+    core/thinning.py    reduces long curves and paths to a bounded number of points
 
 Three invariants hold, and each is tested:
 

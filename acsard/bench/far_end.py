@@ -26,7 +26,7 @@ from acsard.host.timerfd import TimerFd
 
 
 class Part(msgspec.Struct, frozen=True):
-    """The parameters of the far end, which it reads from a file at its start."""
+    """The parameters of the far end. It reads them from a file when it starts."""
 
     config: dict[str, object]
     free_running: float = 0.0

@@ -20,7 +20,7 @@ POINTS = {
     "feedback_to_odometry": "last byte of a feedback line written -> its odometry here",
     "read_to_odometry": "feedback sampled by the microcontroller (its stamp) -> its odometry here",
 }
-"""Names of the times that the benchmark measures, with the two events that begin and end each.
+"""Names of the times that the benchmark measures, with the two events that begin and end each time.
 
 "Here" is the process of the benchmark.
 """
@@ -33,7 +33,7 @@ OWN = {
     "feedback_to_bus": "feedback line read -> its last message handed to the bus",
     "mcu_round_trip": "line -> end of its answer (on a checked link)",
 }
-"""Names of the times that the daemon measures, with the two events that begin and end each.
+"""Names of the times that the daemon measures, with the two events that begin and end each time.
 
 The names are those of `latencies.Name`.
 """
@@ -63,9 +63,9 @@ class Result(Struct, frozen=True, omit_defaults=False):
     realtime: bool
     """True if the daemon's control task had real-time scheduling."""
     outside: dict[str, Summary | None]
-    """Results by their names in `POINTS`. A time that was not measured is null or absent."""
+    """Summaries of the times in `POINTS`, by name. An unmeasured time is null or absent."""
     own: dict[str, Summary]
-    """Results by their names in `OWN`. The percentiles are accurate to 12 %."""
+    """Summaries of the times in `OWN`, by name. The percentiles are accurate to 12 %."""
     commands_sent: int
     commands_seen: int | None
     """Number of commands whose line arrived at the simulated board; null on a real port."""
@@ -74,8 +74,10 @@ class Result(Struct, frozen=True, omit_defaults=False):
     lines_told: int
     """Number of feedback lines whose odometry the benchmark received."""
     lines_waiting_max: int | None
-    """Largest number of feedback lines that the simulated board wrote between a line and the
-    arrival of its odometry here. Null on a real port."""
+    """Largest number of newer lines that the board had written when the odometry of a line arrived.
+
+    It is null on a real port.
+    """
     lines_sent: int
     """Number of lines that the daemon had written to the port when `missed_periods` was read."""
     missed_periods: int

@@ -226,7 +226,7 @@ class Rig:
             time.sleep(0.01)
 
     def _why(self) -> str:
-        """Return the reason of the daemon's mode for an error message; "" if it does not answer."""
+        """Return the daemon's reason for its mode, after ": "; "" if the daemon does not answer."""
         try:
             return f": {self.state().reason}"
         except NoAnswerError:

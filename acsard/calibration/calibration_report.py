@@ -35,7 +35,7 @@ class Refusal(Struct, frozen=True):
 
     log: str
     refused: str
-    """The reason, and what to do."""
+    """The reason why there is no calibration, and what to do."""
     notes: Sequence[str] = ()
     """Sentences about the log that may explain the reason."""
 

@@ -111,7 +111,7 @@ def of_rows(
         jacobian: derivatives of each prediction by the parameters, shape (measurements, COUNT).
         residual: measured minus predicted values.
         weight: weights of the measurements.
-        block: number of the block of each measurement.
+        block: index of the block of each measurement.
         blocks: number of blocks.
     """
     normal = np.zeros((blocks, COUNT, COUNT))
@@ -180,7 +180,7 @@ MANY = 16
 """Minimum number of blocks for a jackknife that also leaves out pairs of neighbouring blocks."""
 
 LEAST_BLOCKS = 5
-"""Minimum number of blocks, or of runs, for a jackknife that leaves out one of them in turn."""
+"""Minimum number of blocks (or runs) for a jackknife that leaves out each of them in turn."""
 
 
 def student_factor(free: Floats | float) -> Floats:
@@ -193,7 +193,7 @@ def student_factor(free: Floats | float) -> Floats:
 
 
 class Fit(Struct, frozen=True):
-    """The result of a fit: the parameters, and each block's normal equations at them."""
+    """The result of a fit: the parameters, and the normal equations of each block for them."""
 
     parameters: Floats
     normal: Floats
@@ -235,8 +235,8 @@ class Fit(Struct, frozen=True):
     def covariance(self, runs: Sequence[int] = ()) -> Floats:
         """Return the covariance of the parameters, from the jackknife and the prior information.
 
-        `runs` gives the number of the run of each block. If there are at least `LEAST_BLOCKS` runs,
-        the jackknife also leaves out whole runs. With () it does not.
+        `runs` contains the index of the run of each block. If there are at least `LEAST_BLOCKS`
+        runs, the jackknife also leaves out whole runs. With () it does not.
         """
         alone = np.arange(len(self.score))
         change, size = self._changes(alone)
@@ -257,7 +257,7 @@ class Fit(Struct, frozen=True):
     def _changes(self, group: npt.NDArray[np.int64]) -> tuple[Floats, Floats]:
         """Return how the parameters change if each group is left out in turn, and their variances.
 
-        `group` gives the number of the group of each block. The variances are those of a jackknife
+        `group` gives the index of the group of each block. The variances are those of a jackknife
         over the groups, widened to those of Student's t. The degrees of freedom are few if few
         groups cause most of a variance. They are estimated with the formula of Satterthwaite (An
         approximate distribution of estimates of variance components, 1946).

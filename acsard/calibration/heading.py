@@ -22,7 +22,7 @@ from acsard.calibration.log_table import Floats, LogError
 from acsard.calibration.runs import Block, Run, cumulative, gaps, inside, rests
 
 REST_S, EDGE_S = 0.6, 0.3
-"""Shortest rest that shows the bias of a gyro, and the margin cut off its ends, s.
+"""Shortest rest that shows the bias of a gyro, and the margin cut off both of its ends, s.
 
 In the margin, the robot may still shake.
 """
@@ -100,7 +100,7 @@ class Rows(Struct, frozen=True):
     """The motion of the robot in intervals of about a second."""
 
     block: npt.NDArray[np.int64]
-    """Number of the block (a few seconds of driving) to which each interval belongs."""
+    """Index of the block (a few seconds of driving) to which each interval belongs."""
     turned: Floats
     """Turn according to the heading sensor, rad; 0 without one."""
     left: Floats

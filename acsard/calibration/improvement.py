@@ -53,10 +53,10 @@ SURE = 2.0
 """Number of standard deviations by which a gain must exceed 0 to count as sure (95 %)."""
 
 HALVED = float(np.log(2.0))
-"""The value of `Improvement.gain` if the calibration halves one error. It always counts as sure.
+"""The value of `Improvement.gain` if the calibration halves one error.
 
-In a guided drive, one leg may show nearly all of the error. The standard deviation of the gain is
-then large although the gain is real.
+A larger gain counts as sure, even if its standard deviation is large. In a guided drive, one leg
+may show nearly all of the error. The standard deviation is then large although the gain is real.
 """
 
 NEAR, FAR = 2.0, 3.0
@@ -89,7 +89,7 @@ class Improvement(Struct, frozen=True):
     The path of each drive is first shifted and rotated so that it fits the positions best.
     """
     gain: float = np.inf
-    """Natural logarithm of the error before divided by the error after; inf if not computed.
+    """Natural logarithm of (error before / error after); inf if it was not computed.
 
     The errors are RMS errors over whole drives. If the log has headings and positions, the two
     logarithms are added.
@@ -142,7 +142,7 @@ def positions_of(drive: Block, driven: Sequence[Run]) -> list[Segment]:
 
 
 def folds(fit: Fit, parts: Sequence[Block], left_out: Sequence[Block], rate: Rates) -> list[Fold]:
-    """Return the fold of each drive in `left_out`, with the parameters of `fit` without this drive.
+    """Return a fold for each drive in `left_out`, with the parameters that fit all other drives.
 
     `parts` contains the blocks of the fit (a few seconds of driving each). A fold leaves out the
     blocks that overlap its drive. If no block or every block overlaps, the drive gets no fold.
@@ -228,7 +228,8 @@ def per_amount(sums: Floats, unit: float) -> BeforeAfter:
     """Return the errors before and after the calibration, in proportion to the driven amount.
 
     `sums` contains the sum of errors before, the same sum after, and the angle or distance driven.
-    Their ratios are multiplied by `unit`: 360 gives deg for each full turn.
+    Each sum is divided by this angle or distance, and multiplied by `unit`. For example, 360 gives
+    the error in deg for a full turn.
     """
     before, after, amount = sums.tolist()
     if not amount:
@@ -272,15 +273,15 @@ def _by_group(
 ) -> Floats:
     """Return the sum of the groups' absolute errors before, the same sum after, and `amount`.
 
-    `before` and `after` contain the error of each interval, and `group` the number of its group.
-    The error of a group is the sum over its intervals. Only those in the mask `among` are used.
+    `before` and `after` contain the error of each interval, and `group` the index of its group. The
+    error of a group is the sum over its intervals, but only over those in the mask `among`.
     """
     sums = (np.abs(np.bincount(group[among], errors[among])).sum() for errors in (before, after))
     return np.array([*sums, amount])
 
 
 def _of_headings(held: Sequence[Fold], before: Floats, after: Floats, rows: Rows) -> Floats:
-    """Return the sums of squared heading errors before and after, deg2, and their number.
+    """Return the sums of squared heading errors before and after, deg2, and the number of samples.
 
     The result has a row for each fold. `before` and `after` contain the error of the turn in each
     interval of `rows`, rad.
@@ -299,7 +300,7 @@ def _of_positions(
     held: Sequence[Fold], configured: Floats, base: Base,
     places: Sequence[Sequence[Segment]], steps: Sequence[WheelSteps],
 ) -> Floats:  # fmt: skip
-    """Return the sums of squared position errors before and after, m2, and their number.
+    """Return the sums of squared position errors before and after, m2, and the number of samples.
 
     The result has a row for each fold.
     """

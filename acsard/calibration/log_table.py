@@ -85,7 +85,7 @@ SPIKE, FEW_VALUES, SLOW = 10.0, 0.02, 0.02
 
 A spike is more than `SPIKE` times as large as the sample before it, as the sample after it, and as
 the usual rate. The usual rate is the quantile 1 - `FEW_VALUES` of all rates above `SLOW` rad/s. A
-true motion can exceed it as much, but never for a single sample.
+true motion can exceed the usual rate as far, but never for a single sample.
 """
 
 
@@ -191,9 +191,9 @@ class Table(Struct, frozen=True):
     columns: dict[str, Floats]
     """Columns by name, in SI units, with NaN for an empty cell."""
     runs: npt.NDArray[np.int64]
-    """Number of the run of each row."""
+    """For each row, the index of its run in `names`."""
     names: tuple[str, ...]
-    """Names of the runs, by number."""
+    """Names of the runs."""
     notes: tuple[str, ...]
     """Sentences about data that was left out."""
 

@@ -69,7 +69,7 @@ class Multipliers(Struct, frozen=True):
     def apart(self, base: Base) -> float:
         """Return how far these multipliers are from those of `base`, in standard deviations.
 
-        A combination of multipliers that no sensor measures stays as configured: it adds nothing.
+        Combinations of multipliers that no sensor measures stay as configured, so they add nothing.
         """
         off = self.values - (base.track, base.left, base.right)
         return math.sqrt(off @ np.linalg.solve(self.covariance + SAME**2 * np.eye(3), off))
@@ -126,7 +126,7 @@ LEAST_M = 0.5
 """Shortest distance between start and end of a run, m, that a tape may measure."""
 
 STRAIGHT = 0.8
-"""Smallest distance / path length (`Extent.straight`) of a run that may be measured by tape."""
+"""Smallest `Extent.straight` (distance / path length) of a run that may be measured by tape."""
 
 
 class Tape(Struct, frozen=True):
@@ -154,7 +154,7 @@ class Extent(Struct, frozen=True):
 Follow = Callable[[Floats, int], Extent]
 """Function that computes the extent of a run's path.
 
-Its arguments are the multipliers, as in `Multipliers.values`, and the number of the run.
+Its arguments are the multipliers, as in `Multipliers.values`, and the index of the run.
 """
 
 

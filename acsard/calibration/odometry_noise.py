@@ -1,8 +1,9 @@
 """Fits the noise settings of `[odometry]` to drives that the fit of the geometry did not use.
 
 A window is about half a minute of a drive. Its residuals are the headings or the positions of a
-sensor minus those of the wheels, at times that lie seconds apart. An error that lasts for a whole
-turn, such as that of a track that changes with the turn rate, is therefore seen as a whole.
+sensor minus those of the wheels. Some errors last for a whole turn, for example if the track
+changes with the turn rate. The residuals are therefore seconds apart, so that each contains the
+whole of such an error.
 
 The residuals are modelled as normal with mean 0. Their covariance V is linear in the noise x, which
 contains one number x_i for each `Source`. C_i is the covariance that noise of x_i = 1 causes. K is
@@ -40,7 +41,7 @@ from acsard.core.config.settings import OdometryConfig
 
 
 class Source(IntEnum):
-    """Sources of noise, as indices of arrays: the robot's up to `TRACK`, then those of sensors."""
+    """Sources of noise, as indices of arrays: six of the robot (0 to 5), then those of sensors."""
 
     DISTANCE = 0
     """Variance of the distance per metre driven, m2/m."""
@@ -97,18 +98,19 @@ ROUNDING = 1e-12
 perfect sensor."""
 
 FLOOR = 0.25
-"""Minimum of the noise `DISTANCE`, `YAW` and `SKID`, as a multiple of its standard deviation.
+"""Minimum of the noise `DISTANCE`, `YAW` and `SKID`, as a fraction of its standard deviation.
 
 In a log of a minute, the geometry often explains all errors, and the fit finds a noise of 0. The
 covariance of the pose would then claim that some directions have no error at all.
 """
 
 CHANGES = 0.1
-"""Minimum of the noise `DISTANCE`, as a fraction of `SLIP` after conversion by `Windows.lasting`.
+"""Minimum of the noise `DISTANCE`, as a fraction of the noise `SLIP`.
 
-`YAW` has the same minimum with `RATIO`, and `SKID` with `TRACK`. A window does not show how long an
-error lasts beyond the window's end. Without this minimum, the pose covariance of one robot in eight
-had no width in some direction.
+`Windows.lasting` first converts `SLIP` to the unit of `DISTANCE`. In the same way, `RATIO` gives
+the minimum of `YAW`, and `TRACK` that of `SKID`. A window does not show how long an error lasts
+beyond the window's end. Without this minimum, the pose covariance of one robot in eight had no
+width in some direction.
 """
 
 TWICE = math.log(2.0) - 3 / 8
@@ -131,7 +133,7 @@ class Windows(Struct, frozen=True):
     """
 
     drive: npt.NDArray[np.int64]
-    """Number of the drive of each window."""
+    """Index of the drive of each window."""
     size: Floats
     """Number of residuals of each window, without the padding."""
     residual: Floats
@@ -139,11 +141,12 @@ class Windows(Struct, frozen=True):
     effects: Floats
     """Covariance of the residuals if the noise of a source is 1, shape (windows, COUNT, n, n)."""
     known: Floats
-    """Covariance of the residuals from the known uncertainties, shape (windows, n, n)."""
+    """Covariance of the residuals due to geometry and gyro bias, shape (windows, n, n)."""
     lasting: Floats
-    """Factors that convert noise of one source to another with the same effect in a mean window.
+    """Factors that convert the noise of one source to equivalent noise of another source.
 
-    They convert `SLIP` to `DISTANCE` (m), `RATIO` to `YAW` (1/m) and `TRACK` to `SKID` (rad).
+    Both have the same effect in a window of average motion. The factors convert `SLIP` to
+    `DISTANCE` (m), `RATIO` to `YAW` (1/m) and `TRACK` to `SKID` (rad).
     """
 
     def of(self, chosen: Mask | npt.NDArray[np.int64]) -> Windows:

@@ -35,7 +35,7 @@ The number must exceed the three unknowns of the alignment: a shift along two ax
 """
 
 FINE_S = 0.02
-"""Time step in which the path is summed, s. Finer steps cost time and add no accuracy."""
+"""Time step for integrating the path, s. Finer steps cost time and add no accuracy."""
 
 JUMP, JUMP_M = 6.0, 0.05
 """Limit above which the step from one position to the next is a jump of the source.
@@ -57,9 +57,9 @@ class Segment(Struct, frozen=True):
     """The positions of a block between two jumps of their source."""
 
     block: int
-    """Number of the block."""
+    """Index of the block."""
     run: int
-    """Number of the run."""
+    """Index of the run."""
     t: Floats
     """Times of the positions, s."""
     place: Complexes
@@ -67,7 +67,7 @@ class Segment(Struct, frozen=True):
 
 
 class WheelSteps(Struct, frozen=True):
-    """The motion of the wheels of a run, divided into the steps from which its path is summed."""
+    """The motion of the wheels of a run, divided into the steps from which its path is computed."""
 
     t: Floats
     """Times at which the steps begin and end, s: one more than there are steps."""
@@ -189,7 +189,7 @@ def path(steps: WheelSteps, base: Base, parameters: Floats) -> Path:
 
 
 def place(steps: WheelSteps, base: Base, parameters: Floats) -> Complexes:
-    """Return only the places of `path`, which is faster. The parameter TRACK_GROWTH must be 0."""
+    """Return only the places of `path`, in less time. The parameter TRACK_GROWTH must be 0."""
     left, right = parameters[P.LEFT] * steps.left, parameters[P.RIGHT] * steps.right
     _, ahead = _directions(base.gain * parameters[P.INVERSE_TRACK] * (right - left))
     return _sums(ahead * base.radius * (left + right) / 2)
@@ -210,14 +210,14 @@ def _sums(steps: Complexes) -> Complexes:
 
 
 Paths = Sequence[Path] | Mapping[int, Path]
-"""Paths of the wheels, by the number of their run."""
+"""Path of the wheels in each run, by the index of the run."""
 
 
 class Aligned(Struct, frozen=True):
     """The positions of a segment, compared with the path that was aligned with them."""
 
     block: int
-    """Number of the block."""
+    """Index of the block."""
     residual: Complexes
     """Position minus aligned path, m, times the root of the position's weight."""
     derivatives: Complexes
@@ -287,7 +287,7 @@ DELAYS = np.arange(-1.5, 1.55, 0.1)
 """Delays of the positions that the search tries, s."""
 
 MOST_SEGMENTS, REFINED_SEGMENTS = 60, 20
-"""Maximum number of segments with which starting points are tried, and with which they are refined.
+"""Maximum numbers of segments: for trying starting points, and for refining them.
 
 The segments with the largest extent are used.
 """
@@ -309,7 +309,7 @@ The lower end is that of a robot that skids much, the upper end that of a robot 
 """
 
 NEAR_HEADING = 0.8, 1.25
-"""Usual range of the robot's turn according to positions, divided by that of a heading sensor."""
+"""Usual range of the turn that positions show, divided by the turn that a heading sensor shows."""
 
 WRONG_WAY = 4.0
 """Factor by which a starting point counts as worse if it describes a robot with a wrong sign.
@@ -328,7 +328,7 @@ STRAYED = 1.3
 """Factor by which a refinement may change the robot's turn. Beyond it, the result is discarded."""
 
 COARSE_S = 0.1
-"""Time step in which paths are summed during the search, s."""
+"""Time step for integrating paths during the search, s."""
 
 
 class StartingPoint(Struct, frozen=True):
@@ -403,10 +403,7 @@ def _penalty(point: StartingPoint, sides: Floats | None) -> float:
 
 
 def _turn(parameters: Floats) -> float:
-    """Return the angle that the robot turns if only the right wheels turn by one radian.
-
-    The angle is in radians, divided by `Base.gain`.
-    """
+    """Return the robot's turn if only the right wheels roll by 1 rad, in units of `Base.gain`."""
     return float(parameters[P.INVERSE_TRACK] * parameters[P.RIGHT])
 
 

@@ -117,7 +117,7 @@ def _other_bag(what: str) -> str:
 def _is_ours(log: Path) -> bool:
     """Return whether acsard recorded this MCAP file, according to its header.
 
-    Return True also if the header is damaged.
+    A file with a damaged header also counts, because the reader of recordings reports the damage.
     """
     with log.open("rb") as stream:
         try:

@@ -49,26 +49,26 @@ LEAST_MESSAGES = 20
 """Minimum number of messages in a topic that is used. Messages without a value do not count."""
 
 CLOCKS_APART_S = 1.0
-"""If the delays of topics differ by more than this, s, their stamps come from different clocks.
+"""Largest difference between the delays of two topics whose stamps are of the same clock, s.
 
 The delay of a topic is the median time from the stamp of a message to its recording.
 """
 
 STEP_S = 1.0
-"""Length of the intervals over which the turns of a sensor and of the wheels are compared, s."""
+"""Length of the intervals in which turns measured by a sensor and the wheels are compared, s."""
 
 UPRIGHT, LYING = 0.5, 0.8
-"""Limits for the correlation between the turns about an IMU axis and the turns of the wheels.
+"""Limits for the correlation of the turns about an IMU axis with those measured by the wheels.
 
 If the correlation is below `UPRIGHT` for the chosen axis and above `LYING` for another axis, the
 other axis points up or down, and the log is refused.
 """
 
 OWN = 3e-3
-"""Smallest credible difference between the turns of an `Odometry` and those of the wheels.
+"""Smallest credible difference between the turns of an `Odometry` and those measured by the wheels.
 
-It is RMS, as a fraction of the RMS turn. If the difference is not larger, the `Odometry` was
-computed from the wheels.
+The number is the RMS difference divided by the RMS turn. If the difference is not larger, the
+`Odometry` was computed from the wheels.
 """
 
 DELAYS_S = np.arange(-0.1, 0.101, 0.01)
@@ -196,7 +196,7 @@ _SHORT = {
     "fl": ("fl", "lf"), "fr": ("fr", "rf"), "rl": ("rl", "lr", "bl", "lb"),
     "rr": ("rr", "br", "rb"), "left": ("l",), "right": ("r",),
 }  # fmt: skip
-"""Abbreviations of a wheel or a side in joint names, by the name of its column in a log."""
+"""Maps the log column of a wheel or a side to its abbreviations in joint names."""
 
 _COLUMN = {word: column for column, words in _SHORT.items() for word in words}
 
@@ -220,8 +220,8 @@ def wheel_of(joint: str) -> str:
 def wheel_joints(names: tuple[str, ...], joints: tuple[str, ...]) -> dict[str, list[int]]:
     """Return the indices of the wheel joints in `names`, by their columns in a log.
 
-    The columns are those of `FOUR`, or "left" and "right". The result is empty unless both sides
-    have a wheel joint.
+    The columns are "fr", "fl", "rl" and "rr", or "left" and "right". The result is empty unless
+    both sides have a wheel joint.
 
     Args:
         names: the names of the joints in a message.
@@ -473,9 +473,9 @@ def _too_few(topic: _Topic) -> str:
 def speeds_of(t: Floats, angles: Floats) -> tuple[Floats, Floats]:
     """Compute wheel speeds from recorded angles. Return their times, s, and the speeds, rad/s.
 
-    Each speed is the mean over one sample period. The speeds therefore add up to exactly the angle
-    that the wheel turned, even if the sample times are uneven. No speed is computed across a gap in
-    the samples, or across a jump of an angle (a driver that restarts begins at 0).
+    Each speed is the mean over one sample period. The integral of the speeds is therefore exactly
+    the angle that the wheel turned, even if the sample times are uneven. No speed is computed
+    across a gap in the samples, or across a jump of an angle (a driver that restarts begins at 0).
 
     Args:
         t: the times of the angles, s.
@@ -538,7 +538,7 @@ def _edges(t: Floats, sides: tuple[Floats, Floats, Floats]) -> Floats:
 
 
 def _follows(t: Floats, rates: Floats, sides: tuple[Floats, Floats, Floats]) -> float:
-    """Return the correlation between a sensor's turns and those of the wheels; NaN if unknown.
+    """Return the correlation of turns measured by a sensor and by the wheels; NaN if unknown.
 
     `rates` contains the sensor's turn rates, rad/s, at the times `t`, s. `sides` is the result of
     `_sides`.
@@ -556,7 +556,7 @@ def _follows(t: Floats, rates: Floats, sides: tuple[Floats, Floats, Floats]) -> 
 
 
 def _computed_from(t: Floats, yaw: Floats, sides: tuple[Floats, Floats, Floats]) -> bool:
-    """Return whether the yaw was computed from the wheels, because it turns exactly with them.
+    """Return whether the yaw follows the wheels so exactly that it was computed from them.
 
     `yaw` contains the yaw, rad, at the times `t`, s. `sides` is the result of `_sides`.
     """

@@ -42,7 +42,7 @@ PAUSE_S = 60.0
 """Time without a wheel sample after which a new run begins, s."""
 
 ROUNDED_S, REPEATED = 0.2, 4.0
-"""Limits that show that the column t was rounded, if both of them are exceeded.
+"""If both of these limits are exceeded, the times in the column `t` were rounded.
 
 `ROUNDED_S` is for the median interval between different times, s. `REPEATED` is for the mean number
 of rows that share a time.
@@ -65,7 +65,7 @@ Streams = dict[str, tuple[Floats, ...]]
 """The times and the values of each sensor, by the sensor's name in `STREAMS`."""
 
 MOST_RUNS = 1000
-"""Largest number of different names in the column run. If there are more, they do not name runs."""
+"""Largest number of different values in the column `run`. If there are more, none names a run."""
 
 TOGETHER = 50
 """Number of rows whose speeds are summed before the two wheels of a side are compared."""
@@ -162,7 +162,7 @@ class Run(Struct, frozen=True, dict=True):
         return np.interp(t, self.t, left), np.interp(t, self.t, right)
 
     def speed_difference(self, t: Floats) -> Floats:
-        """Return the mean speed over `SMOOTH_S` of the right wheels minus the left, rad/s."""
+        """Return the right minus the left wheel speed, averaged over `SMOOTH_S`, rad/s."""
         begin, end = (np.clip(t + s / 2, self.t[0], self.t[-1]) for s in (-SMOOTH_S, SMOOTH_S))
         (left, right), (far_left, far_right) = self.angles(begin), self.angles(end)
         turned = far_right - right - (far_left - left)
@@ -172,7 +172,7 @@ class Run(Struct, frozen=True, dict=True):
 class Notes:
     """Sentences about a log. A sentence that applies to several runs is listed once.
 
-    If a sentence contains "{}", a count replaces it. The count is the sum over all runs.
+    A "{}" in a sentence stands for a count, which is the sum over all runs.
     """
 
     def __init__(self, sentences: Iterable[str]) -> None:
@@ -309,9 +309,9 @@ def _wheel_times(t: Floats, rows: Rows, columns: dict[str, Floats]) -> Floats:
 
 
 def _in_seconds(name: str, t: Floats, parts: list[Rows], columns: dict[str, Floats]) -> None:
-    """Raise `LogError` if the times of a run are not in seconds or are too coarse.
+    """Raise `LogError` if the times `t` are not in seconds or are too coarse.
 
-    `parts` contains the rows of each drive of the run `name`.
+    `name` is a name in the column `run`. `parts` contains the rows of each drive with this name.
     """
     for rows in parts:
         times = _wheel_times(t, rows, columns)
@@ -473,8 +473,8 @@ def cumulative(steps: Floats) -> Floats:
 def rests(run: Run, least_s: float, edge_s: float) -> Floats:
     """Return the intervals in which all wheels stand still, one row (begin, end) each, in s.
 
-    Each interval is shortened by `edge_s` at both ends. It is left out if it is then shorter than
-    `least_s`. Both are in s.
+    Each interval is shortened by `edge_s` s at each end. It is left out if it is then shorter than
+    `least_s` s.
     """
     moving = np.concatenate(([True], run.moving, [True])).astype(np.int8)
     changes = np.flatnonzero(np.diff(moving))
@@ -507,10 +507,10 @@ def blocks(driven: Sequence[Run], shortest_s: float) -> list[Block]:
 
 
 def _turned(run: Run, begin: float, end: float, left: Floats, right: Floats) -> bool:
-    """Return whether the wheels of a side rolled by at least `LEAST_TURN` from `begin` to `end`, s.
+    """Return whether the wheels of at least one side rolled by `LEAST_TURN` from `begin` to `end`.
 
-    Rolling back adds to the angle, as rolling ahead does. `left` and `right` contain the angles of
-    each side at `begin` and at `end`, rad.
+    These times are in s. Rolling back adds to the angle, as rolling ahead does. `left` and `right`
+    contain the angles of each side at `begin` and at `end`, rad.
     """
     if max(abs(left[1] - left[0]), abs(right[1] - right[0])) >= LEAST_TURN:
         return True

@@ -56,7 +56,7 @@ only the shortest length is tried. If it has no heading sensor, the shortest len
 """
 
 ENOUGH_BLOCKS = 8
-"""Minimum number of blocks, unless no shorter block length has given a fit.
+"""Minimum number of blocks for a block length, if a shorter length has already given a fit.
 
 With six blocks, the standard deviation of the ratio of left to right radius was up to three times
 too small.
@@ -76,9 +76,9 @@ class Drives(Struct, frozen=True):
     seconds: float
     metres: float
     turns: float
-    """Sum of all left and right turns, in turns of 360 deg, by the calibrated wheels."""
+    """Sum of all left and right turns, measured by the calibrated wheels, in turns of 360 deg."""
     fastest: float
-    """Turn rate below which the robot turned 95 % of its angle, rad/s."""
+    """Turn rate, rad/s. The robot turned 95 % of its total angle more slowly than this."""
 
     @classmethod
     def of(
@@ -87,8 +87,8 @@ class Drives(Struct, frozen=True):
     ) -> Drives:  # fmt: skip
         """Return the totals of these runs.
 
-        `by_wheels` is the turn of the calibrated wheels in each interval of `rows`, rad. `found`
-        contains the new multipliers, and `rate` the turn rates of the log.
+        `by_wheels` contains the robot's turn in each interval of `rows` according to the calibrated
+        wheels, rad. `found` contains the new multipliers, and `rate` the turn rates of the log.
         """
         size = base.radius * float(found.values[[LEFT_RADIUS, RIGHT_RADIUS]].mean())
         return cls(
@@ -106,10 +106,10 @@ class Calibration(Struct, frozen=True):
     drives: Drives
     configured: Multipliers
     multipliers: Multipliers
-    """The new multipliers."""
+    """New multipliers of the wheel separation and of the two wheel radii."""
     scale: str
-    """What measured the wheels' size: "positions", "distance" (by tape), "positions and distance",
-    or "" for nothing."""
+    """Source of the wheels' size: "positions", "distance" (by tape), "positions and distance", or
+    "" if nothing measured it."""
     growth: float
     """Fraction by which the effective track grows with each rad/s of turn rate."""
     growth_std: float
@@ -253,7 +253,7 @@ def _check_units(headings: Headings | None, start: Floats, base: Base, sized: bo
 
 
 class Candidate(Struct, frozen=True):
-    """A fit to blocks of one length, and how much it improves the odometry of other drives."""
+    """A fit to blocks of one length, and how much it improves the odometry (cross-validated)."""
 
     made: Prepared
     fitted: Fit
@@ -520,7 +520,7 @@ def _own(what: str) -> str:
 
 
 def _follow(made: Prepared, fitted: Fit, rate: Rates) -> Follow:
-    """Return a function that computes the extent of a path from multipliers and a run's number.
+    """Return the function that computes the extent of a run's path for given multipliers.
 
     As in the fit, the track changes with the turn rate.
     """

@@ -80,7 +80,7 @@ class WheelResponse(Struct, frozen=True):
         return {"response_time": self.proposed}
 
     def sentences(self) -> list[str]:
-        """Return a sentence about the response time and, if `fastest` is finite, one about it."""
+        """Return a sentence about the response time, and one about `fastest` if that is finite."""
         follow = f"the wheels follow their commands with a response time of {self.seconds:.2g} s"
         if self.false_fault:
             then = f", and feedback.response_time = {self.present:g} would take them for faulty: "

@@ -106,7 +106,8 @@ class Board:
         self.latched = False
         """Whether zeros stop motor d only with the line ending that `comma` selects."""
         self.sealed = self.sampled = False
-        """`sealed`: lines have a checksum. `sampled`: they ask for the board's clock and counts."""
+        """`sealed`: lines have a checksum. `sampled`: lines request the board's clock and counts.
+        """
         self.identity: dict[str, str] = {}
         self.own_clock = False
         """Whether the board sends reports by its own clock, and not in reply to lines."""
@@ -130,7 +131,7 @@ class Board:
         self.sent_lines = 0
         self.sent_s = 0.0
         self.lateness = Lateness()
-        """The delays of this computer. A simulated board on it contributes its own delays."""
+        """The delays of this computer, including those of a simulated board that runs on it."""
         self.fled = False
         """Whether a motor runs away, or keeps turning although zeros are sent.
 

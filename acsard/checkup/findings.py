@@ -20,8 +20,9 @@ REST = "the rest"
 class Finding(Struct, frozen=True):
     """The result for one subject. Its texts come from `outcomes.py`.
 
-    `figure` is the measurement, `text` its meaning, `mend` the remedy unless the subject passed,
-    and `keys` the configuration values by dotted key, whether they are configured already or not.
+    `figure` is the measurement, and `text` its meaning. `mend` is the remedy unless the subject
+    passed. `keys` contains the suggested configuration values by dotted key, including values that
+    are configured already.
     """
 
     name: str

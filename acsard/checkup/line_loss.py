@@ -149,7 +149,7 @@ A pulse is a single line that turns the motors for a moment.
 """
 
 SPREAD, STRIDE = 12, 5
-"""Each pause after a pulse is longer than the last by `STRIDE` line periods, modulo `SPREAD`.
+"""The pause after pulse n is (n * `STRIDE`) % `SPREAD` line periods longer than the shortest.
 
 With equal pauses, losses at regular intervals could miss every pulse.
 """

@@ -69,8 +69,8 @@ Without the limit for all steps, a check could take four minutes.
 AGAIN, MOST = 1, 5
 """Limits for restarts of the board.
 
-The board may restart `AGAIN` times in each step, which is then repeated. One more restart in the
-same step ends the check, and so do `MOST` restarts in all steps together.
+A step is repeated after a restart, but at most `AGAIN` times. One more restart in the same step
+ends the check, and so do `MOST` restarts in all steps together.
 """
 
 
@@ -84,7 +84,10 @@ def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
     unjudged: set[str] = set()
 
     def once(finding: Finding | None) -> None:
-        """Report the first finding of each name, and the first judged one if the first was not."""
+        """Report the first finding of each name.
+
+        If that finding was not judged, also report the first judged one.
+        """
         if finding is None:
             return
         judged = lateness.judged(finding)

@@ -28,13 +28,13 @@ An identification that arrives later was sent by the board without a request.
 """
 
 UNANSWERED = 5
-"""Number of successive lines without a reply after which a printed text shows a restart.
+"""A text from the board shows a restart only after this many successive lines without a reply.
 
 With fewer such lines, the text may be a debug print of the firmware.
 """
 
 AHEAD_S = 2.0
-"""The board restarted if its clock gains more than this on this computer's between replies, s.
+"""Largest credible gain of the board's clock on the clock of this computer between replies, s.
 
 A line that is delayed on its way causes a smaller gain. A restart causes a larger one, because the
 clock's jump back to 0 looks like a large advance modulo `CLOCK`.
@@ -63,7 +63,7 @@ class Restart(Struct, frozen=True):
     turned: Motors = ZERO
     """Speeds that were commanded just before the restart, rad/s; zeros if the motors stood."""
     silent_s: float = 0.0
-    """Longest pause between lines to the board, from its last reply to its restart, s."""
+    """Longest time without a line to the board between its last reply and its restart, s."""
     cause: str = ""
     """Cause of the restart as the board names it, or "" if it names none."""
 
@@ -182,7 +182,7 @@ def _outcome(restarts: Sequence[Restart]) -> str:
 
 
 def _silent(restarts: Sequence[Restart]) -> bool:
-    """Return whether there are several restarts, and no line came for `SILENT_S` before each."""
+    """Return whether there are several restarts, each after `SILENT_S` without a sent line."""
     return len(restarts) > 1 and all(one.silent_s >= SILENT_S for one in restarts)
 
 

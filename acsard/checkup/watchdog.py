@@ -48,7 +48,7 @@ class Run(Struct, frozen=True):
 
     silent_s: float
     ran_s: float
-    """Distance until standstill of the motor that ran on farthest, as a time at full speed, s."""
+    """Largest distance that a motor ran on until it stood, as a time at full speed, s."""
     slow_s: float
     """Time from the beginning of the stop until all motors were slower than `STOPPED`, s."""
     first: float
@@ -156,10 +156,10 @@ def _asked(board: Board, motors: Sequence[int], stop: Run, between: Between) -> 
 
 
 def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[bytes] = ()) -> Run:
-    """Bring the motors to speed, send nothing for `length_s` s, and stop them with zeros.
+    """Bring the motors to speed, send no valid line for `length_s` s, and stop them with zeros.
 
-    A length of 0 is an ordinary stop. The lines in `instead` are sent during the silence. Raises
-    `StoppedError` if no motor reaches half of the commanded speed.
+    A length of 0 is an ordinary stop. The damaged lines in `instead` are sent before the zeros.
+    Raises `StoppedError` if no motor reaches half of the commanded speed.
     """
     began_s = board.now_s
     full = run_up(board, command(motors))

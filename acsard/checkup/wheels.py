@@ -304,7 +304,7 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
     began_s = board.now_s
 
     def shown() -> Motors:
-        """Return each encoder's mean speed in the probe, rad/s, minus what coasting explains."""
+        """Return each encoder's mean speed in the probe without the part due to coasting, rad/s."""
         seconds = board.now_s - began_s
         ran = motion.covered(board.replies, began_s)
         sure = [max(0.0, abs(ran[m]) - abs(coasting[m]) * seconds) for m in range(4)]

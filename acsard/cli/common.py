@@ -138,9 +138,9 @@ def load(path: str | None, options: Mapping[str, object] | None = None) -> tuple
 def recorded(config: Config) -> Config:
     """Return `config` with an absolute path of the recording directory.
 
-    If `config` names no directory, it comes from the environment variable ACSARD_RECORD, which the
-    systemd units set. The path is absolute because a client that reads it on the bus may run in
-    another directory. It stays "" if no directory is named.
+    If `config` names no directory, the path comes from the environment variable ACSARD_RECORD,
+    which the systemd units set. If neither names one, the path stays "". It is absolute because a
+    client that reads it on the bus may run in another directory.
     """
     told = config.record.directory or os.environ.get(RECORD, "")
     directory = os.path.abspath(told) if told else ""

@@ -99,8 +99,8 @@ class Quota:
     def __init__(self, most: int | None, robots: Collection[str]) -> None:
         """Allow `most` messages of each robot, or any number if `most` is None.
 
-        The limit is used up when each robot in `robots` has reached it. If `robots` is empty, this
-        applies to the robots of which a message has been printed.
+        The limit is used up when each robot in `robots` has reached it. If `robots` is empty, only
+        the robots whose messages have been printed must reach it.
         """
         self._most, self._robots, self._counts = most, robots, dict[str, int]()
 

@@ -3,7 +3,7 @@
 This module is pure. Every program that commands the robot uses the time limits defined here. A
 program that forwards the commands of a person (`Wish`) uses a `Commander`. A `Commander` repeats no
 command, so the robot stops when the person, the panel or the network falls silent. A new command
-replaces one that has not been sent yet. A zero is sent however old it is, and ends every drive.
+replaces one that has not been sent yet. A zero is sent however old it is. A drive ends with a zero.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ SILENCE_NS = 3 * NS_PER_S // 10
 timeout of a source, 0.25 s."""
 
 GATHER_NS = NS_PER_S // 25
-"""Time for which the first command after a silence waits, ns, to see whether a burst follows.
+"""Time for which the first command after a silence is held, ns, to see whether a burst follows.
 
 A panel that sends at 20 Hz sends at most one command in this time. After a burst of more than
 `CROWD` commands, the next command waits again.

@@ -55,7 +55,10 @@ class _Known:
         self.begin()
 
     def begin(self) -> None:
-        """Begin to follow the robot, or begin again because it has reappeared. A query is due."""
+        """Begin to follow the robot, or begin again because it has reappeared.
+
+        Its queries are then due at once.
+        """
         self.since = self.info_due = time.monotonic()
         self.follower = Follower(self.since, FLEET_ASK_S)
         self.follower.due = self.since

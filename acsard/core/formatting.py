@@ -79,7 +79,7 @@ _UNITS = (("d", 86_400), ("h", 3_600), ("min", 60), ("s", 1))
 
 
 def lasting(seconds: float) -> str:
-    """Format a duration in its two largest units, like "2 h 5 min", or below 1 min like "7.3 s"."""
+    """Format a duration in its two largest units ("2 h 5 min"), or below 1 min in s ("7.3 s")."""
     if seconds < 59.95:
         return f"{round(seconds, 1):g} s"
     parts: list[tuple[int, str]] = []
@@ -95,14 +95,14 @@ _ROUGH = (
     ("µs", 1e-6, 999.5e-6), ("ms", 1e-3, 0.9995), ("s", 1.0, 99.5), ("min", 60.0, 99.5 * 60),
     ("h", 3600.0, 99.5 * 3600), ("d", 86400.0, math.inf),
 )  # fmt: skip
-"""Rows of a unit, its size in s, and the duration in s from which the next row applies."""
+"""Each row holds a unit, its size in s, and the duration in s from which the next row applies."""
 
 
 def rough(seconds: float | None, finest: float = 1.0) -> str:
     """Format a duration or an age with two digits or more, in at most 7 characters.
 
-    None and infinity become "never". A negative value or one from 1e9 s on becomes "?". `finest` is
-    the size of the smallest unit to use, s.
+    None and infinity become "never". NaN, negative values and values of 1e9 s or more become "?".
+    `finest` is the size of the smallest unit to use, s.
     """
     if seconds is None or seconds == math.inf:
         return "never"

@@ -16,8 +16,8 @@ latches a fault.
 The guard also checks that the robot comes to rest in time. A ramp from full speed to rest takes a
 known time with the configured decelerations. When this time and `MARGIN_NS` have passed since the
 last fresh command, only zero speeds pass. After a stop, a fault or a shutdown the time is that of a
-ramp at the stop decelerations. The guard remembers the moments from which it counts, so a recording
-stores the guard's `Memory` beside the state of the robot.
+ramp at the stop decelerations. The guard remembers when these times began, so a recording stores
+the guard's `Memory` beside the state of the robot.
 """
 
 from __future__ import annotations
@@ -51,7 +51,8 @@ class Memory(Struct, frozen=True):
     last: bytes = b""
     """The last line that was written to the serial port; empty before the first one."""
     commanded_ns: int | None = None
-    """Monotonic time of the last step with a fresh command in mode `driving`, ns; None before."""
+    """Monotonic time of the last step with a fresh command in mode `driving`, ns. None before the
+    first such step."""
     halted_ns: int | None = None
     """Monotonic time at which the mode became one of `HALTED`, ns. None in any other mode."""
     ramp_ns: int = 0
@@ -118,7 +119,7 @@ class Guard:
         return (self._stop, trip) if trip else (line, "")
 
     def _note_limits(self) -> None:
-        """Update the longest ramp times. A moving robot may still brake by slower, older limits."""
+        """Update the longest ramp times. A moving robot may still brake by its previous limits."""
         if _wheels(self._last) == _ZERO:
             self._longest = self._ramps
         else:

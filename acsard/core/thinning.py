@@ -171,7 +171,7 @@ class Place(NamedTuple):
 
 
 class Track:
-    """A thinned path. Each place of the path is less than 2 `stride` m from a kept place."""
+    """A thinned path. Each place of the path is less than twice `stride` away from a kept place."""
 
     def __init__(
         self,

@@ -336,7 +336,7 @@ class GyroSample(Struct, frozen=True, omit_defaults=True):
     """A turn rate about base_link's z axis, measured by a gyro.
 
     `rate` is in rad/s and positive to the left. `variance` is in rad2/s2, or 0 if the gyro does not
-    report it. `anew` is true for the first sample of a gyro other than the previous one.
+    report it. `anew` is true for the first sample after a change from one gyro to another.
     """
 
     at_ns: int
@@ -421,7 +421,7 @@ class Latch(Struct, frozen=True):
     by: str
     """Name of the client that requested the latch; "" if no client did, as for a fault."""
     why: str
-    """Reason in words, such as "stopped by NAME", "switched off by NAME" or that of a fault."""
+    """Reason in words, such as "stopped by NAME" or the cause of a fault."""
     kept: bool = False
     """True if the latch was set before the daemon's last start."""
 
@@ -476,7 +476,8 @@ class Inputs(Struct, frozen=True):
     refusals: tuple[Refusal, ...] = ()
     """The messages from the bus that were refused before they became a `Command`."""
     guard_trip: str = ""
-    """Why the guard replaced the previous line with STOP, else "". The step latches a fault."""
+    """Why the guard replaced the previous line with STOP; "" if it did not. If it did, this step
+    latches a fault."""
     superseded: bool = False
     """Whether the line of the previous step was not written to the port, and so had no effect."""
     missed: int = 0
@@ -590,9 +591,10 @@ class Snapshot(Struct, frozen=True):
     check: str = "plain"
     """The checksum that the serial lines carry, in words; "plain" without one."""
     encoders: tuple[int, ...] = ()
-    """Encoder counts per wheel turn, in `WHEELS` order.
+    """Configured encoder counts per wheel turn, in `WHEELS` order.
 
-    0 means that the number is unknown, or that the board's speeds are not whole counts per time.
+    0 means that no number is configured, or that the board does not compute its speeds as a whole
+    number of counts divided by a time.
     """
     sender: str = ""
     """The sender whose command the robot follows, "" without one."""

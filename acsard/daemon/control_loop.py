@@ -194,8 +194,8 @@ class ControlLoop:
     def step(self, now: Instant, period: Period = NO_PERIOD) -> Outputs:
         """Run one control step at the time `now`.
 
-        `period` says how many periods have ended since the last step, and when the first was due.
-        It is `NO_PERIOD` for a step between two periods.
+        `period` says how many periods have ended since the last step, and when the first of them
+        was due. It is `NO_PERIOD` for a step between two periods.
         """
         self._got = NOTHING
         try:

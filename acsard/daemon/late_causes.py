@@ -25,14 +25,14 @@ SHARE = 0.5
 """Smallest share of a lateness that a cause must explain, unless the cause has its own constant."""
 
 SLEPT_SHARE = 0.3
-"""Smallest share of a lateness for which the loop's thread must have slept before a disk counts as
-the cause. It is low, because a thread that read pages from a fast virtual disk used the processor
-for as long as it slept."""
+"""A disk counts as the cause only if the loop's thread slept for at least this share of the
+lateness. The share is low, because a thread that read pages from a fast virtual disk used the
+processor for as long as it slept."""
 
 DISK_SHARE = 0.25
-"""Smallest share of a lateness for which programs must have waited for a disk before a disk counts
-as the cause. It is low, because the kernel counted only 0.28 to 0.45 of the time as waiting while a
-thread wrote to a disk all the time."""
+"""Smallest share of a lateness at which the waiting of all programs for a disk counts. It is low,
+because the kernel counted only 0.28 to 0.45 of the time as waiting while a thread wrote to a disk
+all the time."""
 
 LEAST_STOLEN_NS = 3 * NS_PER_S // 100
 """Shortest steal time that counts as a cause, ns: three of the kernel's ticks. In a test on a
@@ -112,8 +112,8 @@ def low_voltage(now: Conditions) -> str:
 def heat(late: Lateness) -> str:
     """Return the clause for a processor that heat slows down, or "".
 
-    The signs are a higher `thermal_throttle` count of a processor and an active cooling device. On
-    a Raspberry Pi the bits 1 to 3 of get_throttled are signs too.
+    The signs are a `thermal_throttle` count that has risen, and an active cooling device. On a
+    Raspberry Pi the bits 1 to 3 of get_throttled are signs too.
     """
     hotter = late.after.conditions.throttled > late.before.conditions.throttled
     return hot(late.after.conditions, hotter) if late.computed else ""
@@ -275,8 +275,8 @@ def cause_in(text: str) -> str:
 
 
 STOLEN_SHARE = 0.02
-"""Largest share of the time that the host of a virtual machine may take from a processor before
-`present` reports it."""
+"""`present` reports steal time only above this share of the time. Steal time is the time for which
+the host of a virtual machine takes a processor away."""
 
 
 def present(before: Reading, after: Reading, within_ns: int) -> list[tuple[str, str]]:

@@ -37,8 +37,8 @@ EVERY_S = 0.25
 include more delays of normal load."""
 
 HISTORY = 12
-"""Number of readings that are kept, which cover 3 s. A lateness is compared with a reading from
-before it began, and the thread goes on reading during the lateness."""
+"""Number of readings that are kept, which cover 3 s. The thread goes on reading during a
+lateness, and afterwards still needs the last reading from before the lateness."""
 
 SETTLE_S = 0.03
 """Time from a late period to the reading after it, s. The kernel updates some counters only at its

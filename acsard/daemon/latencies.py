@@ -70,8 +70,8 @@ Name = Literal[
 ]
 """The latencies that the daemon measures.
 
-- period_lateness: from the time at which a period was due to the start of its step. If periods
-  were missed, from the time at which the first missed period was due.
+- period_lateness: from the due time of a period to the start of its step. If periods were missed,
+  from the due time of the first missed period.
 - step_time: from the start of a step to the end of its work.
 - command_age: from a command's arrival to the write of each line that carries it.
 - command_to_wire: from a command's arrival to the write of the first line that carries it. A
@@ -80,7 +80,7 @@ Name = Literal[
   moment at which its messages are queued for the bus. The time for which the line waited in the
   kernel before the read is not included.
 - mcu_round_trip: from the write of a line to the read of the end of its reply. It is measured only
-  if the lines are checked (`mcu.link_check`), because only then a reply names the line it answers.
+  if the lines are checked (`mcu.link_check`). Otherwise a reply does not name the line it answers.
 """
 
 NAMES: tuple[Name, ...] = get_args(Name)
@@ -91,8 +91,8 @@ SLOT_NS = 10 * NS_PER_S
 SLOTS = 6
 
 FRESH_NS = NS_PER_S
-"""Age up to which `Stopwatch.measured` returns cached values, ns. It computes them seldom, because
-adding up the slots of a minute takes longer than a control step."""
+"""Age up to which `Stopwatch.measured` returns cached values, ns. Values are cached, because adding
+up the slots of a minute takes longer than a control step."""
 
 
 class Figure:

@@ -1,7 +1,7 @@
 """Decides when a line may be written to the board: in every control period, and early if needed.
 
-An early line is written between two periods, for a new command or mode or after a press of the
-emergency stop or of a bumper. It replaces the line of the next period, so a flood of commands does
+An early line is written between two periods: for a new command or mode, or after a press of the
+emergency stop or a bumper. It replaces the line of the next period, so a flood of commands does
 not cause more lines. An early line must come at least the wire time of a line plus `BREATH_NS`
 after the previous line. Each period allows one attempt to write an early line.
 """
@@ -22,7 +22,7 @@ class Period(Struct, frozen=True):
 
 
 NO_PERIOD = Period(0, 0)
-"""The `Period` of a step that runs between the ends of two periods."""
+"""The `Period` of a step if no period has ended since the last step."""
 
 
 BREATH_NS = 1_000_000
@@ -30,15 +30,15 @@ BREATH_NS = 1_000_000
 ns."""
 
 IDLE_WAKES = 3
-"""Number of steps in a period that may have input from the bus but no new command or mode. After
-one more such step, input waits for the next period. This bounds the cost of a flood of messages
-from any client."""
+"""If more than this number of steps in a period had input from the bus but no new command or mode,
+further input waits for the next period. This bounds the cost of a flood of messages from any
+client."""
 
 
 class Pace:
     """Decides when a line may be written, from the results of the earlier steps of the period.
 
-    The serial port knows when it wrote the last line, so the methods get that time as `sent_ns`.
+    The argument `sent_ns` is the time of the last line, which only the serial port knows.
     """
 
     def __init__(self, line_ns: int, period_ns: int) -> None:

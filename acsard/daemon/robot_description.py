@@ -16,8 +16,9 @@ from acsard.daemon.bus.zenoh_sessions import MESSAGE_BYTES
 from acsard.host.errors import Exit, ExitError
 
 MAX_BYTES = 50_000
-"""Largest size of the file, bytes. The TLS gateway and the routers accept no message above
-`MESSAGE_BYTES`, and JSON needs two bytes for each quotation mark and each line end."""
+"""Largest size of the file, bytes. The TLS gateway and the routers accept messages of up to
+`MESSAGE_BYTES`. The limit for the file is lower, because JSON needs two bytes for each quotation
+mark and each line end."""
 
 MAX_JSON = MESSAGE_BYTES - 1024
 """Largest size of the description as JSON, bytes. The other 1024 bytes of a message are for the key
@@ -76,7 +77,9 @@ def robot_description(path: str) -> str:
         raise _error(path, f"its outermost element is <{root.tag}>, but a URDF begins with <robot>")
     if any(XACRO in element.tag for element in root.iter()):
         raise _error(
-            path, f"it is a xacro file; make the URDF with `xacro {path} > robot.urdf`, and name it"
+            path,
+            f"it is a xacro file: convert it with `xacro {path} > robot.urdf`, and set [ros] urdf "
+            "to the new file",
         )
     if len(encode(String(text), "json")) > MAX_JSON:
         raise _too_large(path)

@@ -87,7 +87,7 @@ class SettingsFile:
     def __init__(
         self, file: Path | None, parse: Callable[[bytes], Config], started: Config
     ) -> None:
-        """Prepare the comparison. It begins with `start`.
+        """Prepare the comparison, which begins when `start` is called.
 
         Args:
             file: the file that the daemon has read, or None for the built-in defaults.
@@ -111,8 +111,8 @@ class SettingsFile:
         self._results = Mailbox[_Checked | Answer](JOBS)
         self._pending: dict[int, _Pending] = {}
         self._started = self._limits = started.limits
-        """`_started` has the limits at the start of the daemon. In `_limits`, the values that the
-        daemon has written to the file since then replace them."""
+        """`_started` has the limits at the start of the daemon. `_limits` has the same limits, but
+        with the new value of each limit that the daemon has written to the file since then."""
         self._kept: tuple[Latches, LimitsConfig, LimitsConfig, Latches] | None = None
         """Cache of `latches`: its last arguments, the `_limits` at that time, and its result."""
 
@@ -217,11 +217,11 @@ class SettingsFile:
         return self._limits
 
     def latches(self, latches: Latches, now: LimitsConfig) -> Latches:
-        """Return the robot's latches for the next start, which reads its limits from the file.
+        """Return the robot's latches, changed for the next start of the daemon.
 
-        `Latches.lowered` has the limits that are lower now than at the start of the daemon. If the
-        daemon has written limits to the file since then, the result has the limits that are lower
-        now than in the file.
+        `Latches.lowered` has the limits that are lower now than at the start of the daemon. But the
+        next start reads the limits from the file. If the daemon has written limits to the file, the
+        result therefore has the limits that are lower now than in the file.
 
         Args:
             latches: the latches of the robot.

@@ -107,7 +107,10 @@ class Ticker(_Timer):
 
 
 class Next(Struct, frozen=True):
-    """Says which events start the next step, besides a period, bytes, a stop and a signal."""
+    """Result of a step: says whether a command, a retry or a stop may start the next step.
+
+    The other events, such as the end of a period, start a step in any case.
+    """
 
     listens: bool
     """Whether a command that arrives gets a step of its own, before the next period."""

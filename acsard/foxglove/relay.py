@@ -83,7 +83,7 @@ class Way(Struct, frozen=True):
 def ways(key_of: Callable[[str], str], ros: RosConfig, source: str) -> dict[str, Way]:
     """Return how the daemon interprets the commands of `source`, by the key on which they arrive.
 
-    The keys are the daemon's own ones for twists and wheel speeds, and those of ROS. `key_of`
+    The keys are the daemon's keys for twists and wheel speeds, and the keys of ROS. `key_of`
     returns the full key for a key below the robot's id.
     """
     native = source_keys([source])
@@ -114,7 +114,7 @@ class Reader:
 
 
 class Commanders:
-    """Receives the commands that programs send to the robot, for one topic per command source.
+    """Receives the commands that programs send to the robot. Each command source has a topic.
 
     A command is decoded as the daemon decodes it. A command that the daemon refuses appears only in
     the daemon's counters. Only one thread may use this class; Zenoh's threads call `wake`.

@@ -48,7 +48,7 @@ class Facts(Struct, frozen=True):
 
 
 def key_of(row: Channel, source: str) -> str:
-    """Return the key, below the robot's id, of the messages that the topic `row` shows.
+    """Return the key of the messages that the topic `row` shows, without the robot's id.
 
     `source` replaces the placeholder `<source>` in the key.
     """

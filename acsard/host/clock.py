@@ -4,7 +4,7 @@ In the daemon, no other module reads a clock. The monotonic clock is CLOCK_MONOT
 NTP makes CLOCK_MONOTONIC faster or slower by up to 8 %. With that clock, each distance that is
 computed as speed times time, and each measured delay of a command, would be wrong by as much.
 
-The times in an `Instant` are whole microseconds. Reading the clocks takes that long, so smaller
+The times in an `Instant` are whole microseconds. Reading the clocks takes about 1 us, so smaller
 digits mean nothing, and storing them would make a recording twice as large.
 """
 

@@ -81,7 +81,7 @@ Keys = Mapping[str, object]
 
 
 class Edit(Struct, frozen=True):
-    """A change of a running daemon's configuration file that the daemon has prepared."""
+    """A prepared change of the configuration file of a running daemon."""
 
     file: Path
     keys: Keys

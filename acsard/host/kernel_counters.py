@@ -19,8 +19,8 @@ from acsard.core.values import NS_PER_S
 from acsard.host import clock
 
 SLOWED_BITS = 0b1110
-"""Bits 1 to 3 of the Raspberry Pi's `get_throttled`. They say that at present the clock is limited,
-the processor is throttled, or the soft temperature limit is active."""
+"""Mask (0b1110) of three bits in the Raspberry Pi's `get_throttled`. They say that at present the
+clock is limited, the processor is throttled, or the soft temperature limit is active."""
 
 OWN_SCALING = ("intel_pstate", "amd-pstate", "amd-pstate-epp")
 """The cpufreq drivers whose governor `powersave` adapts the processor's frequency to the load.

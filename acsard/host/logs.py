@@ -87,7 +87,7 @@ class JournalStream(io.StringIO):
 Form = Literal["console", "json", "logfmt", "journal"]
 
 MAX_VALUE = 500
-"""Number of characters after which a logged value is cut. It may be a text of another program."""
+"""Number of characters after which a logged value is cut. Other programs may send long values."""
 
 
 class Writer:

@@ -102,8 +102,8 @@ class Mailbox(Generic[T]):
     def wakes(self, wake: Callable[[], object]) -> None:
         """Make writers call the function `wake` to wake the reader, from now on.
 
-        The method `wait` is then no longer woken. `wake` is called at once if an item waits or the
-        mailbox is closed.
+        Writers then no longer end the reader's `wait`. `wake` is called at once if an item waits or
+        the mailbox is closed.
         """
         self.wake = wake
         if self.waiting or self.closed:

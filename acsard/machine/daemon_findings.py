@@ -299,10 +299,10 @@ def refused(counters: Mapping[str, int]) -> list[str]:
 
 
 def gone(counters: Mapping[str, int]) -> list[tuple[int, str]]:
-    """Return how often the link was lost for another reason than a stall of the daemon's computer.
+    """Return a list with one pair: the number of losses of the link, and a sentence about them.
 
-    The result is a list with one pair, this number and a sentence that describes it. The list is
-    empty if the number is 0. `counters` are the daemon's counters.
+    Losses that a stall of the daemon's computer caused do not count. If the number is 0, the list
+    is empty. `counters` are the daemon's counters.
     """
     times = counters.get("link_lost", 0) - counters.get("link_lost_host_stall", 0)
     text = (

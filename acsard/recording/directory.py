@@ -145,7 +145,7 @@ class Run(Struct):
     numbers: set[int] = field(default_factory=set)
     """The numbers in the names of the files that ended in this run of the daemon."""
     cut: dict[str, Kind] = field(default_factory=dict)
-    """Maps the name of each file that a disk error cut off in this run to its retention class.
+    """Retention class of each file that a disk error cut off in this run, by the file's name.
 
     All other `.part` files without a marker were cut off by a crash before this run.
     """

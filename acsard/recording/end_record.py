@@ -30,7 +30,8 @@ The end record of a typical recording begins 1960 bytes before the end of the fi
 """
 
 _NAMED = struct.pack("<I", len(END)) + END.encode()
-"""Length and name of the end record. In the file, these bytes follow the head of the record."""
+"""Name of the end record, after the length of the name. In the file, the record's head is before
+these bytes."""
 
 _FOOTER = HEAD.pack(Opcode.FOOTER, 20)
 """Head of the MCAP footer, which has 20 bytes."""

@@ -377,7 +377,7 @@ def _write_steps(
     began_ns, over = recording.about.mono_ns, False
 
     def is_inside(step: Step) -> bool:
-        """Return whether a step is in the time span. End the output at the first step after it."""
+        """Return whether a step is in the span. The first step after the span ends the output."""
         nonlocal over
         seconds = (step.inputs.now.mono_ns - began_ns) / NS_PER_S
         if seconds > span.end and not over:

@@ -81,7 +81,7 @@ class ReplayResult(NamedTuple):
     It is "" if the daemon did not fail.
     """
     event_copies: str = ""
-    """Sentence about the first event whose copy in the channel `events` differs from its step.
+    """Sentence about the first event that differs from its copy in the channel `events`.
 
     It is "" if all copies are equal.
     """
@@ -133,10 +133,10 @@ def _items(
 
 
 MAX_STATE_BYTES = 8
-"""Bytes of states that may be decoded after gaps, for each byte of the file, besides `MAX_BYTES`.
+"""Total size of the states that may be decoded after gaps, in bytes for each byte of the file.
 
-A file stores a state compressed to a third of its size, so a genuine file stays below this limit.
-Without the limit, the replay of a forged file of 5 kB took 4 s.
+`MAX_BYTES` are allowed in addition. A file stores a state compressed to a third of its size, so a
+genuine file stays below this limit. Without it, the replay of a forged file of 5 kB took 4 s.
 """
 
 

@@ -61,8 +61,8 @@ A message with one second of steps and 20 commands has 16 000 bytes.
 """
 
 _HEAD = struct.Struct("<BQQQQII4sQ")
-"""Head of a chunk's record: opcode, length, first and last time, uncompressed size and its CRC-32,
-length and name of the compression, compressed size.
+"""Head of a chunk's record: opcode, length, first and last time, size and CRC-32 of the
+uncompressed data, length of the compression's name, this name, compressed size.
 """
 
 _AFTER_LENGTH = _HEAD.size - 9
@@ -72,7 +72,7 @@ _NAME_AT = 37
 """Offset of `ZSTD` in the head of a chunk, bytes."""
 
 ZSTD = struct.pack("<I4s", 4, b"zstd")
-"""The length and the name of the compression. Every chunk has these bytes in its head."""
+"""Name of the compression, after the length of the name. Every chunk's head has these bytes."""
 
 _ENDLESS = (1 << 63) - 1
 """Value of the length in the head of a chunk that is still growing. No file is that long."""
@@ -428,7 +428,7 @@ class _Chunks:
     def __init__(self, data: bytes) -> None:
         self._data = data
         self._effort = MAX_CHUNK_BYTES + MAX_EFFORT * len(data)
-        """Work that is left for incomplete chunks, in unpacked bytes."""
+        """Work that may still be spent on incomplete chunks, in unpacked bytes."""
         self._searched = 0
         """Offset up to which `later` has searched."""
         self._found: int | None = None

@@ -35,9 +35,9 @@ SLOW_NS = 3 * NS_PER_S
 SLOW = "the disk has accepted nothing for 3 s"
 
 PAUSE_NS = NS_PER_S // 4
-"""Largest part of the time between two steps that counts as waiting for the disk, ns.
+"""An interval between two steps adds at most this time to the counted wait for the disk, ns.
 
-If the time is longer, this process did not run in the meantime. Then the recorder's thread did not
+If the interval is longer, this process did not run for a while. Then the recorder's thread did not
 run either, and the disk is not the cause.
 """
 

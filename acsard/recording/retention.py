@@ -35,7 +35,7 @@ KEPT_FILES = 50
 """Largest number of `kept` recordings that are protected. Older ones count as unprotected."""
 
 FILES = 100
-"""Divisor of the allowed total size that gives the largest size of one recording file.
+"""A recording file may have at most the allowed total size divided by this number.
 
 The 50 protected files then take at most about half of the total size.
 """

@@ -108,7 +108,7 @@ class StepWriter:
         self._number = self._began_ns = self._state_ns = 0
         self._last = Instant(0, 0)
         self._reported = False
-        """True once the event that recording works was reported."""
+        """True once the log has the event which says that the recording works."""
         self._refused = False
         """True if the last write failed because the disk was full."""
         self._looked_back = False

@@ -44,7 +44,7 @@ Without a link to the board there is no pose.
 """
 
 SET_NS = 5 * NS_PER_S
-"""Change of the wall clock against the monotonic clock that counts as a clock step, ns."""
+"""Smallest change of the wall clock against the monotonic clock that gives an entry `clock`, ns."""
 
 WAITS_NS = NS_PER_S
 """Time for which a sender sends speeds without effect before the timeline mentions it, ns.
@@ -136,7 +136,7 @@ class LinkLosses:
 
 
 class ReasonChanges:
-    """Detects changes of the mode's reason that neither the mode nor an event shows."""
+    """Detects a new reason for an unchanged mode, unless an event has the same reason."""
 
     def __init__(self) -> None:
         self._mode = self._reason = ""
@@ -144,7 +144,7 @@ class ReasonChanges:
         self._reported_ns = -REASON_NS
         """Monotonic time of the last entry, ns.
 
-        An event or a change of mode that shows the reason for `waiting` counts as an entry too.
+        A change to the mode `waiting`, or an event with the reason for it, counts as an entry too.
         """
         self._sender = ("", "")
         """The last source that the robot followed, and the last sender on that source."""
@@ -452,8 +452,8 @@ INCIDENTS = {
 }
 """Maps the name of an event to its word in the summary of a recording.
 
-`link_up` is not counted and has no word. It is in the table so that `summary` receives it, and
-counts a loss of the link after it separately.
+`link_up` is not counted and has no word. It is in the table because `summary` needs it to count
+the next loss of the link as a new loss.
 """
 
 

@@ -121,7 +121,7 @@ class Lateness:
         """Number of lines that `at_once` has counted since the last period."""
         self._began_ns: int | None = None
         self._earliest = math.inf
-        """Smallest delay so far, ns, measured from the first period. It may be negative."""
+        """Smallest delay of a step so far, ns. The delay of the first step counts as 0."""
         self.missed = 0
         """Number of periods without a step."""
 

@@ -279,7 +279,7 @@ class Page:
 
     def __init__(self) -> None:
         self._shown = NO_END
-        """Number of lines since the first line of the help; `NO_END` before the first help."""
+        """Number of lines printed since the last help, including it; `NO_END` before the first."""
 
     def with_help(self, told: list[str], height: int) -> list[str]:
         """Return the lines `told` of a report, with the help first if it is no longer in sight.

@@ -46,8 +46,8 @@ class ScreenData(Struct, frozen=True):
     passed: float = 0.0
     """Seconds from the arrival of `before` to the arrival of `state`, on the local clock.
 
-    If the time between their stamps differs from it by more than the network delay, the robot's
-    clock was set.
+    If the time between the stamps of the two states differs from this time by more than the network
+    delay, the robot's clock was set.
     """
 
 

@@ -36,7 +36,10 @@ FIGURES = {
     "step_time": ("work of one step", "from the start of a step to the end of its work"),
     "command_age": ("arrival → each line", "from a command's arrival to each line that follows it"),
     "command_to_wire": ("arrival → first line", "from a command to the first line it causes"),
-    "feedback_to_bus": ("line read → published", "from the read of a line to its last message"),
+    "feedback_to_bus": (
+        "line read → published",
+        "from reading a feedback line to publishing its last message",
+    ),
     "mcu_round_trip": ("line out → answer in", "from a line to its answer; checked link"),
 }
 """Maps each latency (`latencies.Name`) to a short and a long explanation.

@@ -342,7 +342,7 @@ class Page:
 
 
 def settings_in(config: Mapping[str, Any]) -> list[Setting]:
-    """Return the settings in `config` that can be changed at run time, in the same order.
+    """Return the settings in `config` that can be changed at run time, in the order of `config`.
 
     `config` is the robot's configuration as plain tables, the decoded value of the key `config`.
     """

@@ -231,7 +231,7 @@ class Merged:
 class Stops:
     """Sends stops to the page's own robot, at most `STOPS_AT_ONCE` at the same time.
 
-    The callers beyond that number share one stop, which is sent when one of the others has ended.
+    The callers beyond that number share one stop. It is sent when a running stop has ended.
     """
 
     def __init__(self) -> None:

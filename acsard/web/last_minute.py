@@ -21,7 +21,7 @@ STEP_NS = NS_PER_S // 5
 """Nominal interval of the rows, ns. It is about one pixel wide in a plot on a phone."""
 
 EARLY_NS = STEP_NS // 4
-"""Time, ns, by which a state may arrive before the next row is due and still become that row."""
+"""A state may become the next row if it arrives at most this long before the row is due, ns."""
 
 ROWS = LASTS_NS // (STEP_NS - EARLY_NS)
 """Maximum number of rows in a minute."""

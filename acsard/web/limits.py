@@ -245,7 +245,10 @@ class Seats:
             places.leave(name)
 
     def _places(self, address: str, token: str) -> list[tuple[Places, str, str]]:
-        """Return each limit for a WebSocket, with the name to count and the text of a refusal."""
+        """Return the limits that apply to a WebSocket.
+
+        Each comes with the name under which it counts the WebSocket, and the text of a refusal.
+        """
         if not token:
             here = f"{CONNECTIONS_HERE} pages are open on the robot itself: close some"
             return [(self._here, address, here)]

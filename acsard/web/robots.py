@@ -69,7 +69,10 @@ def _path() -> Track:
 
 
 class _Asking:
-    """The client that a `Watch` uses. Queries run in threads, and do not block the event loop."""
+    """The bus client for a `Watch`, which follows a robot's state.
+
+    Queries run in threads, and do not block the event loop.
+    """
 
     def __init__(self, client: Client) -> None:
         self.subscribe, self._client = client.subscribe, client

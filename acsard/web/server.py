@@ -147,7 +147,7 @@ async def _tell(counts: Counts, log: Log) -> None:
 
 
 async def _held(leaving: asyncio.Event) -> None:
-    """Send signs of life to the parent; set `leaving` when the parent closes our standard input."""
+    """Send signs of life to the parent; set `leaving` when the parent closes the standard input."""
     parent, loop = Parent(sys.stdin.fileno()), asyncio.get_running_loop()
 
     def look() -> None:

@@ -33,8 +33,8 @@ KEYS = frozenset(topic.key for topic in FOLLOWED)
 DECLARE_S = 3.0
 
 STATE = "state"
-"""Key of a robot's state. The server waits for the next state of another robot instead of querying
-the last one, which a router's storage would return even if that robot has been off for a week."""
+"""Key of a robot's state. The server does not query the last state of another robot, but waits for
+the next one. A router's storage would return a last state even if the robot was off for a week."""
 
 UNREADY = (TimeoutError, zenoh.ZError, UsageError)
 """Errors that mean that the bus is stuck or the session is closed. A later attempt may succeed."""

@@ -121,7 +121,7 @@ class Budget(Struct, frozen=True):
     learned_used: bool = False
     """True if the odometry uses `learned` for turns that only the wheels measure."""
     coarse: bool = False
-    """True if the wheel speeds jump as with coarse encoders, and their counts are unknown."""
+    """True if the wheel speeds jump like those of coarse encoders, and the counts are unknown."""
 
     def largest(self, *bases: Basis) -> Share | None:
         """Return the share with the largest position error, among the shares with one of `bases`.
@@ -139,8 +139,8 @@ class Budget(Struct, frozen=True):
     def total(self) -> tuple[float | None, float | None]:
         """Return the error of all causes together, in mm after 100 m and deg after a turn.
 
-        The causes are independent, so their squares are added. An error is None if it is None for
-        every cause.
+        The causes are independent, so the squares of their errors are added. An error is None if it
+        is None for every cause.
         """
         return _squares([share.mm_per_100_m for share in self.shares]), _squares(
             [share.deg_per_turn for share in self.shares]
@@ -167,7 +167,7 @@ class Received(Struct, frozen=True):
     used: bool = False
     """True if the odometry uses `learned` for turns that only the wheels measure."""
     coarse: bool = False
-    """True if the wheel speeds jump as with coarse encoders, and their counts are unknown."""
+    """True if the wheel speeds jump like those of coarse encoders, and the counts are unknown."""
 
 
 def budget(received: Received, config: Config, metres: float = METRES) -> Budget:
@@ -196,7 +196,7 @@ def budget(received: Received, config: Config, metres: float = METRES) -> Budget
 
 
 def _standing(received: Received, config: Config, model: _Model) -> Budget:
-    """Return the budget of a robot that stands still, whose errors follow from the settings."""
+    """Return the budget of a robot that stands still. Its errors follow from the settings."""
     lines, odometry, known = received.lines, config.odometry, model.declares_parameters
     shares = (
         model.share("slip", "settings", STRAIGHT, SPIN, _only(odometry, *NOISE)),
@@ -324,7 +324,7 @@ class _Model:
 
 
 def _only(odometry: OdometryConfig, *kept: str) -> OdometryConfig:
-    """Return the settings without the errors that they declare, except those named in `kept`."""
+    """Return the settings with every declared error set to 0, except those named in `kept`."""
     zeros = {name: 0.0 for name in (*NOISE, *PARAMETERS) if name not in kept}
     return replace(odometry, pose_covariance_diagonal=(0.0,) * 6, **zeros)
 

@@ -42,9 +42,9 @@ BASIS: dict[Basis, str] = {
 }
 
 COARSE = (
-    "the encoders are coarse and the daemon does not know their counts, so its error in the time "
-    "of a line turns the pose: write mcu.encoder_counts, the counts per wheel turn "
-    "(`acsard mcu check` says about how many)"
+    "the encoders are coarse and the daemon does not know their counts, so an error in the time of "
+    "a feedback line becomes an error of the heading: write mcu.encoder_counts, the counts per "
+    "wheel turn (`acsard mcu check` says about how many)"
 )
 """Advice for a robot with coarse encoders."""
 
@@ -56,7 +56,7 @@ CALIBRATE = (
 
 
 def parts(budget: Budget) -> Iterator[RenderableType]:
-    """Yield a sentence about the drive, the table, and advice on the largest cause."""
+    """Yield a sentence about the drive, then the table, then advice on the largest cause."""
     if budget.still:
         yield _standing(budget)
     else:

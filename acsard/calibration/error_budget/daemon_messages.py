@@ -33,7 +33,7 @@ MOST = 60_000
 """Maximum number of feedback lines that are kept: ten minutes at 100 Hz."""
 
 SHARE_COARSE = 0.1
-"""If more than this fraction of feedback lines look like coarse encoders, the report says so."""
+"""Fraction of feedback lines with signs of coarse encoders, above which the report says so."""
 
 LEAST_LOST, SHARE_LOST = 3, 0.01
 """Number and fraction of the daemon's feedback lines that this program may fail to receive.
@@ -127,7 +127,7 @@ class Feed:
         )
 
     def _coarse(self, last: RobotState) -> bool:
-        """Return whether more than `SHARE_COARSE` of the feedback lines look like coarse encoders.
+        """Return whether more than `SHARE_COARSE` of the lines have signs of coarse encoders.
 
         `last` is the present state of the daemon.
         """

@@ -14,8 +14,9 @@ size. If a wheel passes through a value while it becomes faster or slower, the e
 and in the second half of the equal values cancel.
 
 Some firmware counts encoder edges in each period, so each speed is a multiple of the speed of one
-count. An edge that comes too late for one period is counted in the next one, so this error does not
-add up. Only the rounding of the multiple to two decimals adds up, and its error can be computed.
+count. An edge that comes too late for one period is counted in the next one, so errors of the count
+do not accumulate. The multiple is then rounded to two decimals. Only these rounding errors
+accumulate, and they can be computed.
 
 `Driving` divides a drive into steps, each with the errors of one cause. Errors that are independent
 from step to step are given as variances. Errors that have the same sign in each step add up, so
@@ -44,11 +45,11 @@ Counts = npt.NDArray[np.int64]
 AHEAD = 30
 """Number of consecutive feedback lines of which at least one is not delayed.
 
-At 100 Hz they take 0.3 s, the longest time for which a host does not run the daemon.
+At 100 Hz they take 0.3 s, the longest time for which a busy host does not run the daemon.
 """
 
 MISSING = 0.6
-"""Growth of the smallest delay among `AHEAD` lines, in periods, above which a line was lost."""
+"""If the smallest delay among `AHEAD` lines grows by this number of periods, a line was lost."""
 
 FOLLOWED = 0.05
 """Gain of the low-pass filter that computes the expected delay from the smallest delays.
@@ -59,8 +60,9 @@ The delays drift because the period is at first known only to about 1 %.
 CLUSTERED, ALIKE_TIMES = 0.4, 0.25
 """Limits for taking the median interval between lines as the period, instead of the mean.
 
-More than the fraction `CLUSTERED` of all intervals must be near the median: they differ from it by
-less than the fraction `ALIKE_TIMES` of it. If lines arrive in bursts, fewer intervals are near it.
+An interval is near the median if it differs by less than the fraction `ALIKE_TIMES` of the median.
+The median is taken if more than the fraction `CLUSTERED` of all intervals are near it. If lines
+arrive in bursts, fewer intervals are.
 """
 
 
@@ -76,11 +78,12 @@ class LineTimes(Struct, frozen=True):
 
 
 def line_times(t: Floats, sent: Floats) -> LineTimes:
-    """Estimate the delays of at least 3 feedback lines, and the lines that were lost.
+    """Estimate the delay of each feedback line, and the number of lines lost before it.
 
-    `t` contains the stamps of the feedback lines, s. `sent` contains the times at which the daemon
-    sent lines, s. A board sends feedback at a fixed period, or one line as the answer to each line
-    of the daemon. The function tries both, and returns the estimate with the smaller delays.
+    `t` contains the stamps of at least 3 feedback lines, s. `sent` contains the times at which the
+    daemon sent lines, s. A board sends feedback at a fixed period, or one line as the answer to
+    each line of the daemon. The function tries both, and returns the estimate with the smaller
+    delays.
     """
     even = _even(t)
     asked = _asked(t, sent)
@@ -109,7 +112,8 @@ def _even(t: Floats) -> LineTimes:
 def _asked(t: Floats, sent: Floats) -> LineTimes | None:
     """Estimate the delays of lines with the stamps `t`, s, if the board answers the daemon's lines.
 
-    `sent` contains the times of the daemon's lines, s. The result is None if they are too few.
+    `sent` contains the times of the daemon's lines, s. The result is None if these lines are too
+    few or do not cover the feedback lines.
     """
     if len(sent) < 3 or sent[0] > t[0] or len(sent) < len(t) / 2:
         return None
@@ -147,13 +151,14 @@ def _missing(at: Floats) -> Counts:
 
 
 BLOCK_S = 0.5
-"""Time within which errors of line stamps are correlated, s. A host never stalls for so long."""
+"""Time within which errors of line stamps are correlated, s. Stalls of the host are shorter."""
 
 LEAST_LINES, ALIKE = 20, 0.99
-"""Limits for the fit that separates the gyro's noise, which grows with time, from its scale error.
+"""Limits for the fit that separates the noise of the gyro from its scale error.
 
-`LEAST_LINES` is the minimum number of feedback lines while the robot moves. If the turns are nearly
-proportional to time (cosine above `ALIKE`), the two errors look the same.
+`LEAST_LINES` is the minimum number of feedback lines while the robot moves. The noise grows with
+time, and the scale error grows with the turn. If the turns are nearly proportional to time (cosine
+above `ALIKE`), the fit cannot separate the two.
 """
 
 LATEST_S = 0.1
@@ -196,7 +201,7 @@ class Motion(Struct, frozen=True):
     turn: Floats
     """Turn, rad."""
     yaw_variance: Floats | None
-    """Variance that odometry added to the heading with time, rad2; None if it is unknown."""
+    """Variance of the heading due to the noise of the gyro, rad2; None if it is unknown."""
     late: Floats
     """Errors of the motion due to wrong stamps, rows of (m, rad)."""
     lateness: float
@@ -252,7 +257,8 @@ def _noise(t: Floats, speeds: Floats, turns: Floats, variances: Floats) -> Float
     The gyro's scale error adds to the variance as well: S^2 A^2, where S is the relative standard
     deviation of the scale and A the turn since the pose was set. A line with the turn dA adds
     2 S^2 A dA. A is unknown at the first line, so a least-squares fit estimates A and the noise.
-    The result is None if the fit cannot separate them. While the wheels stand still, it is 0.
+    The result is None if the fit cannot separate the two. The variance is 0 while the wheels stand
+    still.
     """
     # Leave out the lines in which the variance falls, because the pose was set there.
     dt, moves = np.diff(t), speeds[1:].any(axis=1) & (variances[1:] > variances[:-1] / 2)
@@ -273,8 +279,8 @@ def _late(t: Floats, twists: list[Twist], found: LineTimes) -> Floats:
     """Return the errors of the motion due to wrong stamps, rows of (m, rad).
 
     A wrong stamp changes the interval dt of a line, and thus the distance, which is speed times dt.
-    Summation by parts gives each line its own term: minus the delay of the line times the change of
-    the speed after it.
+    Summation by parts gives each line its own term: the delay of the line, multiplied by the
+    difference (speed of the line - speed of the next line).
     """
     speeds = np.array([(one.linear, one.angular) for one in twists])
     near = np.abs(found.late) <= LATEST_S
@@ -325,10 +331,8 @@ def _gaps(
 
 
 TOGETHER = 0.8
-"""Minimum fraction of feedback lines in which two wheels report equal speeds.
-
-The rounding errors of two such wheels are taken to be the same.
-"""
+"""If two wheels report equal speeds in at least this fraction of the feedback lines, their rounding
+errors are taken to be the same."""
 
 LEAST_VALUES = 3
 """Minimum number of different speeds that are needed to find a quantization step."""
@@ -375,7 +379,7 @@ def _runs(values: Floats) -> Floats:
 
     `values` contains the speeds of the wheel, and q is the quantization step. A sequence of n equal
     speeds has the variance n^2 at its last speed, and 0 at the others. If the wheel passed through
-    this speed while it became faster or slower, the variance is 1.
+    this speed while it became faster or slower, the variance at the last speed is 1.
     """
     found = np.zeros(len(values))
     ends = np.append(np.flatnonzero(np.diff(values)), len(values) - 1)
@@ -421,9 +425,10 @@ class Steps(Struct, frozen=True):
 
 
 class Driving:
-    """Divides a drive into steps of about `step_s` s. Each method adds the errors of one cause.
+    """Divides a drive into steps of about `step_s` s.
 
-    `gyro` is true if a gyro measured the turns.
+    Each method returns these steps with the errors of one cause. `gyro` is true if a gyro
+    measured the turns.
     """
 
     def __init__(

@@ -20,7 +20,7 @@ from acsard.calibration.log_table import Floats
 from acsard.core.link.whole_counts import ROUNDING
 
 FINEST = 4 * ROUNDING
-"""Finest step that is searched, rad/s. Half of all speeds fit a finer step by chance."""
+"""Finest step that is searched, rad/s. A finer step would fit over half of all speeds by chance."""
 
 DEVIATION = 0.01 / math.sqrt(12)
 """Standard deviation of the rounding to two decimals, rad/s."""
@@ -29,7 +29,7 @@ STRAYS = 0.005
 """Fraction of the speeds that need not be multiples of the step, because of damaged lines."""
 
 BY_CHANCE = 1e-5
-"""Probability of fitting all speeds by chance, above which a step is rejected."""
+"""A step is rejected if its probability of fitting all speeds by chance exceeds this value."""
 
 STEEP = 1.0
 """Smallest step, rad/s, that is accepted without a test against chance.

@@ -102,11 +102,15 @@ class Slant(Struct, frozen=True):
 
     quantity: Quantity
     near: str
-    """Name of the answer with the distance from the line to the point that a left turn brings
-    closer to it."""
+    """Name of the answer with the distance of one point of the robot from the line.
+
+    A turn to the left moves this point towards the line.
+    """
     far: str
-    """Name of the answer with the distance from the line to the point that a left turn takes
-    away from it."""
+    """Name of the answer with the distance of a second point of the robot from the line.
+
+    A turn to the left moves this point away from the line.
+    """
     apart: str
     """Name of the answer, asked before the first leg, with the distance between both points."""
     since: str = ""

@@ -28,7 +28,7 @@ DEVIATES_S = 1.0
 """Time for which the robot may deviate from the command before the leg is halted, s."""
 
 LINEAR_OFF, ANGULAR_OFF, OFF_SHARE = 0.05, 0.15, 0.3
-"""Allowed deviation of the wheels, m/s and rad/s, and the fraction of the command added to it."""
+"""Allowed deviation of the wheels from a command: m/s, rad/s, plus a fraction of the command."""
 
 STILL = 0.02
 """Largest speed at which a wheel is considered to stand still, rad/s."""

@@ -36,7 +36,7 @@ BY_EYE = 0.07
 """Standard deviation of a heading that a person judges by eye, rad."""
 
 END_M = 0.003
-"""Standard deviation of the robot's distance from its marks after a square, m.
+"""Standard deviation of the measured distance of the robot from its marks after a square, m.
 
 It includes the error with which the person made the marks beside the robot.
 """
@@ -321,7 +321,7 @@ in "positions" (rad), as it would be without skidding.
 """
 
 PETALS = ((FAST, CURVE), (-FAST, -CURVE), (SLOW, 0.0), (-SLOW, CURVE), (FAST, -CURVE))
-"""Turn rates, rad/s, of the turns on the spot in "positions" and of the curve after each turn.
+"""Pairs of turn rates, rad/s: a turn on the spot in "positions", and the curve after it.
 
 The robot would have these rates without skidding.
 """

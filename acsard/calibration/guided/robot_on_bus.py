@@ -36,7 +36,7 @@ from acsard.terminal.prompt import Prompt
 SOURCE = "app"
 
 LOOK_S = 0.005
-"""Period of polling the keyboard and the message queues, s. A key press takes effect within it."""
+"""Period of polling keyboard and message queues, s. A key press takes effect within this period."""
 
 SHOWN_S = 0.2
 """Period in which the progress of a leg is shown, s."""
@@ -176,8 +176,8 @@ class Recorder:
 def times(samples: Sequence[Sample]) -> Floats:
     """Return the times of samples on this computer's clock, s.
 
-    If any sample has no stamp, the times of arrival are used. Otherwise they follow from the stamps
-    (`on_arrival_clock`).
+    If any sample has no stamp, the times of arrival are used. Otherwise the times are computed from
+    the stamps (`on_arrival_clock`).
     """
     came = np.array([sample.came for sample in samples])
     made = np.array([math.nan if s.made is None else s.made for s in samples])

@@ -39,14 +39,14 @@ There the floor has no limits, and no person has to set the robot back.
 
 
 def begins_again(legs: Sequence[Leg], number: int, *, sensor: bool) -> int:
-    """Return the index of the leg with which a guided drive goes on after a disturbed leg.
+    """Return the index of the leg to drive next after a disturbed leg.
 
-    If a sensor measures, it is the disturbed leg. If a person measures by tape, each measurement
-    is relative to the place where the person put the robot. The drive then goes back to the last
-    leg before which the person placed the robot.
+    If a sensor measures, this is the disturbed leg itself. If a person measures by tape, each
+    measurement is relative to the place where the person put the robot. The drive then goes back to
+    the last leg before which the person placed the robot.
 
-    There is one exception: if the disturbed leg only needs the robot's angle before it
-    (`angle_before`), the person measures this angle again, and the drive repeats only that leg.
+    There is one exception: some legs only need the robot's angle at their start (`angle_before`).
+    The person then measures this angle again, and the drive repeats only the disturbed leg.
 
     Args:
         legs: the legs of the method.
@@ -59,10 +59,10 @@ def begins_again(legs: Sequence[Leg], number: int, *, sensor: bool) -> int:
 
 
 def angle_before(leg: Leg) -> str:
-    """Return the name of the earlier leg after which a person measured the robot's angle for `leg`.
+    """Return the name of the earlier leg after which a person measured the start angle of `leg`.
 
-    The turn of `leg` is the change since that angle. The name is "" if the measurements of `leg`
-    need no earlier angle, or if they cover several legs.
+    The turn of `leg` is the robot's angle after `leg` minus this start angle. The name is "" if the
+    measurements of `leg` need no start angle, or if they cover several legs.
     """
     slants = [measure for measure in leg.measures if isinstance(measure, Slant)]
     return next((slant.since for slant in slants if slant.since and not slant.over), "")

@@ -2,7 +2,7 @@
 
 A reading is one measurement of the robot's motion since its pose was last known: a distance, a
 turn, or a displacement. Each reading is compared with the path of the wheels, which
-`calibration/positions.py` sums. The fit is a Gauss-Newton fit to all readings.
+`calibration/positions.py` computes. The fit is a Gauss-Newton fit to all readings.
 
 A reading differs from the path of the wheels because of the error of tape and eye, and because the
 robot skids. If there are enough readings, their scatter shows how much the robot skidded.
@@ -47,8 +47,10 @@ UNKNOWN = 1.0
 """Prior standard deviation of the mean wheel radius, as a fraction."""
 
 PRIOR_FREE = 4.0
-"""Weight of the assumed noise in its average with the scatter of the readings. The weight of the
-scatter is the number of readings beyond those that the fit needs."""
+"""Weight of the assumed noise, which is averaged with the noise that the readings show.
+
+The weight of the readings' noise is the number of readings minus the number that the fit needs.
+"""
 
 MOST_STEPS = 50
 SMALL = 1e-9
@@ -78,11 +80,11 @@ class Reading(Struct, frozen=True, dict=True):
 
     @cached_property
     def steps(self) -> WheelSteps:
-        """The motion of the wheels in all legs, as if they were one leg."""
+        """The motion of the wheels in all legs of `rides`, as if they were one leg."""
         return joined(self.rides)
 
     def residual(self, prediction: float) -> float:
-        """Return the measured minus the predicted value, without whole turns for an `angle`."""
+        """Return measured minus predicted value. For an `angle`, whole turns are removed."""
         off = self.value - prediction
         return math.remainder(off, 2 * math.pi) if self.quantity == "angle" else off
 
@@ -301,7 +303,7 @@ def slant(near: float, far: float, apart: float) -> float:
     """Return the angle in rad between the robot and a line, positive after a turn to the left.
 
     `near` and `far` are the distances, m, of two points of the robot from the line. The points are
-    `apart` m from each other. A turn to the left moves the point `near` towards the line. Raises
+    `apart` m from each other. A turn to the left decreases `near` and increases `far`. Raises
     `RefusedError` if the distances are impossible.
     """
     sine = (far - near) / apart

@@ -60,9 +60,9 @@ class Bus(Protocol):
     def take(self, queries: int) -> BusInput:
         """Return the input since the last call, with at most `queries` + 1 queries.
 
-        First come up to `queries` service calls. Then comes one slow query (ROS parameters or a
-        `set`), even if `queries` is reached. Other queries follow until `queries` is reached. The
-        remaining queries wait for the next call.
+        Service calls come first, at most `queries` of them. Then comes one slow query (ROS
+        parameters or a `set`), even if `queries` is reached. Other queries follow until `queries`
+        is reached. The remaining queries wait for the next call.
         """
 
     def publish(self, key: str, message: Message) -> None:

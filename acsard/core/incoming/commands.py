@@ -115,15 +115,16 @@ class Arrival(Struct, frozen=True):
     sender: str
     """Id of the Zenoh session that stamped the sample, usually the session of the sender.
 
-    It is "" if no other session than the daemon's stamped the sample. On a native key, it is also
-    "" if a connected router stamped it.
+    It is "" if the sample has no stamp, or if the daemon's own session stamped it. On a native key,
+    it is also "" if a connected router stamped it.
     """
     via: Via = "native"
     attachment: bytes = b""
     received_ns: int | None = None
     """Zenoh's timestamp by the wall clock, ns, if the daemon's own session set it.
 
-    The session sets one if the sample has none, or one that is too far ahead of the daemon's clock.
+    The session sets one if the sample has none, or if the sample's timestamp is too far ahead of
+    the daemon's clock.
     """
 
 
@@ -303,8 +304,8 @@ class Identity(Struct, frozen=True):
     steady: bool = False
     """Whether the sender states that the clock of its stamps is never adjusted."""
     signed: str = ""
-    """Public name of the sender's id, which does not depend on the certificate. "" if the sample
-    has no id, or is not a command on a native key."""
+    """Public name of the sender's id. Unlike `sender`, it does not depend on the certificate. "" if
+    the sample has no id, or is not a command on a native key."""
 
 
 # The results are cached, because each command needs the parts of its key twice, and few different

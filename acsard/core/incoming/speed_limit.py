@@ -8,7 +8,7 @@ A speed limit never raises a speed. The robot's `limits.linear_speed` is the low
 The class `Robot` knows nothing of speed limits. This module turns a message into a `set` request of
 its own. While a limit is in force, a client's `set` is checked against the settings without the
 limit, because they apply again when the limit is lifted. The robot then gets the client's value or
-the limit, whichever is lower. So each control step keeps to both values.
+the limit, whichever is lower. So each control step obeys the setting and the limit.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ _LINE = re.compile(TOKENS + rb"(?:, *)?")
 
 
 class FrameError(AcsardError):
-    """The error for an invalid line. `reason` is the name of the counter of such lines."""
+    """The error for an invalid line. `reason` is the name of the counter that counts the line."""
 
     def __init__(self, reason: Reason, line: bytes) -> None:
         super().__init__(reason, line)

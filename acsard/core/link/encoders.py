@@ -21,7 +21,7 @@ from acsard.core.link.minimum_delay import MinimumDelay
 from acsard.core.values import NS_PER_S
 
 SLACK_COUNTS = 4
-"""Number of counts that a wheel may make between two readings beyond those at its highest speed.
+"""Counts that a wheel may make between two readings in addition to those of its highest speed.
 
 It covers one count at each end of the interval, and play in the gears.
 """
@@ -57,8 +57,8 @@ class Encoders:
         """Start.
 
         If the first of two readings arrived late, the board's clock seems to gain on the host's
-        clock, but by no more than that delay. If it gains more than the delay plus `quiet_ns`, the
-        board has restarted.
+        clock. This gain is no larger than the delay of the first reading. If the gain exceeds
+        that delay by more than `quiet_ns`, the board has restarted.
 
         Args:
             counts: Encoder counts per turn, 0 if unknown.

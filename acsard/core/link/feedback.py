@@ -79,8 +79,8 @@ class Feedback(Struct, frozen=True, gc=False):
     gap: float = 0.0
     turned: Motors | None = None
     bridged: float = 0.0
-    """Length of the part of `dt`, at its start, in which lines were lost, s. The odometry fills
-    this part with the speeds of the lines before and after it."""
+    """Time at the start of `dt` in which lines were lost, s. The odometry fills this time with the
+    speeds of the lines before and after it."""
     asked_ns: int | None = None
     """Monotonic time at which the daemon wrote the command line that this line answers, ns. None if
     that command line is unknown."""
@@ -260,7 +260,8 @@ class Timeline:
             reading: The sample fields of a checked reply, None if it has none.
             following: The number of bytes in the read after the end of the line.
             length: The number of bytes of the line with its line end.
-            silent: Whether a silence that makes the link stale came before the line.
+            silent: True after a silence that makes the link stale, and for the first line of a
+                session.
             asked_ns: Monotonic time at which the daemon wrote the line that this reply answers, ns.
                 None if unknown.
         """

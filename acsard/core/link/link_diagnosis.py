@@ -23,7 +23,7 @@ from acsard.core.values import NS_PER_S, Event
 
 SHARE = 0.5
 """A link is stale after a silence of `Link.quiet_ns`. If the time between two control steps reaches
-this share of it, this computer caused the silence and not the board."""
+this share of `Link.quiet_ns`, this computer caused the silence and not the board."""
 
 BUSY = (
     "`top` shows which other program uses the processor; if acsard runs as the service, it has "
@@ -87,7 +87,7 @@ def is_ours(words: str) -> bool:
 
 
 class Lateness:
-    """Detector of late control steps, with which this computer itself causes silences."""
+    """Detector of late control steps. Such a step is a silence that this computer itself causes."""
 
     def __init__(self, simulated: bool, quiet_ns: int) -> None:
         """Start.
@@ -117,7 +117,7 @@ class Lateness:
         return good and (late_s > 0.0 or self._simulated)
 
     def words(self, link: LinkState) -> str:
-        """Return a sentence about the state `link` of the link.
+        """Return a sentence about a link in the state `link`.
 
         If this computer caused the silence, the sentence says so.
         """
@@ -245,7 +245,7 @@ class UnansweredLines:
     No other check detects this loss. After every `WINDOW` sent lines, the number of sent lines is
     compared with that of good lines. The warning is given once, and again only after a window
     without loss or after the link was lost. A sound board that reports by its own clock causes the
-    same warning if its rate is lower and mcu.reply_period is not set.
+    same warning if it sends fewer lines than the daemon and mcu.reply_period is not set.
     """
 
     def __init__(self, reply_period: float) -> None:

@@ -52,7 +52,7 @@ WORDS: dict[State, str] = {
 }
 
 WATCHDOG_S = 0.3
-"""Time after the last valid line from the daemon after which the board stops the motors, s."""
+"""If the board receives no valid line from the daemon for this time, s, it stops the motors."""
 
 GOOD_LINES = 3
 """Number of good lines in a row before the link is trusted. A board that has just reset may print

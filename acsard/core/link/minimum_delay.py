@@ -30,8 +30,8 @@ class MinimumDelay:
     def add(self, ours: float, theirs: float) -> float:
         """Process an event, and return its delay in excess of the minimum so far.
 
-        If the result is negative, this event is the new minimum. Unlike the result of `measure`, it
-        is not reduced by the allowed drift.
+        If the result is negative, this event is the new minimum. The allowed drift is not
+        subtracted from the result, unlike in `measure`.
 
         Args:
             ours: time since the last event by this computer's clock.

@@ -1,9 +1,9 @@
 """Measures how coarsely encoders quantize the reported speeds, and adds whole counts to lines.
 
 If the counts per turn are configured, `whole_counts.py` recovers the counts from the speeds.
-Otherwise the pose uses speed times time, because the speeds do not show how many counts a turn has.
-They would show it only with firmware that divides its counts by a fixed period. Such firmware does
-not need it: the time between its lines is known, so only the rounding of the speeds causes errors.
+Otherwise the pose uses speed times time. The speeds would show the counts per turn only if the
+firmware divided its counts by a fixed period. But then the time between the lines is known, so
+speed times time is wrong only by the rounding of the speeds.
 """
 
 from __future__ import annotations
@@ -149,8 +149,8 @@ class CountRecovery:
     def look(self, line: Feedback) -> Feedback:
         """Return the line with the counted angle and the quantization step of each wheel added.
 
-        The counted angles are None if they are unknown. If they include the time of a missing line,
-        `bridged` becomes 0.
+        The counted angles are None if they are unknown. If they include the angles of a missing
+        line, `bridged` becomes 0.
         """
         own, speeds, counted = line.dt - line.bridged, line.speeds.as_tuple(), None
         if self._whole.angle:

@@ -64,7 +64,7 @@ DRIFT = 0.01
 """Largest relative error of a board's clock. A ceramic resonator reaches half of it."""
 
 EXACT = 0.001
-"""A measured period is rounded to a whole number of ms if it differs from it by less than this
+"""A measured period is rounded to a whole number of ms if the rounding changes it by less than this
 share. The share covers the error of a quartz and of the measurement."""
 
 LONE = 0.7
@@ -78,14 +78,15 @@ lines that an adapter batches. `HELD_NS` limits both."""
 
 HELD_NS = 25_000_000
 """Longest time for which an adapter is assumed to hold a line back, ns. An FTDI chip holds it for
-16 ms. A line that is later than this probably answers a command that was sent between two periods.
-Then `FreeRunningTimes` finds no clock. This also applies to a slow board whose lines vary more."""
+16 ms. A line that is later than this probably answers a command that was sent between two periods,
+so `FreeRunningTimes` finds no clock. It also finds none for a slow board whose lines vary by more
+than this time."""
 
 EARLY_ALONE, ALONE = 0.55, 12
-"""`FreeRunningTimes` refuses a clock if nearly all reads come more than `EARLY_ALONE` periods after
-their slots. The exceptions are the earliest read, and one more for each `ALONE` reads. They
-probably answer commands that were sent between two periods, so a clock that fits them is too early
-for all other lines."""
+"""`FreeRunningTimes` refuses a clock if only a few reads come within `EARLY_ALONE` periods of their
+slots: the earliest read, and at most one more for each `ALONE` reads. These few reads probably
+answer commands that were sent between two periods, so the clock is too early for all other
+lines."""
 
 JUMP = 1.4
 """If two reads with a single line each are less than this number of periods apart, no line is
@@ -286,9 +287,9 @@ class FreeRunningTimes:
 
         - Configured periods come first. For jittery lines they are more reliable than half a second
           of data.
-        - An adapter that batches lines may also pass them on one by one, if they fill its packets.
-          So configured periods without missing lines come before measured periods with missing
-          lines.
+        - Configured periods without missing lines come before measured periods with missing lines.
+          Lines that are read one by one may still come from an adapter that batches lines, because
+          they may fill its packets one by one.
         - In batches, a measured period is left out if a configured period is within `DRIFT` of it,
           because half a second cannot distinguish the two.
         """
@@ -391,8 +392,8 @@ MEMORY = 64
 """Largest number of command lines that are remembered because their replies may still come."""
 
 FAST = 0.05
-"""Gain of the filters for the usual reply delay, its spread, the time between command lines and the
-batches."""
+"""Gain of the filters for the usual reply delay and its spread, the usual time between command
+lines, the usual time between batches, and the share of batches among the reads."""
 
 SLOW = 0.0125
 """Gain per read of the filter that decides whether the board itself varies the reply delay."""
@@ -403,9 +404,9 @@ outdated least delay is forgotten after about 500 replies."""
 
 CREEP, CREEPS_FOR = 0.05, 3
 """The least delay of the last replies rises by the share `CREEP` of the time since the last read,
-so that older replies are forgotten. This time counts as no less than the usual time between two
-command lines and no more than `CREEPS_FOR` times it, because a board may stall and then answer all
-lines."""
+so that older replies are forgotten. This time is limited to between 1 and `CREEPS_FOR` times the
+usual time between two command lines. The upper limit is for a board that stalls and then answers
+all lines."""
 
 LATE = 1.25
 """If the least delay of the last replies exceeds the long-term least delay by more than this,
@@ -413,8 +414,9 @@ replies were lost. The unit is the usual time between two command lines. A limit
 because the delay may permanently rise by almost that much."""
 
 RARE = 0.002
-"""Share of lost replies. If two command lines were written close together, a late reply proves that
-a reply was lost only if at least this share was lost before."""
+"""Share of lost replies. After a host stall, two command lines are written close together, and the
+reply to the first one is late. If a smaller share of the replies was lost before, such a late reply
+does not prove a loss."""
 
 JITTER_NS = 350_000
 """Mean deviation of the reply delay that USB and the scheduler cause, ns."""
@@ -440,8 +442,8 @@ SEVERAL = 0.15
 Host stalls alone cause fewer such reads."""
 
 THINKS = 0.6
-"""If the delay varies in more than this filtered share of the reads, the board itself varies it. An
-adapter whose packets fill line by line varies the delay for only a quarter of a second."""
+"""If the reply delay varies in more than this share of the reads, the board itself varies it. An
+adapter whose packets fill line by line also varies it, but only for a quarter of a second."""
 
 BATCH_NS = 2_000_000
 """Mean deviation of the reply delay above which an adapter holds the lines back, ns. No board
@@ -501,10 +503,10 @@ class PromptedTimes:
         """Times at which two command lines were written, ns. `_line` belongs to the last line that
         was answered, and `_passed` to the last line that was answered or given up."""
         self._lost = False
-        """Whether the last reply that was read alone showed that an earlier reply was lost."""
+        """Whether the last read with a single reply showed that an earlier reply was lost."""
         self._given: list[int] = []
-        """Times (ns), oldest first, of the command lines whose replies count as lost since the last
-        read of a batched link. An adapter that stalled may still deliver these replies."""
+        """The command lines that were given up at the last read of a batched link, as times in ns,
+        oldest first. An adapter that stalled may still deliver their replies."""
         self._at, self._alone, self._since = 0, False, 0
         self._base, self._batch, self._losses = 0.0, 2e7, 0.0
         """For a batched link: `_base` is the least reply delay and `_batch` the usual time between
@@ -623,7 +625,7 @@ class PromptedTimes:
 
         The second reply, which answers the line written at `line` ns, then comes much earlier than
         usual. Without the correction, the usual delay would fall by only 5 % of the difference per
-        reply. Until then the delay would seem to vary much, and this would hide lost replies.
+        reply. Meanwhile the delay would seem to vary much, and this would hide lost replies.
         """
         own = self._at - line
         self._first = own < (self._delay or 0) - self._apart / 2
@@ -676,8 +678,8 @@ class PromptedTimes:
     def _given_up_too_early(self, delay: float) -> bool:
         """Return whether the present reply answers the command line that was given up last.
 
-        Before that, give up the command lines whose replies were lost. The reply must have been
-        read alone. `delay` is the usual delay, ns.
+        This method first gives up the command lines whose replies were lost. The present reply must
+        be the only one in its read. `delay` is the usual delay, ns.
         """
         left, at, wide = self._left, self._at, 4 * self._spread
         lost, self._lost = self._lost, False

@@ -20,8 +20,8 @@ lost or counted twice.
 If the previous line is missing, there are two cases. If the board answered and its reply was lost,
 T covers only the time since that reply. If the command was lost, the board did not answer, and T
 covers the whole time since the last good line. Only one of these times makes the speeds whole
-counts. If a line does not show which one, and one line is missing, the module assumes the case of
-most earlier lines.
+counts. If a line does not show which one, the module assumes the case of most earlier lines. If
+more than one line is missing, it assumes the first case.
 
 Some firmware filters its speeds, or measures the time between two encoder edges. Its speeds are not
 whole counts. The module detects this, and the caller then uses speed times time.
@@ -104,8 +104,8 @@ class WholeCounts:
         self.covers_gap = False
         """Whether the counts of the last line include those of the missing line before it."""
         self._cover = 0.0
-        """Filtered share of the lines after a missing line whose counts include those of the
-        missing line. A line is ignored if its speeds do not show this."""
+        """Filtered share of the lines whose counts include those of a missing line before them.
+        Only lines that follow a missing line are used, and only if their speeds show the case."""
         self._doubt = self._unsure = 0.0
         """`_doubt` is the filtered share of the lines whose speeds are not whole counts. `_unsure`
         is the filtered error of the host's time, in counts of the fastest wheel."""

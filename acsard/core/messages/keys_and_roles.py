@@ -198,7 +198,7 @@ TOPICS: tuple[Topic, ...] = (
     _out("tf", "TFMessage", "with odom", "transform odom -> base"),
     _out("tf_static", "TFMessage", "latched", "transform base -> lidar", latched=True),
     _out(
-        DESCRIPTION, "String", "latched", "the URDF, with a file in [ros] urdf",
+        DESCRIPTION, "String", "latched", "the URDF, if `[ros] urdf` names a file",
         latched=True, urdf=True,
     ),
     _out("wheel_states", "JointState", "every feedback", "wheel angles and speeds"),

@@ -20,7 +20,7 @@ USES: tuple[Use, ...] = get_args(Use)
 
 MAY: dict[Role, str] = {
     "viewer": "this role may read data and stop the robot, but not drive it",
-    "operator": "this role may drive by the sources in commands.sources, stop and clear",
+    "operator": "this role may stop, clear, and drive as a source that commands.sources lists",
     "maintainer": "this role has every permission",
 }
 """The permissions of each role in words, for the error message of a tool with too low a role."""
@@ -62,8 +62,8 @@ def least_role(key: str) -> Role:
     """Return the lowest role that may use `key`, the part of the full key after the robot's id.
 
     To use a key means to put on it if clients may do that, else to query it, else to subscribe to
-    it. For an unknown key, return the lowest role. This grants no permission: callers use the
-    result for a hint to a client that has received nothing.
+    it. For an unknown key, return the lowest role. That is right only for a hint to a client that
+    has received nothing, so a caller that grants permissions must not ask for an unknown key.
     """
     row = row_of(key.removeprefix(JSON_TREE))
     if row is None:

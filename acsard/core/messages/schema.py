@@ -311,7 +311,7 @@ class RobotState(Message, frozen=True):
     certificate_expiry: str = ""
     """Remaining validity of the bus's TLS certificate, in words; empty without TLS.
 
-    The text begins with "valid" as long as the certificate is valid for 30 more days.
+    The text begins with "valid" as long as at least 30 days of validity remain.
     """
     latencies: dict[str, Latency] = {}
     """Latencies of the daemon by name (`daemon/latencies.py`). They are up to one second old."""
@@ -325,7 +325,11 @@ class RobotState(Message, frozen=True):
     wheel_fault: str = ""
     """The wheel that the odometry leaves out, or the side that slips, in words; else empty."""
     sender: str = ""
-    """Public name of the sender of `source` that drives the robot; empty while none drives."""
+    """Public name of the selected sender of `source`; empty while no sender is selected.
+
+    The selected sender may still have to send a zero before it drives. It is also given while a
+    latch keeps the robot from driving.
+    """
     effective_track: str = ""
     """Effective track divided by the wheel separation, in words.
 
@@ -371,9 +375,9 @@ class RobotState(Message, frozen=True):
     It is empty if no speed limit lowers it.
     """
     certificate_days: float | None = None
-    """Number of days until the first of the certificates that TLS needs expires.
+    """Number of days until the earliest expiry of the certificates that TLS needs.
 
-    The number is negative after that. It is null without TLS, and while the expiry is unknown.
+    It is negative after this expiry, and null without TLS or while the expiry is unknown.
     """
 
 

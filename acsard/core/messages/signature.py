@@ -35,7 +35,7 @@ With so many bits, nobody can find another sender id with the same hash.
 MARKS = " @._-:/+"
 """Characters besides letters and digits that a public name may contain. Others become "?".
 
-Brackets and commas are not among them, because they surround and separate names in the log.
+Brackets and commas become "?" too, because they surround and separate names in the log.
 """
 
 

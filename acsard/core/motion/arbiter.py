@@ -4,8 +4,8 @@ A sender is live while its last command is not older than the timeout of its sou
 live while one of its senders is.
 
 - The robot follows the live source of the highest priority. Among sources of equal priority, the
-  robot follows the first one until that source falls silent. The same rule applies to the senders
-  of one source.
+  robot follows the one that began to send first, until that source falls silent. The same rule
+  applies to the senders of one source.
 - A live source that is not armed yet (`neutral.py`) keeps its priority, and the robot stands still.
   Otherwise a source of lower priority would drive the robot in its place.
 - A source that sends zeros holds the robot still for any length of time. The arbiter cannot tell
@@ -106,7 +106,7 @@ class _Source:
         return armed and sender.live(now_ns), armed, sender.noticed_ns
 
     def doubt(self, name: str, was_set: bool) -> None:
-        """Disarm the sender `name` if only zeros whose stamps were never proven right armed it.
+        """Disarm the sender `name` if it was armed only by zeros with unproven stamps.
 
         If `was_set` is true, the sender's clock seems to have been set, so disarm it in any case.
         """
@@ -152,9 +152,9 @@ class _Source:
         return Wait("neutral", self.name, pause, lasts=lasts, ros=sender.ros, shared=sender.shared)
 
     def doubted(self, now_ns: int) -> Wait | None:
-        """Return why the source waits if the stamps of its recent commands were not accepted.
+        """Return why the robot does not follow a recent command with a doubtful stamp.
 
-        Return None if no recent command was refused because of its stamp.
+        Return None if the source has sent no such command recently.
         """
         doubtful = [sender for sender in self.senders.values() if sender.doubtful(now_ns)]
         if not doubtful:
@@ -193,8 +193,7 @@ class Arbiter:
         """Forget all commands, and require a zero from each sender before it drives again.
 
         Only a zero that arrives at the monotonic time `since_ns` or later arms a sender. For
-        example, a zero from before a stop was cleared does not show that its sender commands rest
-        now.
+        example, a sender that sent a zero before a stop was cleared may command motion by now.
         """
         self._since_ns = since_ns
         for source in self._ranking:
@@ -227,10 +226,10 @@ class Arbiter:
         return "" if verdict in ("fresh", "set") else "unproven"
 
     def notice(self, source: str, sender: str, arrived_ns: int) -> None:
-        """Record a message that was lost or could not be used, but that may have been a speed.
+        """Record a lost or unusable message, which may have commanded motion.
 
-        If an earlier zero is still waiting for the end of `commands.neutral_pause`, that zero then
-        cannot arm its sender. If `sender` is "", the message may come from any sender of `source`.
+        It prevents an earlier zero from arming a shared identity whose `commands.neutral_pause` is
+        not over yet. If `sender` is "", the message may come from any sender of `source`.
         """
         known = self._sources.get(source)
         if known is None:
@@ -280,10 +279,10 @@ class Arbiter:
         return Choice(source.name, sender.twist, wait, sender.arrived_ns, sender.name)
 
     def _kept(self, holder: _Source, now_ns: int) -> str:
-        """Return words for a sender whose speeds have no effect because `holder` sends zeros.
+        """Return the name of a source whose speeds have no effect because `holder` sends zeros.
 
-        For a sender of another source, the result is the name of that source. It is "" if no other
-        sender sends speeds.
+        If they come from `holder` itself, return "another sender of" and its name. Return "" if
+        no other sender sends speeds.
         """
         for source in self._ranking:
             senders = (each for each in source.live(now_ns) if each is not self._followed)
@@ -293,10 +292,8 @@ class Arbiter:
 
     @property
     def forgiven_ns(self) -> int:
-        """Total rise of command delays, ns, that the arbiter took for adjustments of clocks.
-
-        It contains only rises without a visible adjustment of the sender's clock (`freshness.py`).
-        """
+        """Sum of the rises of command delays, ns, that were trusted although no adjustment of the
+        sender's clock was visible (`freshness.py`)."""
         return self._freshness.forgiven_ns
 
     def sources(self, now_ns: int) -> tuple[SourceStatus, ...]:

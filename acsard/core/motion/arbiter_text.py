@@ -24,8 +24,8 @@ REFUSED = {
 
 MAX_SENDER = 124
 """Largest number of characters of a sender's name that an event shows. A public name has up to 57
-characters, and a certificate adds up to 67. If a sender is named after its key, the name may be
-longer, because the sender chooses the key."""
+characters, and a certificate adds up to 67. A sender may also be named after its key, which can be
+longer. The event cuts such a name."""
 
 ROS_NEVER = (
     ' (`ros2 topic pub` of a speed never sends a zero; "After a clear" in deploy/ros2/README.md '
@@ -110,8 +110,7 @@ class CommandEvents:
         """Return the events for changes since the last call.
 
         The events report a new mode, a new commander (the source and sender that drive the robot),
-        and speeds without effect. A new commander differs from the last one that drove the robot,
-        even if that was long ago.
+        and speeds without effect. A commander that drives again after a pause is not new.
 
         Args:
             mode: The present mode.
@@ -133,7 +132,8 @@ class CommandEvents:
     def _kept_waiting(self, mode: Mode, choice: Choice) -> list[Event]:
         """Return an event if the speeds of a source have had no effect for a while.
 
-        Each source is reported once, until its speeds have an effect or another one is reported.
+        The same source is not reported again until its speeds have had an effect, or until another
+        source has been reported.
         """
         wait, kept = choice.wait, ""
         if mode not in (Mode.READY, Mode.DRIVING) or wait.what not in ("neutral", "zeros"):

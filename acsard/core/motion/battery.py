@@ -23,9 +23,9 @@ TIME_CONSTANT_S = 10.0
 A battery takes minutes from one level to the next, so the robot reacts soon enough."""
 
 SETTLE_S = 3.0
-"""The mean decides the level when the times between the reports since the last silence add up to
-this, s. Each of these times counts as at most `LONGEST_NS`. A motor start within this time lowers
-the mean by up to a tenth of the voltage drop."""
+"""Time that the reports must cover after a silence before their mean decides the level, s. The time
+between two reports counts as at most `LONGEST_NS`. A motor start within this time lowers the mean
+by up to a tenth of the voltage drop."""
 
 SILENT_S = 5.0
 """Age at which the daemon drops a value, s. If a board reports its battery once a second, four
@@ -33,9 +33,9 @@ reports in a row may be lost before that."""
 
 LONGEST_NS = 300_000_000
 """Largest weight of a report in the mean, ns. The weight is the time since the previous report, but
-at most this duration of a motor start. Otherwise a report during a motor start would weigh too much
-if it follows a gap or if reports are rare. The mean of a board that reports once a second is
-therefore about three times as slow."""
+at most this value, the duration of a motor start. Otherwise a report during a motor start would
+weigh too much if it follows a gap or if reports are rare. If a board reports once a second, its
+mean therefore follows the voltage about three times as slowly."""
 
 ORDER: tuple[BatteryLevel, ...] = get_args(BatteryLevel)[:4]
 """The battery levels without "unknown", from the best to the worst."""

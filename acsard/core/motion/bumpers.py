@@ -81,8 +81,8 @@ class Bumpers(BoardInput):
 
     @property
     def latching(self) -> bool:
-        """Whether bumpers that count as pressed latch a stop. Those of a silent board always do. A
-        reported press does unless `safety.bumper` is "away"."""
+        """Whether bumpers that count as pressed latch a stop. They do not if the board reports the
+        press and `safety.bumper` is "away"."""
         return not self._away or self.state == "silent"
 
     @property
@@ -137,7 +137,7 @@ class Bumpers(BoardInput):
         return self.note().partition(": ")[2] if self.limiting else super().advice()
 
     def released(self, before: EstopState) -> str:
-        """Return the text that logs a release or, if `before` is "", the first report.
+        """Return the log text for a release or, if `before` is "", for the first report.
 
         `before` is the state of the bumpers before this report.
         """

@@ -106,10 +106,10 @@ class ConsistencyChecks:
         return found
 
     def taken_back(self, turn: float) -> float:
-        """Record that recomputing the `on_trial` lines changed their total turn by `turn` rad.
+        """Account for a change of `turn` rad in the total turn of the recomputed `on_trial` lines.
 
-        Return the angle that the caller must subtract from the heading, rad. It is `turn` if the
-        gyro is proven by now, because the gyro has then already corrected the heading, otherwise 0.
+        Return the angle that the caller must subtract from the heading, rad. If the gyro is proven
+        by now, it has already corrected the heading, so this angle is `turn`. Otherwise it is 0.
         """
         return 0.0 if self.gyro is None else self.gyro.taken_back(turn)
 

@@ -45,9 +45,9 @@ LATE_NS = 150_000_000
 period that can be configured is 100 ms."""
 
 EXCUSE_NS = 100_000_000
-"""Extra time, ns, before the board counts as silent after this computer was late. In this time the
-daemon reads the lines that have arrived meanwhile. It grants the extra time only once between two
-reports, so a computer that is always late does not delay the stop forever."""
+"""If this computer was late, the board counts as silent only after this further time, ns. In this
+time the daemon reads the lines that have arrived meanwhile. It grants the extra time only once
+between two reports, so a computer that is always late does not delay the stop forever."""
 
 PRESSED = "emergency stop pressed at the robot"
 SILENT = (
@@ -143,7 +143,7 @@ class BoardInput(ABC):
 
     @abstractmethod
     def released(self, before: EstopState) -> str:
-        """Return the text that logs a release or, if `before` is "", the first report.
+        """Return the log text for a release or, if `before` is "", for the first report.
 
         `before` is the state of the inputs before this report.
         """
@@ -182,7 +182,7 @@ class EmergencyStop(BoardInput):
         return PRESSED
 
     def released(self, before: EstopState) -> str:
-        """Return the text that logs a release or, if `before` is "", the first report."""
+        """Return the log text for a release or, if `before` is "", for the first report."""
         if not before:
             return "the board reports an emergency-stop input, which is released"
         return "released; the robot stays stopped until srv/clear"

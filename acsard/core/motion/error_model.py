@@ -36,8 +36,8 @@ from acsard.core.values import Twist, TwistVariances
 Column = tuple[float, float, float, float]
 """The error of a step if one parameter, such as a wheel radius, is off by one standard deviation.
 
-The numbers are the errors of the distance for each m and for each rad of the step (m/m, m/rad), and
-the errors of the turn for each m and for each rad of the step (rad/m, rad/rad).
+The first two numbers are the error of the distance per m of distance and per rad of turn (m/m,
+m/rad). The last two are the error of the turn per m and per rad (rad/m, rad/rad).
 """
 
 SLIPPING = 100.0
@@ -131,15 +131,16 @@ class ErrorModel:
 def columns(
     odometry: OdometryConfig, kinematics: Kinematics, learned: Track | None = None
 ) -> tuple[Column, ...]:
-    """Return the error of a step for each parameter that is off by one standard deviation.
+    """Return a column (see `Column`) for each uncertain parameter.
 
-    The parameters are the multipliers m_l, m_r and m_L in
+    The equations of a step are
 
         dl = r m_l phi_l,   dr = r m_r phi_r,   dyaw = (dr - dl) / (m_L b)
 
-    the ratio m_r / m_l, a scale that multiplies all lengths, and the fraction of each distance that
-    the wheels lose by slip. r is `wheel_radius`, b is `wheel_separation`, and phi_l and phi_r are
-    the wheel angles. A parameter with a standard deviation of 0 has no column.
+    where r is `wheel_radius`, b is `wheel_separation`, and phi_l and phi_r are the wheel angles.
+    The parameters are the multipliers m_l, m_r and m_L, the ratio m_r / m_l, a scale that
+    multiplies all lengths, and the fraction of each distance that the wheels lose by slip. The
+    last two share one column. A parameter with a standard deviation of 0 has no column.
 
     If `learned` is given, the last column is the error of the learned track. It is zero while the
     configured track is in use.
@@ -255,8 +256,8 @@ class TwistUncertainty:
         )
 
     def with_gyro(self, variances: TwistVariances, angular: float) -> TwistVariances:
-        """Return the variances with `angular`, the variance of a gyro's turn rate, rad2/s2.
+        """Return the variances with the variance of the turn rate replaced by `angular`.
 
-        The gyro's variance replaces that of the wheels.
+        `angular` is the variance of a gyro's turn rate, rad2/s2.
         """
         return TwistVariances(variances.linear, variances.lateral, min(max(LEAST, angular), MOST))

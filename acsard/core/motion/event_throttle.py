@@ -18,8 +18,8 @@ BURST = 5
 presses buttons."""
 
 MOST = 8
-"""Largest number of kinds, and of clients' names, that one log line lists. It combines the rest as
-"others", because a client may use any number of names."""
+"""Largest number of event kinds, and of client names, that one log line lists. The line combines
+the rest as "others", because a client may use any number of names."""
 
 LEVELS: tuple[Level, ...] = get_args(Level)
 
@@ -56,13 +56,13 @@ class EventThrottle:
     def __init__(self) -> None:
         self._held: dict[EventName, _Held] = {}
         self._free_ns: dict[EventName, int] = {}
-        """A monotonic time, ns, for each event name. Each written line moves it on by one second,
-        from the present time if it lies in the past. `_may` compares it with the present time."""
+        """For each event name, the monotonic time, ns, until which the written lines have used the
+        rate of one line per second. Each written line adds one second."""
 
     def lines(self, events: list[Event], now_ns: int) -> tuple[Event, ...]:
         """Add new events, and return the events to log now.
 
-        A returned event may combine several, also older ones that had to wait.
+        A returned event may combine several events, including earlier ones that had to wait.
         """
         if not (events or self._held):
             return ()
@@ -74,8 +74,8 @@ class EventThrottle:
     def _may(self, name: EventName, news: bool, now_ns: int) -> bool:
         """Return whether a line of this name may be written now, and if so, count it as written.
 
-        `news` is true if at least one waiting event does not only repeat an earlier one
-        (`Event.news`). Only then may up to `BURST` lines be written at once.
+        `news` is true if at least one waiting event reports something new (`Event.news`). Only then
+        may up to `BURST` lines be written at once.
         """
         free_ns = self._free_ns.get(name, now_ns)
         if free_ns > now_ns + (BURST - 1 if news else 0) * NS_PER_S:

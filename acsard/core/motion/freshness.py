@@ -70,9 +70,9 @@ JUMP_PROOF_NS = 3 * NS_PER_S // 2
 likely a backlog that arrives in bursts than a clock that was set."""
 
 GAP_NS = 2 * NS_PER_S
-"""Silence of a sender, ns, that ends a proof. If both the stamps and the arrivals show a pause of
-this length, a foreign clock may have been set by any amount during the pause. Sequence numbers
-distinguish a pause from lost commands."""
+"""Silence of a sender, ns, that ends a proof (a test whether the delay is constant). If both the
+stamps and the arrivals show a pause of this length, a foreign clock (one that may be adjusted) may
+have been set by any amount meanwhile. Sequence numbers distinguish a pause from lost commands."""
 
 STANDS_NS = 10_000
 """If two successive commands arrive more than `APART_NS` apart, but the second stamp is later by at
@@ -95,8 +95,8 @@ in `FORGIVE_RATE` seconds."""
 
 MAX_CLOCKS = 1024
 """Largest number of clocks that are remembered. If there are more, usually the one that was silent
-for longest is forgotten. To make the daemon forget the clock of a sender at 20 Hz, a client would
-have to use this many names within 0.05 s."""
+for longest is forgotten. To make the daemon forget the clock of a sender that sends at 20 Hz, a
+client would have to use this many names within 0.05 s."""
 
 State = Literal["new", "known"]
 Verdict = Literal["fresh", "first", "unproven", "stale", "set"]
@@ -113,14 +113,14 @@ Verdict = Literal["fresh", "first", "unproven", "stale", "set"]
 class _Proof:
     """A test whether the delays have become constant, starting with one command.
 
-    The test divides the time into halves, each of which is half of the nominal duration of a proof.
-    It compares the minimum delays of the halves, because minima have less jitter than single
-    delays.
+    The test divides the time into intervals. An interval is called a half, because it lasts half of
+    the nominal duration of a proof, but a test may take more than two. The test compares the
+    minimum delays of the halves, because minima have less jitter than single delays.
 
-    - For a known clock (`again`), the test compares the first half with the second. If it fails, it
-      begins again with its second half.
+    - For a known clock (`again`), the test compares the first half with the second. If they differ,
+      the test begins again with the second half.
     - For a new clock, it compares the first two halves. If they differ, it compares the last eight
-      halves in four pairs. The minima of the pairs must keep within the same limit (`EVEN`), or
+      halves in four pairs. The minima of the pairs must agree within the same limit (`EVEN`), or
       differ by at most `EARLY_NS` without a trend. A trend means that the minima only fall, as
       while a backlog arrives, or only rise, as while a queue grows.
     """
@@ -130,7 +130,7 @@ class _Proof:
         self._length_ns, self._share, self._again = needed_ns // 2, share, again
         self._begun_ns = self._last_ns = at_ns
         self._halves: list[tuple[int, int]] = []
-        """For each of the last halves, its start, monotonic ns, and its minimum delay, ns."""
+        """Start (monotonic) and minimum delay of each of the latest halves (see the class), ns."""
 
     def add(self, delay: int, at_ns: int, timeout_ns: int) -> Literal["proven", "open", "failed"]:
         """Add a command, and return whether the delays are proven constant.
@@ -186,8 +186,8 @@ class _Clock:
         self.at_ns = at_ns
         """Arrival of the last command, monotonic ns."""
         self.forgiven_ns = 0
-        """Rise of the delay, ns, that the last verdict `set` trusted although visible adjustments
-        of the clock do not explain it."""
+        """Rise of the delay at the last verdict `set`, ns, without the part that visible
+        adjustments of the clock explain."""
         self._stamp_ns = 0
         self._delay = 0
         self._number: int | None = None
@@ -206,8 +206,8 @@ class _Clock:
         """Sum of the clock's visible adjustments since the last command that was on time, ns."""
         self._doubted: tuple[int, int, int] | None = None
         """An adjustment of the clock that the next command must confirm, because the network may
-        have swapped or repeated a command. The numbers are the delay before the adjustment, its
-        amount, and the stamp before it, all in ns."""
+        have swapped or repeated a command. The numbers are, in ns: the delay before the
+        adjustment, the amount of the adjustment, and the stamp before the adjustment."""
         self._paused = False
         """Whether the sender has paused since the last command that was on time. Its clock may then
         have been set by any amount."""
@@ -218,10 +218,7 @@ class _Clock:
 
     @property
     def was_known(self) -> bool:
-        """Whether a command of this clock was accepted, so that the order of its stamps counts.
-
-        This is False again after a pause of `FORGET_NS`.
-        """
+        """Whether a command of this clock has been accepted since its last pause of `FORGET_NS`."""
         return self._accepted is not None
 
     def judge(self, command: Command, stamp_ns: int, timeout_ns: int) -> Verdict:
@@ -273,7 +270,8 @@ class _Clock:
         """Record a pause of the sender, or an adjustment of its clock.
 
         A stamp that goes back or stands still shows an adjustment. The next command must confirm
-        it: its stamp must do so too, or must not be later than the stamp before the adjustment.
+        the adjustment: its stamp must also go back or stand still, or must not be later than the
+        stamp before the adjustment.
         Nothing is recorded if the sequence numbers show that commands were lost.
 
         Args:
@@ -364,7 +362,7 @@ class _Clock:
 
 
 class Freshness:
-    """The clocks of all senders that stamp their commands, and the verdicts on commands."""
+    """Judges commands. It keeps a clock for each sender that stamps its commands."""
 
     def __init__(self) -> None:
         self._clocks: dict[str, _Clock] = {}
@@ -405,7 +403,7 @@ class Freshness:
         return verdict
 
     def _in_order(self, command: Command) -> Verdict:
-        """Return the verdict on a command without a stamp according to its sequence number.
+        """Judge a command without a stamp by its sequence number, and return the verdict.
 
         After a pause of `GAP_NS` the sender may start again with lower numbers.
         """
@@ -422,11 +420,11 @@ class Freshness:
         return "fresh"
 
     def _forget(self, now_ns: int) -> None:
-        """Forget clocks that were silent for long, and one more if there are over `MAX_CLOCKS`.
+        """Forget clocks that were silent for long. Forget another if over `MAX_CLOCKS` are left.
 
-        That one is preferably a steady clock without an accepted command that was silent for
-        `GAP_NS`, otherwise the clock that was silent for longest. The number of clocks is limited
-        because a recording begins with all of them, and the control loop writes them in one step.
+        This other clock is the longest silent one in `_unproved` if it was silent for `GAP_NS`,
+        otherwise the longest silent one of all. The number of clocks is limited, because
+        a recording begins with all of them, and the control loop writes them in one step.
         """
         limits = (self._newcomers, GAP_NS), (self._unproved, KEEP_NS), (self._clocks, KEEP_NS)
         for held, silent_ns in limits:
@@ -441,8 +439,5 @@ class Freshness:
 
 
 def _oldest(held: dict[str, _Clock]) -> _Clock:
-    """Return the clock that was silent for longest.
-
-    This is the first one, because each command moves its clock to the end.
-    """
+    """Return the first clock. It was silent for longest, as commands move clocks to the end."""
     return next(iter(held.values()))

@@ -56,8 +56,8 @@ class Rolled(Struct, frozen=True, gc=False):
     """The angles according to the encoder counts in the lines, rad. This motion came before that
     of `pieces`."""
     seen: Motors
-    """The angles during `seconds` according to the speeds or counts in the last line, with their
-    rounding errors, rad."""
+    """The angles during `seconds` according to the speeds or counts in the last line, rad. They
+    contain the rounding errors of that line."""
     seconds: float
     """Duration of the motion `seen`, s."""
     bridged: float
@@ -186,7 +186,7 @@ class Gaps:
         self._first, self._seconds, self._distance, self._turn = twist, 0.0, 0.0, 0.0
 
     def bridge(self, seconds: float, before: Twist, after: Twist) -> tuple[float, float]:
-        """Return the variances that a filled gap adds: the distance (m2) and the turn (rad2).
+        """Return the variances of distance (m2) and turn (rad2) that a filled gap adds.
 
         The gap lasts `seconds` s. Gaps that directly follow each other count as one longer gap, and
         the result is then only the increase. `before` and `after` are the speeds before and after
@@ -199,7 +199,7 @@ class Gaps:
         return max(0.0, along - given[0]), max(0.0, yaw - given[1])
 
     def unseen(self, seconds: float, before: Twist, after: Twist) -> tuple[float, float]:
-        """Return the variances of the motion in a gap: the distance (m2) and the turn (rad2).
+        """Return the variances of the distance (m2) and the turn (rad2) in a gap.
 
         The gap lasts `seconds` s, and `before` and `after` are the speeds before and after it.
         """

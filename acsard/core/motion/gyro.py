@@ -11,7 +11,7 @@ used (`gyro_trial.py`). If a gyro is silent, or its rate is out of all proportio
 heading comes from the wheels.
 
 The module remembers the angle that it has returned so far, not the time of its last result. So a
-sample that arrives late is included in the turn of the next line, and such errors do not add up.
+sample that arrives late is included in the turn of the next line, and no turn is lost.
 """
 
 from __future__ import annotations
@@ -214,10 +214,10 @@ class Gyro:
         gyro was not proven, rad, and its variance, rad2. It is applied once the gyro is proven."""
 
     def taken_back(self, turn: float) -> float:
-        """Record that recomputing the lines with `owes` changed their total turn by `turn` rad.
+        """Account for a change of `turn` rad in the total turn of the lines with `owes`.
 
-        Return the angle that the caller must subtract from the heading, rad. It is `turn` if the
-        gyro is proven by now, because the gyro has then already corrected the heading, otherwise 0.
+        Return the angle that the caller must subtract from the heading, rad. If the gyro is proven
+        by now, it has already corrected the heading, so this angle is `turn`. Otherwise it is 0.
         """
         verdict = self._trial.verdict
         if verdict == "none yet":

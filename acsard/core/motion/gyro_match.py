@@ -36,16 +36,16 @@ MEMORY = 0.995
 of turning have most of the weight."""
 
 ROUGH, FINE = 0.5, 0.1
-"""Standard deviation of the ratio of the gyro's turn to the wheels' turn: before any data, and the
-smallest one that is assumed. It is not smaller, because floor and turn rate change the ratio."""
+"""Standard deviation of the ratio of the gyro's turn to the wheels' turn. `ROUGH` is assumed before
+any data. `FINE` is the smallest one assumed, because floor and turn rate change the ratio."""
 
 STRETCH = 1.0
 """Turn to one side, rad, called a stretch. Each stretch measures the error of the ratio once. The
 delay of the gyro hardly matters over such a turn."""
 
 KEPT, PRIOR = 0.9, 0.1
-"""Factor by which each new stretch (a turn of `STRETCH`) reduces the weight of the earlier ones,
-and the initial weight of `ROUGH` as a number of stretches."""
+"""`KEPT` is the factor by which each new stretch (a turn of `STRETCH`) reduces the weight of the
+earlier ones. `PRIOR` is the initial weight of `ROUGH`, as a number of stretches."""
 
 DELAY_S = 0.2
 """Standard deviation of the gyro's delay before any data, s."""
@@ -108,8 +108,8 @@ class Match:
         predicted, and the turn of the wheels, rad."""
         self._ways = PRIOR * STRETCH**2
         self._offs = ROUGH**2 * self._ways
-        """Weighted sum of `_off` squared over the completed stretches, rad2. `_ways` is that of
-        `_way` squared."""
+        """Weighted sum of `_off` squared over the completed stretches, rad2. `_ways` is the same
+        sum of `_way` squared."""
         self._lag = LAG_S
         self.blocks = 0.0
         """Number of blocks in which the robot turned; older blocks count less (`MEMORY`)."""
@@ -130,8 +130,8 @@ class Match:
     def delay(self) -> float | None:
         """Return the delay of the gyro minus the assumed delay, s, or None if it is uncertain.
 
-        The caller must add a returned number to the assumed delay, because the measurement of the
-        delay then starts over.
+        If the result is a number, the measurement of the delay has started over, so the caller must
+        add this number to the assumed delay.
         """
         ratio, slope = self.ratio, self._slope
         spread = self._dd - self._wd * self._wd / self._ww

@@ -55,8 +55,8 @@ class Kinematics:
         """Return the distance (m) and the turn (rad) of the base for these wheel angles (rad).
 
         `wheels` is in the order of `WHEELS`. For wheel speeds (rad/s), the result is a linear speed
-        (m/s) and a turn rate (rad/s). This method is faster than `twist`, because each feedback
-        line needs it several times.
+        (m/s) and a turn rate (rad/s). It runs several times for each feedback line, so it uses
+        plain tuples, which are faster than `Twist`.
         """
         front_right, front_left, rear_left, rear_right = wheels
         left = self._left_radius * (front_left + rear_left) / 2
@@ -64,12 +64,12 @@ class Kinematics:
         return (right + left) / 2, (right - left) / self.track
 
     def opposite(self, left: float, right: float, turn: float) -> tuple[float, float]:
-        """Return the wheel angle of each side that follows from the other side and the turn, rad.
+        """Compute the wheel angle of each side from the other side and the turn, rad.
 
         The first result is the angle of the left side, computed from `right` and `turn`. The second
         is the angle of the right side, computed from `left` and `turn`. `left` and `right` are the
-        mean wheel angles of the sides, rad, and `turn` is the turn of the base, rad. The equation
-        is (3) of the module, for angles.
+        mean wheel angles of the sides, rad, and `turn` is the turn of the base, rad. The method
+        applies equation (3) of the module to angles.
         """
         across = turn * self.track
         return (

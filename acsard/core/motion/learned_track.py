@@ -14,8 +14,8 @@ from acsard.core.values import Event, GyroStatus, Level, TrackUse
 
 LEAST = 0.05
 """Smallest relative standard deviation of a learned track. It is not 0, because the floor and the
-turn rate may change. It is half of `gyro_match.FINE`, because that is the error at one moment, and
-a drive consists of many moments."""
+turn rate may change. `gyro_match.FINE` is the error at one moment. The mean error of a whole drive
+is smaller, so this is half of `FINE`."""
 
 CERTAIN, UNCERTAIN = 0.1, 0.2
 """Relative standard deviations of the learned track: below the first, an uncertain track becomes

@@ -118,7 +118,7 @@ class Lifecycle:
         self._held, self._mend = why, mend
 
     def caused_again(self, now_ns: int) -> None:
-        """Record that the cause of a fault, which is latched already, occurred again in this step.
+        """Record that the cause of the latched fault occurred again in this step.
 
         A call `clear` that arrived before this step does not release the fault. `now_ns` is the
         monotonic time of this step, ns.
@@ -346,7 +346,7 @@ class Lifecycle:
 
 
 def number_after_restart(kept: int, now: Instant) -> int:
-    """Return a number for a new latch that no earlier run of the daemon has used.
+    """Return a latch number that no earlier run of the daemon has used.
 
     The number is the wall-clock time in ms. If that is not above `kept`, because the wall clock was
     set back, the number is `kept` + 1 plus the time since the computer started in ms. `kept` + 1

@@ -76,27 +76,27 @@ class Sender:
         self._armed = self._proven_armed = not self._neutral_first
 
     def unlearn(self) -> None:
-        """Undo the effect of zeros whose stamps were never proven right.
+        """Undo the effect of zeros with unproven stamps.
 
-        The network may have held such a zero back, so that the sender no longer commands rest.
+        The network may have delayed such a zero, and the sender may command motion by now.
         """
         self._armed, self._zero_ns = self._proven_armed, self._proven_zero_ns
 
     def notice(self, at_ns: int) -> None:
-        """Record a message that was refused, but that may have been a speed.
+        """Record a refused message, which may have commanded motion.
 
-        If a shared identity's zero is still waiting for the end of `commands.neutral_pause`, that
-        zero then cannot arm it. `at_ns` is the monotonic time at which the message arrived, ns.
+        It prevents an earlier zero from arming a shared identity whose `commands.neutral_pause` is
+        not over yet. `at_ns` is the monotonic time at which the message arrived, ns.
         """
         self._settle(at_ns)
         self._zero_ns = self._proven_zero_ns = None
         self.noticed_ns = at_ns
 
     def missed(self) -> None:
-        """Record that messages of this sender were lost, each of which may have been a speed.
+        """Record that messages of this sender were lost. They may have commanded motion.
 
-        If a shared identity's zero is still waiting for the end of `commands.neutral_pause`, that
-        zero then cannot arm it.
+        They prevent an earlier zero from arming a shared identity whose `commands.neutral_pause` is
+        not over yet.
         """
         self._zero_ns = self._proven_zero_ns = None
 
@@ -108,9 +108,9 @@ class Sender:
     def take(self, command: Command, since_ns: int, verdict: Verdict = "fresh") -> None:
         """Process a command that was not refused. `verdict` is the verdict on its stamp.
 
-        A command of an unproven clock ("first", "unproven") does not drive the robot yet, but a
-        zero arms the sender until `unlearn` undoes that. A zero that arrived before `since_ns`, the
-        time of the last `require_neutral`, does not arm the sender.
+        A command of an unproven clock ("first", "unproven") does not drive the robot yet. But if it
+        is a zero, it arms the sender until `unlearn` undoes that. A zero that arrived before
+        `since_ns`, the time of the last `require_neutral`, does not arm the sender.
         """
         now_ns, zero = command.arrived_ns, is_zero(command)
         self._settle(now_ns)

@@ -93,8 +93,8 @@ class Odometry:
         self._positions = NOWHERE
         self._rolling = Rolling(quiet)
         self._held = NOWHERE
-        """Wheel angles at rest that the pose does not contain yet, because the direction of their
-        encoder counts is not clear, rad."""
+        """Angles by which the wheels turned at rest, rad. The pose does not contain them until the
+        direction of their encoder counts is clear."""
         self._steps_of, self._coarsest = NOWHERE, 0.0
         """Quantization steps of the wheel speeds in the last line, and the largest known one of
         them, rad/s."""
@@ -152,7 +152,7 @@ class Odometry:
         return self._path.pose
 
     def missed(self) -> dict[str, int]:
-        """Return counters of the gaps in the feedback, without those that are 0.
+        """Return counters of the gaps in the feedback, without counters that are 0.
 
         `gaps` is the number of gaps in which the robot moved but the pose stood still, and `gap_ms`
         is their duration. `gaps_filled_ms` is the time that gap filling covered.

@@ -5,7 +5,7 @@ the constant twist that leads from the estimated pose to the true pose in one un
 vector (x, y, yaw).
 
 Errors are expressed in axes that are parallel to those of odom, with the origin at the robot. When
-the robot moves, an error in these axes changes only by the lever arm of the displacement
+the robot moves, only x and y of an error in these axes change, by its yaw times the displacement
 (`seen_from`). In the axes of base_link it would change by the adjoint of the robot's displacement.
 
 A covariance is the covariance of such a vector. E[...] is an expected value, ' means transposed,
@@ -35,7 +35,7 @@ def bracket(a: Vector, b: Vector) -> Planar:
 
 
 def brackets(a: Vector, p: PoseCovariance, times: float) -> tuple[Vector, Vector]:
-    """Return `times` E[[a, e] e'] for a random pose error e with the covariance `p`.
+    """Return E[[a, e] e'] multiplied by `times`, for a random pose error e with covariance `p`.
 
     E is the expected value, [a, e] is the Lie bracket, and ' means transposed. The result has the
     rows x and y, because the row yaw is always 0.

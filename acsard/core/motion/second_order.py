@@ -64,8 +64,8 @@ class SecondOrder:
         self._noise: Vector = ORIGIN
         """Covariance (xx, xy, yy), m2, of the sum of all [x, n] / 2 and M_i of the module."""
         self._with_x: list[tuple[Vector, Vector]] = []
-        """Covariance E[M_i x'] of M_i with the noise x (see the module), for each parameter i. It
-        has the rows x and y."""
+        """Covariance E[M_i x'] of M_i with the noise x (see the module), for each parameter i. Each
+        is a pair of rows: one for the x axis and one for the y axis."""
         self._bent: dict[tuple[int, int], Planar] = {}
         """C_ik of the module for each pair of parameters, m. The keys are pairs of their indices,
         the larger one first."""
@@ -74,7 +74,8 @@ class SecondOrder:
         self.xx = self.xy = self.yy = 0.0
         """The terms of second order in the covariance of x and y, m2, in the axes of odom.
 
-        A step does not transform them, because only yaw has a lever arm.
+        A motion of the robot does not change them, because it changes x and y of an error only in
+        proportion to its yaw (`se2.seen_from`), and these terms have no yaw.
         """
 
     def widen(self) -> None:

@@ -37,8 +37,8 @@ LEAVES = 0.05
 """Least change of the command, rad/s, after which a healthy wheel must report another speed."""
 
 VOTE = 1 / 3
-"""A reference (a gyro or the command) decides which of two wheels is faulty only if it is nearer to
-one of them by at least this share of the difference between the wheels."""
+"""A reference (a gyro or the command) decides which of two wheels is faulty only if one wheel is
+nearer to it than the other by at least this share of the difference between the wheels."""
 
 HAND_S = 0.3
 """Time for which a wheel must repeat one speed without a command before it is called stuck, s. A
@@ -66,8 +66,8 @@ WORDS: dict[WheelFault, str] = {
 class _Ballot:
     """The comparison of two wheels with one reference, which is a gyro or the command.
 
-    It holds the sums, over several lines, of the turns of both wheels and of the range in which the
-    reference says that the true turn lies, rad.
+    It holds four sums over several lines, rad: the turn of each wheel, and the lower and the upper
+    bound of the true turn according to the reference.
     """
 
     def __init__(self) -> None:
@@ -223,7 +223,7 @@ class Stuck:
         return abs(command - self._command) >= LEAVES
 
     def says(self, same: bool, apart: float, dt: float, count: float, expected: Expected) -> bool:
-        """Return whether the encoder is stuck, after a line of `dt` s.
+        """Add a line, and return whether the encoder is stuck.
 
         Args:
             same: Whether the wheel turns and repeats the speed of the line before.

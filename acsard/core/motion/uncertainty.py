@@ -51,7 +51,7 @@ from acsard.core.motion.second_order import SecondOrder
 from acsard.core.values import PoseCovariance
 
 MAX_VARIANCE = 1e9
-"""Largest variance of the pose, m2 or rad2. It means "unknown", and keeps the numbers finite."""
+"""Largest variance of the pose, m2 or rad2. A variance of this size means "unknown"."""
 
 COARSE_COUNTS = 400
 """Encoder counts per wheel turn that are assumed if the configuration has no number. Few encoders
@@ -122,10 +122,10 @@ class PoseUncertainty:
             self._p = added(self._p, *self._phase, self._cos, self._sin)
         self._effects = self._parameters
         self._columns: list[Vector] = [ORIGIN for _ in self._effects]
-        """The columns of J: for each parameter, for the gyro's scale and for motion in gaps.
+        """The columns of J: the error of the pose if one parameter is off by a standard deviation.
 
-        Each is the error of the pose if its parameter is off by one standard deviation. The last
-        two are added when they have an effect for the first time.
+        Two further columns, for the gyro's scale and for motion in gaps, are added when they first
+        have an effect.
         """
         self._of_gyro = self._of_gaps = -1
         """Indices in `_columns` for the gyro's scale and for motion in gaps; -1 without one."""

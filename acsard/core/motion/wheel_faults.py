@@ -46,7 +46,7 @@ LEAST = 0.005
 
 ROLLED_S, REPEATED_S = 0.2, 1.0
 """Time for which wheels must turn without a command before the daemon reports that, and least time
-between two such reports, s. A robot that rocks as it comes to rest is not being pushed."""
+between two such reports, s. A shorter turn may be the rocking of a robot that comes to rest."""
 
 SLIP_S = 0.5
 """Time after the last contradiction for which a side still counts as slipping, s."""
@@ -296,7 +296,7 @@ class WheelFaults:
         self._late = False
         """Whether a wheel turns too slowly."""
         self._found: _Side | None = None
-        """The side whose wheel the last line proved faulty, None without one."""
+        """The side on which the last line proved a wheel faulty, None without one."""
         self.events: list[Event] = []
         """Log events of the last line."""
 
@@ -452,7 +452,7 @@ class WheelFaults:
         return Event("wheel_fault", text, "warning", kind="slow")
 
     def was_faulty(self, before: WheelSpeeds) -> bool:
-        """Return whether the wheel that the last line proved faulty was wrong in an earlier line.
+        """Return whether the newly faulty wheel may already have been wrong in an earlier line.
 
         `before` contains the speeds of the earlier line, rad/s.
         """

@@ -58,8 +58,8 @@ SLOWEST = 1.0
 """Wheel speed, rad/s, below which the difference of the wheels is not learned."""
 
 WILD = 0.1
-"""Change of the learned fraction while the wheels contradict each other for `DOUBTED_S`. A slip
-ends sooner, but a tyre stays flat, so its effect is learned."""
+"""Change of the learned fraction while the wheels contradict each other for `DOUBTED_S`. Slip ends
+sooner, but a flat tyre stays flat, so the effect of the tyre is learned."""
 
 
 class Residual:

@@ -30,8 +30,8 @@ CLEAR = 1.0
 which a wheel at this speed turns by one encoder count."""
 
 NEARER = 1.0
-"""Amount by which the speed of a wheel that contradicts its command must approach the command to
-count as obeying, rad/s."""
+"""A wheel that contradicts its command counts as obeying if its speed has approached the command by
+more than this, rad/s."""
 
 RATIO_S = 2.0
 """Duration of driving over which a wheel's angle is compared with the expected one, s."""
@@ -118,8 +118,9 @@ class Witness:
         # already too fast would never count as slowing down: slow motors latched "runaway" that
         # way.
         self._nearest = math.inf
-        """How far the wheel was from obeying when it last approached the command, rad/s. This is
-        its speed if it was too fast, otherwise its speed against the direction of the command."""
+        """Deviation from the command when the wheel last approached the command, rad/s. The
+        deviation is the speed of a wheel that is too fast, otherwise the speed of the wheel against
+        the commanded direction."""
         self._wrong = False
         """Whether the wheel was too fast, stood, or turned against its command in the last line."""
         self._seconds = self._went = self._way = 0.0

@@ -111,8 +111,8 @@ def _parsed(text: str) -> dict[str, tuple[tuple[str, str], ...]]:
 
 
 _DECLARED = _parsed(_TEXT)
-"""The constants and fields of each type, in order. Each is a pair: its type, and the text after
-it."""
+"""The constants and fields of each type, in order. Each constant or field is a pair: its type, and
+the text after the type."""
 
 DEFINITIONS: dict[str, tuple[Field, ...]] = {
     name: tuple((kind, rest.split()[0]) for kind, rest in declared if "=" not in rest)
@@ -205,7 +205,7 @@ LOG = Channel("log", "events", "rcl_interfaces/msg/Log", Log, Qos(1000))
 """The topic of the robot's events. Each event is one log message."""
 
 CMD_VEL_IN = Channel(f"cmd_vel_in/{SOURCE}", f"cmd/{SOURCE}", TWIST_STAMPED, TwistStamped)
-"""The topics of the commands of each source. The stamp of a message is the arrival time."""
+"""The topics of the commands, one for each source. The stamp of a message is its arrival time."""
 
 BY_KEY: dict[str, Channel] = {**_published(), STATE.native: STATE}
 """The channels of the messages that `Report` (`messages/report.py`) builds, by native key."""

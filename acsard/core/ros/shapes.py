@@ -40,7 +40,7 @@ class Log(Struct, frozen=True):
 
 
 NUMBERED = re.compile(r"\d+ (x|times)\b")
-"""Matches an event's text that begins with the number of events, such as "3 x" or "3 times"."""
+"""Matches the count at the beginning of an event's text, such as "3 x" or "3 times"."""
 
 LEVELS: dict[str, int] = {"info": 20, "warning": 30, "error": 40}
 """The numbers of the log levels in ROS."""

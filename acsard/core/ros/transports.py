@@ -60,8 +60,8 @@ class Endpoint(Struct, frozen=True):
     direction: Direction
     key: str
     token: str
-    """Liveliness token that announces the endpoint, or "" if it is not announced. The GID, by which
-    rmw_zenoh identifies an endpoint, is a hash of this token."""
+    """Liveliness token that announces the endpoint, or "" if it is not announced. rmw_zenoh
+    identifies the endpoint by its GID, which is a hash of this token."""
     latched: bool
     """True if a new subscriber receives the last message at once."""
     type: str
@@ -94,8 +94,8 @@ PARAMETER_SERVICES = {
 }
 
 PARAMETERS = "parameters/"
-"""Prefix in `RosName.native` for ROS's parameter services, which have no native key. The native key
-`config` returns the same settings."""
+"""Beginning of `RosName.native` for a parameter service of ROS. The value is then a placeholder and
+not a native key. The native key `config` returns the same settings."""
 
 PUBLISHED = (
     RosName("odom", "odom", "out", "nav_msgs/msg/Odometry"),
@@ -220,8 +220,8 @@ def command_keys(ros: RosConfig) -> tuple[str, ...]:
 def claims(ros: RosConfig) -> tuple[str, ...]:
     """Return the tokens with which this daemon claims the ROS name `cmd_vel` for itself.
 
-    If another daemon has the same token, both would follow the same `cmd_vel`, so the second one
-    does not start. ROS tokens cannot serve for this: not every daemon announces itself to ROS, and
+    Two daemons with the same token would follow the same `cmd_vel`, so the second daemon does not
+    start. ROS tokens cannot serve for this: not every daemon announces itself to ROS, and
     other ROS nodes may use the same names. So the keys of these tokens begin with `acsard/@ros/`.
     """
     name = full_name(ros.namespace, "cmd_vel")

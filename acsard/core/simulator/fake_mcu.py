@@ -3,7 +3,7 @@
 Without faults the simulated board does what the daemon expects of a board. It boots with stopped
 motors, obeys only complete valid lines, and stops the motors after 300 ms without a valid line. It
 answers a checked line, which is a line with a checksum, with a checked reply. It does not use the
-daemon's parser, so that the tests show an error of that parser.
+daemon's parser, so that an error in that parser makes the tests fail.
 
 A fault is on inside a `with` block, such as `with mcu.mute():` (`faults.py`). The faults that
 `[sim] faults` lists are always on.
@@ -316,7 +316,10 @@ class FakeMcu(Faults):
         return self._seen
 
     def _speeds(self, now_ns: int) -> list[float]:
-        """Return the speeds of the motors a to d, rad/s: the turned angle divided by the time."""
+        """Return the speeds of the motors a to d, rad/s.
+
+        A speed is the angle turned since the last computation, divided by the time since then.
+        """
         since, before = self._window
         gains = self.gains
         if self.stuck is not None:
@@ -395,14 +398,15 @@ class FakeMcu(Faults):
     def estop_pressed(self, after_s: float, length_s: float) -> Fault:
         """Make the board report the emergency stop as pressed after `after_s` s, for `length_s` s.
 
-        Otherwise the board reports it as released. If `length_s` is 0, it stays pressed.
+        At other times the board reports it as released. If `length_s` is 0, it stays pressed.
         """
         return self._input("estop", "pressed", after_s, length_s)
 
     def estop_silent(self, after_s: float, length_s: float) -> Fault:
-        """Make the board report a released emergency stop only until `after_s` s have passed.
+        """Make the board report a released emergency stop, and then no longer report it.
 
-        The board reports it again `length_s` s later, or never if `length_s` is 0.
+        The reports end after `after_s` s, and begin again `length_s` s later. If `length_s` is 0,
+        they do not begin again.
         """
         return self._input("estop", "silent", after_s, length_s)
 
@@ -419,16 +423,17 @@ class FakeMcu(Faults):
         return self._input("bumpers", "".join(marks), after_s, length_s)
 
     def bumpers_silent(self, after_s: float, length_s: float) -> Fault:
-        """Make the board report released bumpers only until `after_s` s have passed.
+        """Make the board report released bumpers, and then no longer report them.
 
-        The board reports them again `length_s` s later, or never if `length_s` is 0.
+        The reports end after `after_s` s, and begin again `length_s` s later. If `length_s` is 0,
+        they do not begin again.
         """
         return self._input("bumpers", "silent", after_s, length_s)
 
     def driver_fault(self, after_s: float, length_s: float) -> Fault:
         """Make the board report a fault of a motor driver after `after_s` s, for `length_s` s.
 
-        Otherwise the board reports no fault. If `length_s` is 0, the fault stays.
+        At other times the board reports no fault. If `length_s` is 0, the fault stays.
         """
         return self._input("driver", "fault", after_s, length_s)
 

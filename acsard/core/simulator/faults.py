@@ -60,7 +60,8 @@ class Faults:
         that there is no adapter."""
         self.stall_every_ns = self.stall_ns = 0
         self.lose_reply = self.lose_command = self.bit_error = 0
-        """The numbers n of the faults that affect every n-th reply, command or line; 0 = off."""
+        """The n of three faults: every n-th reply is lost, every n-th command is lost, and one bit
+        of every n-th line is flipped. 0 means that the fault is off."""
         self._passed = {"reply": 0, "command": 0, "bit": 0}
         self._clock = b""
 

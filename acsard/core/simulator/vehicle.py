@@ -95,7 +95,7 @@ class Vehicle:
         self.pose = arc(self.pose, (left + right) / 2, turn)
 
     def _grip(self) -> float:
-        """Return the fraction of a turn that remains at present, although wheels skid, 0 to 1."""
+        """Return the fraction of a turn that is not lost to skidding wheels now, 0 to 1."""
         kept = 1.0 - self.turn_slip
         if self._floor:
             kept *= 1.0 - self._floor * uniform(self._seed, int(self._time / GRIP_S))

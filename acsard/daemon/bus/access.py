@@ -32,6 +32,7 @@ from acsard.core.messages.keys_and_roles import (
     json_key,
     offered,
     published,
+    row_of,
     source_keys,
 )
 from acsard.core.messages.permissions import COMMAND_ROLE, Use, has, keys_for, least_role
@@ -187,13 +188,16 @@ class _Keys:
 
         Return None if the endpoint sends commands to a source that is not configured, which no role
         may do. A ROS key cannot contain a certificate's name, so every role that may command may
-        use the ROS key of a command.
+        use the ROS key of a command. Raise `LookupError` if the table of keys lacks the native key.
         """
         native = endpoint.native
         if native.startswith(PARAMETERS):
             return least_role("config")
         if native.startswith(tuple(f"{kind}/" for kind in COMMANDS)):
             return COMMAND_ROLE if native.rpartition("/")[2] in self._sources else None
+        if row_of(native) is None:
+            # `least_role` would let every role use the ROS key.
+            raise LookupError(f"{endpoint.key} has no native key, and therefore no role")
         return least_role(native)
 
 
@@ -215,9 +219,9 @@ def access_control(config: Config) -> dict[str, object]:
 def gateway_access(config: Config) -> dict[str, object]:
     """Return the value of Zenoh's `access_control` for the session of the TLS gateway.
 
-    The only link of that session without a certificate leads to the daemon. Each certificate that
-    may command is a subject of its own (Zenoh's word for those to whom rules apply), and also
-    belongs to the subject of its role.
+    The only link of that session without a certificate leads to the daemon. Zenoh applies
+    rules to "subjects". Each certificate that may command is a subject of its own, and also belongs
+    to the subject of its role.
     """
     return _access(config, ("pass",), gateway=True)
 

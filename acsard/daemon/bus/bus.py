@@ -67,7 +67,10 @@ class ZenohBus:
         return self._outlets.wanted
 
     def take(self, queries: int) -> BusInput:
-        """Return the input since the last call, with at most `queries` queries and a slow one."""
+        """Return the input since the last call, with at most `queries` queries.
+
+        A slow query may exceed this number by one (`Inbox.take`).
+        """
         taken = self._inbox.take(queries)
         routers = self._links.changed()
         if routers is not None:

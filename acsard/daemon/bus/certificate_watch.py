@@ -34,7 +34,11 @@ class CertificateFiles:
     """The three TLS files of a process that listens: authority, certificate and key."""
 
     def __init__(self, authority: Path, certificate: Path, key: Path) -> None:
-        """Record the present files. Create the object before the process itself reads them."""
+        """Record the state of the files.
+
+        The caller must create this object before it reads the files itself. Otherwise a replacement
+        between the two would not be noticed.
+        """
         self._files = authority, certificate, key
         self._used = self._seen = self._signature()
         self._due_ns = clock.mono_ns() + FILES_LOOK_NS

@@ -205,7 +205,7 @@ def _load(context: ssl.SSLContext, directory: str) -> None:
 
 
 def _ends_ns(certificate: Any) -> int:
-    """Return when a certificate expires, ns since 1970. It is an object of `cryptography`."""
+    """Return when a certificate (an object of `cryptography`) expires, ns since 1970."""
     return int(certificate.not_valid_after_utc.timestamp()) * NS_PER_S
 
 
@@ -223,7 +223,7 @@ def _place(endpoint: str) -> tuple[str, str]:
 
 
 PATIENCE_S = 2.0
-"""Time limit for the server to accept the connection, and then again for its answer in TLS, s."""
+"""Time limit for the server to accept the connection, s. Its TLS answer has the same limit."""
 
 REFUSAL_S = 0.5
 """Time to wait after the TLS handshake for a rejection of the client's certificate, s.

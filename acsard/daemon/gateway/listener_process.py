@@ -37,7 +37,7 @@ An observation takes a millisecond.
 """
 
 FIRST_NS = 5 * NS_PER_S
-"""Time from the opening of the session within which the daemon must connect, ns.
+"""Time within which the daemon must connect after the session has been opened, ns.
 
 Otherwise the process restarts. The time is longer than `ALONE_NS`, because the other clients
 connect at the same time.
@@ -97,7 +97,7 @@ class SessionHealth:
     """The health of the session, derived from its successive observations."""
 
     def __init__(self, most: int, opened_ns: int, events: Events = GATEWAY_EVENTS) -> None:
-        """Start at the monotonic time `opened_ns`, at which the session was opened.
+        """Create the health of a session that was opened at the monotonic time `opened_ns`, ns.
 
         `most` is the largest number of connections from the network. `events` names the log events.
         """

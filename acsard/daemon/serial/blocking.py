@@ -20,7 +20,7 @@ SEND_S = 0.5
 slowest wire."""
 
 DRAIN_S = 0.5
-"""Longest time to wait at the close until the driver has sent the last stop lines, s."""
+"""Longest time for which `close` waits for the driver to send the last stop lines, s."""
 
 CLOSE_S = 1.0
 """Longest time to wait for a close, s. Some drivers drain for 30 s."""

@@ -32,7 +32,7 @@ different device may be opened."""
 
 BACK_OFF_S = (0.05, 0.1, 0.2)
 """Pauses between the attempts to reopen the port, s. The last pause repeats. The first ones are
-short, because a device can be opened only a moment after it appears, when udev has set its group.
+short, because a new device can be opened as soon as udev has set its group, which takes a moment.
 """
 
 PERMISSION_PATIENCE_S = 2.0

@@ -15,6 +15,7 @@ import pytest
 import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec import structs
 
 from acsard.core.config.settings import (
     AccessConfig,
@@ -37,7 +38,7 @@ from acsard.core.messages.keys_and_roles import (
 from acsard.core.messages.permissions import SERVICE_ROLES, least_role
 from acsard.core.ros.transports import PARAMETERS, claims, endpoints
 from acsard.core.values import Role
-from acsard.daemon.bus.access import GRANTS, access_control, gateway_access
+from acsard.daemon.bus.access import GRANTS, _Keys, access_control, gateway_access
 from tests.each import each
 
 ROLES: tuple[Role, ...] = ("viewer", "operator", "maintainer")
@@ -235,6 +236,13 @@ def test_the_rules_have_the_least_role_of_each_key() -> None:
             assert least_role(written(topic.key)) == LEAST[topic.key]
         elif topic.direction == "out":
             assert least_role(topic.key) == "viewer"
+
+
+def test_a_ros_key_without_a_native_key_is_granted_to_no_role() -> None:
+    keys, (endpoint, *_) = _Keys(Config()), endpoints(Config().ros, "*")
+    assert keys._least(endpoint)
+    with pytest.raises(LookupError, match="has no native key"):
+        keys._least(structs.replace(endpoint, native="forgotten"))
 
 
 def test_an_unused_gyro_key_is_granted_to_no_role() -> None:
