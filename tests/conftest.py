@@ -32,7 +32,7 @@ settings.load_profile("default")
 # nohup and a script's `&` start a program with these signals ignored, and the programs that a test
 # starts inherit that. A handler is not inherited, and a handler that does nothing ignores the
 # signals just as well.
-for number in (signal.SIGINT, signal.SIGHUP):
+for number in (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
     if signal.getsignal(number) is signal.SIG_IGN:
         signal.signal(number, lambda *_: None)
 

@@ -39,7 +39,7 @@ HEAD = """\
 #
 #     pip install -r requirements.lock
 #
-# Written by `python -m tests.lock`. .ci/run runs all tests on it, and the unit tests once more on
+# Written by `python -m tests.lock`. .ci/run tests on it, and runs unit tests once more on
 # the lowest versions that pyproject.toml allows.
 """
 

@@ -26,7 +26,7 @@ POINTS = {
 """
 
 OWN = {
-    "period_lateness": "period due (the first of several missed) -> its step",
+    "period_lateness": "period due (the first one, if several were missed) -> its step",
     "step_time": "start of a step -> end of its work",
     "command_age": "command arrived -> each line that follows it",
     "command_to_wire": "command arrived in its source's turn -> first line after it",
@@ -162,7 +162,7 @@ def _counts(result: Result) -> list[tuple[str, str]]:
     said = "" if r.lines_said is None else f" of {r.lines_said}"
     waiting = ""
     if r.lines_waiting_max is not None:
-        waiting = f", at most {r.lines_waiting_max} newer lines waiting"
+        waiting = f", with at most {r.lines_waiting_max} newer lines waiting"
     start = "not measured" if r.start_up_ms is None else f"{r.start_up_ms:.0f} ms"
     rows = [
         ("commands", f"{r.commands_sent} sent{seen}"),
@@ -174,5 +174,5 @@ def _counts(result: Result) -> list[tuple[str, str]]:
         ("start-up", f"{start} from the start of the process to the first line on the port"),
     ]
     if not r.simulated:
-        rows.append(("left out", "the wire of a real port cannot be seen from here"))
+        rows.append(("left out", "the benchmark cannot see the lines on the wire of a real port"))
     return rows

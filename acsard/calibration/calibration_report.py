@@ -243,7 +243,7 @@ def parts(report: Report, calibration: Calibration, where: str) -> Iterator[Rend
 
 def _better(report: Report) -> list[str]:
     """Return sentences about the improvement that the calibration brings."""
-    noise = f"chance errors of the {{}} after {METRES:g} m, as the odometry states them"
+    noise = f"random errors of the {{}} after {METRES:g} m, as odometry publishes them"
     sentences = [
         f"{words}: {_two(before * factor)} {unit} now, {_two(after * factor)} {unit} with the new "
         "values"
@@ -278,9 +278,9 @@ def _remains(report: Report, calibration: Calibration) -> list[str]:
     share = multipliers.std[SEPARATION] / multipliers.values[SEPARATION]
     known = "" if TRACK in report.kept else f"here it is known to {share:.1%}, and "
     sentences = [
-        f"what remains: on wheels that skid the effective track is not constant; {known}"
-        f"{'it ' * (not known)}changes by {report.effective_track_growth * fastest:+.1%} (+- "
-        f"{report.effective_track_growth_std * fastest:.1%}) from slow turns to fast ones. It "
+        "the error that remains: on wheels that skid the effective track is not constant; "
+        f"{known}{'it ' * (not known)}changes by {report.effective_track_growth * fastest:+.1%} "
+        f"(+- {report.effective_track_growth_std * fastest:.1%}) from slow turns to fast ones. It "
         "differs on other ground, so calibrate where you drive"
     ]
     if not report.scale:

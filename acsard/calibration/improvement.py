@@ -318,13 +318,15 @@ def _of_positions(
 def no_better(found: Improvement) -> str:
     """Return the message of a calibration whose new multipliers are not surely better."""
     errors = ", ".join(
-        f"{name} {error.before * factor:.2g} {unit} now and {error.after * factor:.2g} {unit} then"
+        f"{name} {error.before * factor:.2g} {unit} now and {error.after * factor:.2g} {unit} "
+        "with the new values"
         for name, error, unit, factor in (
             ("heading", found.heading, "deg", 1.0), ("position", found.place, "cm", 100.0)
         )
         if error.before is not None and error.after is not None
     )  # fmt: skip
     return (
-        "keep the configured multipliers: over whole drives that the fit did not use, those of "
-        f"this log are not surely better ({errors or 'no drive could be left out'})"
+        "keep the configured multipliers: over whole drives that the fit did not use, the "
+        "multipliers of this log are not clearly better "
+        f"({errors or 'no drive could be left out'})"
     )

@@ -323,14 +323,14 @@ def _near(names: Sequence[str], header: Sequence[str]) -> str:
     """Return a hint at a column of `header` that may be one of the missing `names`, or ""."""
     others = [name for name in header if name and name not in COLUMNS]
     if "t" in names and (times := [name for name in others if "time" in name or "stamp" in name]):
-        return f" (is {times[0][:40]} it? rename it t, in s)"
+        return f" (if {times[0][:40]} is the time, rename that column to t and write it in s)"
     if counts := [name for name in others if COUNTS.search(name)]:
         return (
-            f" ({counts[0][:40]} has counts, not speeds: write the counts of each row as rad/s, "
-            "2 pi counts / (counts per turn x seconds))"
+            f" ({counts[0][:40]} has counts, not speeds: convert the counts of each row to rad/s "
+            "with 2 pi x counts / (counts per turn x seconds))"
         )
     near = [other for name in names for other in nearest(name, others)]
-    return f" (is {near[0]} it? rename it)" if near else ""
+    return f" (if {near[0]} is that column, rename it)" if near else ""
 
 
 def _ignored(header: list[tuple[str, str]], names: list[str]) -> list[str]:
@@ -376,7 +376,9 @@ class _Reader:
                 return
             cells += [""] * short
         elif short < 0 and any(cell.strip() for cell in cells[short:]):
-            self._refuse(f"line {number} has {len(cells)} cells, but the header {len(self._names)}")
+            self._refuse(
+                f"line {number} has {len(cells)} cells, but the header has {len(self._names)}"
+            )
             return
         try:
             row = [float(cells[i] or "nan") for i in self._picks]

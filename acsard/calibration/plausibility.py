@@ -134,8 +134,8 @@ def rolls_enough(rows: Rows, *, spins: bool = False) -> None:
         cross = float(together @ against) ** 2
         if cross > ALIKE * float(together @ together) * float(against @ against):
             raise RefusedError(
-                f"the robot always drives the same curve, which does not separate the wheels from "
-                f"the track: {DRIVE}"
+                "the robot always drives the same curve, so the log cannot separate errors of the "
+                f"wheels from errors of the track: {DRIVE}"
             )
 
 
@@ -143,8 +143,8 @@ def turns_enough(turned: Floats) -> None:
     """Raise `RefusedError` if the robot hardly turns. `turned` contains its turns, rad."""
     if (angle := float(np.abs(turned).sum())) < LEAST_ANGLE:
         raise RefusedError(
-            f"the robot turned by {np.degrees(angle):.0f} deg in all, which is too little for the "
-            f"effective track: {DRIVE}"
+            f"the robot turned by {np.degrees(angle):.0f} deg in all, which is too little to "
+            f"measure the effective track: {DRIVE}"
         )
 
 
@@ -243,8 +243,7 @@ def turns_the_right_way(source: str, sides: Floats | None, begun: StartingPoint 
         )
         raise RefusedError(
             f"{sensor} and the wheels show turns in opposite directions: the columns of left and "
-            "right are swapped, or ahead is negative on both sides"
-            f"{or_sensor}"
+            f"right are swapped, or the wheel speeds of both sides are negative ahead{or_sensor}"
         )
 
 
@@ -268,8 +267,8 @@ def turns_like_the_wheels(source: str, rows: Rows, base: Base) -> None:
         raise RefusedError(
             f"{source} shows turns of {np.degrees(shown):.0f} deg in all, but the wheels would "
             f"turn the robot by up to {np.degrees(by_wheels):.0f} deg: is {source} the rate about "
-            "the upright axis? If the IMU lies on its side, write the rate about the axis that "
-            "points up into the column, positive to the left. Are the wheel speeds in rad/s, not "
+            "the upright axis? If the IMU lies on its side, fill the column with the rate about "
+            "the axis that points up, positive to the left. Are the wheel speeds in rad/s, not "
             "counts, deg/s or rpm?"
         )
 
@@ -377,7 +376,7 @@ def remarks(
             )
     if abs(bias) > LARGE_BIAS:
         yield (
-            f"the gyro turns by {bias:.3f} rad/s while the robot stands: the calibration has "
+            f"the gyro shows {bias:.3f} rad/s while the robot stands: the calibration has "
             "corrected this large value"
         )
     left, right = float(turned[turned > 0].sum()), float(-turned[turned < 0].sum())
@@ -396,8 +395,8 @@ def remarks(
     if not 1 / ODD_RATIO < ratio < ODD_RATIO:
         yield (
             f"the right wheels are {ratio:.3g} times as large as the left ones, which is unusual: "
-            "compare them, and check that the speeds of both sides have the same unit and that no "
-            "encoder counts only in part"
+            "compare their sizes, and check that the speeds of both sides have the same unit and "
+            "that no encoder misses counts"
         )
     track = float(values[0])
     if not LEAST_TRACK < track < MOST_TRACK:

@@ -89,10 +89,11 @@ def _table(log: Path, config: Config, choice: Choice) -> Table:
         return _bag([log], config, choice)
     if choice != Choice():
         raise LogError(
-            "--topic and --yaw-axis are for a ROS 2 bag, and this is not one: leave them out"
+            "--topic and --yaw-axis are only for a ROS 2 bag, and this log is not a ROS 2 bag: "
+            "leave both options out"
         )
     if log.stat().st_size > MOST_BYTES:
-        raise MendableError(f"{log} is larger than 1 GiB: use a part; ten minutes are enough")
+        raise MendableError(f"{log} is larger than 1 GiB: use a part of it; ten minutes are enough")
     return read(_measured(log) if begin.startswith(MAGIC) else log.read_bytes())
 
 
@@ -154,10 +155,11 @@ def _messages(file: Path, notes: list[str]) -> Iterator[RosMessage]:
                 encoding = channel.message_encoding
                 yield RosMessage(channel.topic, type_, encoding, one.log_time, one.data)
         except EndOfFile:
-            notes.append(f"{file.name} has no end: the messages before the cut are used")
+            notes.append(f"{file.name} is cut off: only the messages before the cut are used")
         except BAG_DAMAGE as error:
             notes.append(
-                f"{file.name} is damaged, and the messages before that place are used: {error}"
+                f"{file.name} is damaged, so only the messages before the damaged place are used: "
+                f"{error}"
             )
 
 

@@ -366,9 +366,9 @@ class _Log:
             if not topic.wheels and topic.joints:
                 names = ", ".join(printable(name) for name in sorted(topic.joints)[:8])
                 return (
-                    f"no joint of {topic} is known as a wheel of the left and one of the right "
-                    f"side: its joints are {names}. Write those of the wheels into [joints] of the "
-                    f"configuration, or convert the bag as {PAGE} shows"
+                    f"the joints of {topic} must include a known left wheel and a known right "
+                    f"wheel, but are {names}. Write the names of the wheel joints into [joints] "
+                    f"of the configuration, or convert the bag as {PAGE} shows"
                 )
             if topic.unreadable or topic.wheels:
                 return _too_few(topic)
@@ -395,8 +395,9 @@ class _Log:
             back = float(np.diff(stamps).min(initial=0.0))
             if topic.stamped and back < -RESTART_S:
                 raise LogError(
-                    f"the stamps of {topic} go back by {-back:.0f} s in the middle, because a "
-                    "simulation or a played bag began again: record each drive in its own bag"
+                    f"the stamps of {topic} go back by {-back:.0f} s in the middle of the bag, "
+                    "because a simulation or a played bag restarted: record each drive in its own "
+                    "bag"
                 )
         start = since_ns / NS_PER_S
         if all(topic.stamped for topic in used):
@@ -405,8 +406,8 @@ class _Log:
             if apart <= CLOCKS_APART_S:
                 return [stamps + start for stamps in made]
             self._notes.append(
-                f"the stamps of the topics are of different clocks, {apart:.3g} s apart: each "
-                "topic's are moved to the clock of the recording"
+                f"the stamps of the topics come from different clocks, {apart:.3g} s apart: the "
+                "tool moves the stamps of each topic to the clock of the recording"
             )
         return [
             (on_arrival_clock(c, m) if topic.stamped else c) + start

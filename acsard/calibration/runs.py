@@ -218,11 +218,11 @@ def runs(table: Table) -> Log:
     for number, name in enumerate(table.names):
         rows = np.flatnonzero(timed & (table.runs == number))
         parts = _restarts(t, rows, columns)
-        notes.add("each restart of the time begins a new run: {} of them", len(parts) - 1)
+        notes.add("each jump back of the time begins a new run: {} of them", len(parts) - 1)
         _in_seconds(name, t, parts, columns)
         whole, parts = len(parts), [piece for part in parts for piece in _pauses(t, part, columns)]
         notes.add(
-            f"each silence of the wheels of over {PAUSE_S:g} s begins a new run: {{}} of them",
+            f"each pause of over {PAUSE_S:g} s in the wheel speeds begins a new run: {{}} of them",
             len(parts) - whole,
         )
         for at, part in enumerate(parts):
@@ -253,8 +253,8 @@ def _sides(columns: dict[str, Floats], notes: Notes) -> tuple[Floats, Floats]:
         apart = _apart(columns, front, rear)
         if apart > NOTED:
             notes.add(
-                f"{front} and {rear} differ by {apart:.0%} of their distance: the tool uses their "
-                "mean"
+                f"{front} and {rear} differ by {apart:.0%} of the distance driven: the tool uses "
+                "their mean"
             )
     fr, fl, rl, rr = (columns[name] for name in FOUR)
     return (fl + rl) / 2, (fr + rr) / 2
@@ -277,8 +277,8 @@ def _apart(columns: dict[str, Floats], front: str, rear: str) -> float:
     least, most = (front, rear) if np.abs(a).sum() < np.abs(b).sum() else (rear, front)
     sizes = sorted(float(np.abs(speeds).sum()) for speeds in (a, b))
     raise LogError(
-        f"{least} hardly turns while {most} does: name the wheels that work left and right, and "
-        "omit the others"
+        f"{least} hardly turns while {most} does: rename the columns of the working wheels to "
+        "left and right, and omit the others"
         if sizes[0] < (1 - APART) * sizes[1]
         else f"{front} and {rear} turn in opposite directions: a sign is wrong, or columns are "
         "swapped"
@@ -321,13 +321,14 @@ def _in_seconds(name: str, t: Floats, parts: list[Rows], columns: dict[str, Floa
         period = float(np.median(np.diff(once))) if len(once) > 1 else np.inf
         if len(times) > REPEATED * len(once) and period > ROUNDED_S:
             raise LogError(
-                f"run {name or 1}: {len(times)} rows of wheel speeds have {len(once)} different "
-                "times, because t was rounded: write it with 3 decimals of a second"
+                f"run {name or 1}: {len(times)} rows of wheel speeds have only {len(once)} "
+                "different times, because t was rounded: write t in seconds with 3 decimals"
             )
         if period > SLOWEST_S:
             raise LogError(
                 f"run {name or 1}: {period:g} s between two rows of wheel speeds: t must be in "
-                "seconds (divide ms by 1000, ns by 1e9), and the wheels recorded at 5 Hz or more"
+                "seconds (divide ms by 1000, ns by 1e9), and the wheel speeds must be recorded at "
+                "5 Hz or more"
             )
 
 
@@ -381,8 +382,8 @@ def _remove_repeats(drives: Iterable[tuple[str, Streams]], notes: Notes) -> None
         if rolling <= AGAIN * sum(int(rolls.sum()) for *_, rolls in found):
             continue
         notes.add(
-            f"{what} repeat their value between samples: {{}} such rows while the wheels turn are "
-            "left out",
+            f"{what} repeat their last value between samples: such rows are left out, {{}} of "
+            "them while the wheels turn",
             rolling,
         )
         for streams, again, _ in found:

@@ -204,8 +204,8 @@ def prepared(
         rows = heading.level(every)
     if headings is not None and not len(rows.turned):
         raise RefusedError(
-            f"{headings.source} has no samples while the wheels turn: record both at the same "
-            "time, with times of one clock"
+            f"{headings.source} has no samples while the wheels turn: record it at the same time "
+            "as the wheels, with times of one clock"
         )
     segments = positions.segments(driven, parts)
     plausibility.rolls_enough(rows, spins=headings is not None and not segments)
@@ -229,8 +229,8 @@ def prepared(
         start = by_positions.parameters.copy()
     if not sources:
         raise RefusedError(
-            "there are no positions or turn rates while the robot drives: record both at the same "
-            "time, with times of one clock"
+            "there are no positions or turn rates while the robot drives: record one of them at "
+            "the same time as the wheels, with times of one clock"
         )
     plausibility.turns_the_right_way(headings.source if headings else "", sides, by_positions)
     if sides is not None:
@@ -472,13 +472,13 @@ def _of_noise(shown: Noise | None) -> Iterator[str]:
     """Yield a sentence if some noise stays as configured. `shown` is the result of `_noise`."""
     if shown is None or not shown.better:
         yield (
-            "the variances per metre and per radian stay as configured, because another "
-            "drive may have other errors than this log"
+            "the variances per metre and per radian stay as configured, because the errors of "
+            "another drive may differ from those of this log"
         )
     elif not shown.places:
         yield (
-            "the chance errors of the distance stay as configured, because a gyro does not show "
-            "them: positions do"
+            "the random errors of the distance stay as configured, because only positions show "
+            "them, and a gyro does not"
         )
 
 

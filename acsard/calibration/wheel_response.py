@@ -65,7 +65,7 @@ class WheelResponse(Struct, frozen=True):
     """Response time that fits best, s."""
     proposed: float | None
     """Response time to configure if `false_fault` is true, s. It causes no fault in this log. It is
-    None if every tried response time causes a fault."""
+    None if every tried time from `seconds` on leaves less reserve than `SPARE`."""
     present: float
     """Configured response time, s."""
     false_fault: bool
@@ -83,12 +83,19 @@ class WheelResponse(Struct, frozen=True):
         """Return a sentence about the response time, and one about `fastest` if that is finite."""
         follow = f"the wheels follow their commands with a response time of {self.seconds:.2g} s"
         if self.false_fault:
-            then = f", and feedback.response_time = {self.present:g} would take them for faulty: "
-            then += (
-                "so would every other value; if they are healthy, raise feedback.fault_time"
-                if self.proposed is None
-                else f"the new value is {self.proposed:g}"
+            then = (
+                f", so the daemon would take them for faulty with feedback.response_time = "
+                f"{self.present:g}: "
             )
+            if self.proposed is not None:
+                then += f"the new value is {self.proposed:g}"
+            elif np.isfinite(self.fastest):
+                then += "lower limits.wheel_speed first"
+            else:
+                then += (
+                    "no longer response time leaves enough reserve; if the wheels are healthy, "
+                    "raise feedback.fault_time"
+                )
         elif max(self.seconds / self.present, self.present / self.seconds) > SAME:
             then = f". feedback.response_time is {self.present:g}, and causes no fault in this log"
         else:

@@ -117,7 +117,7 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
         if board.lost and not near:
             return outcomes.find("encoder counts: damaged", share=board.lost)
         counts = configured if near else round(measured)
-        how = f"measured against the speeds, {measured:.0f} within {AGREES:.0%}"
+        how = f"measured against the speeds: {measured:.0f}, which agrees within {AGREES:.0%}"
     elif abs(measured - named) > AGREES * named:
         return outcomes.find("encoder counts: misnamed", named=named, measured=measured)
     else:

@@ -77,7 +77,7 @@ def _pressed(board: Board, operator: Operator, asked: Input, inputs: list[Input]
             break
     others = [each.name for each in inputs if each.number in seen - {asked.number}]
     if asked.number not in seen:
-        instead = f"; instead that of the {' and the '.join(others)}" if others else ""
+        instead = f"; instead the board reported the {' and the '.join(others)}" if others else ""
         return f"{asked.name}: no press was reported{instead}"
     if others:
         return f"{asked.name}: the board also reported the {' and the '.join(others)}"

@@ -22,31 +22,31 @@ FAIL baud rate: other | {rate}, not {configured} baud
     {heard} at the configured {configured} baud; good lines at {rate}
     -> write mcu.baud_rate = {rate}; the check goes on with it
 FAIL baud rate: nothing | nothing received
-    {heard} at {configured} baud, and no good line at any other
+    {heard} at {configured} baud, and no good line at any other rate
     -> is this the right port (`acsard ports`), does the board have power, does its firmware answer,
     are TX and RX swapped?
 FAIL baud rate: cut | pieces of lines
-    at {configured} baud {heard}; no good line at any other
+    at {configured} baud {heard}; no good line at any other rate
     -> the firmware cuts its replies short or omits the line end: it must send all four values and
     Serial.println() in one reply; is its send buffer too small, or does it restart while it writes?
 FAIL baud rate: foreign | other bytes in the lines
-    at {configured} baud {heard}; no good line at any other
+    at {configured} baud {heard}; no good line at any other rate
     -> the baud rate is right, but other bytes are on the line: a debug print of the firmware, or
-    those of a second program at this port. If neither, it is noise: use one ground for board and
-    computer, and a short cable away from the motors' leads
+    writes of a second program to this port. If it is neither, it is noise: use one ground for board
+    and computer, and a short cable away from the motors' leads
 FAIL baud rate: garbage | only garbage
-    at {configured} baud {heard}; no good line at any other
+    at {configured} baud {heard}; no good line at any other rate
     -> does the firmware send at 9600 to 115200 baud, at TTL level and not RS-232? is this the right
     port (`acsard ports`), and is the board's ground connected to the computer's?
 FAIL baud rate: few | few good lines
-    at {configured} baud {heard}; fewer good lines at any other
+    at {configured} baud {heard}; fewer good lines at any other rate
     -> use a short cable away from the motors' leads, a common ground, or a lower baud rate at both
     ends
 FAIL baud rate: statuses | only status lines
-    at {configured} baud {heard}; no good line at any other
+    at {configured} baud {heard}; no good line at any other rate
     -> the board hears nothing: connect this computer's TX to the board's RX
 FAIL baud rate: sparse | good lines, but too seldom
-    at {configured} baud {heard}; no good line at any other
+    at {configured} baud {heard}; no good line at any other rate
     -> the board must answer each line, or report by its own clock at least every 0.25 s; does
     delay() or a slow print block its loop?
 
@@ -122,16 +122,16 @@ FAIL? lost lines: silent | {share:.0%} of {lines}
     -> check the lead from the board's TX to the computer's RX; use a short cable away from the
     motors' leads, a common ground, or a lower baud rate at both ends
 
-PASS lost where: not seen | none of {sent} more
-FAIL? lost where: there | {there} of {sent} there, {back} back
+PASS lost where: not seen | none of {sent} more lines
+FAIL? lost where: there | of {sent} lines, {there} lost on the way there, {back} on the way back
     lines are lost on the way to the board: the motors did not follow these lines
     -> check the lead from the computer's TX to the board's RX and the ground, or use a lower baud
     rate; does the firmware read its buffer often enough?
-FAIL? lost where: back | {there} of {sent} there, {back} back
+FAIL? lost where: back | of {sent} lines, {there} lost on the way there, {back} on the way back
     answers are lost on their way back: the motors followed the lines
     -> check the lead from the board's TX to the computer's RX and the ground, or use a lower baud
     rate at both ends
-FAIL? lost where: both | {there} of {sent} there, {back} back
+FAIL? lost where: both | of {sent} lines, {there} lost on the way there, {back} on the way back
     lines and answers are lost
     -> check first the ground of board and computer, then cable and plugs; or use a lower baud rate
     at both ends
@@ -220,8 +220,8 @@ SKIPPED encoder counts: none
     the firmware sends no counts
 WARN? encoder counts: coarse | about {about:.0f} per turn
     the firmware sends no counts, and its speeds jump by one count of a coarse encoder from line to
-    line: after one square of driving the heading is wrong by degrees unless the daemon knows the
-    counts
+    line: unless the daemon knows the counts, the heading is wrong by degrees after the robot has
+    driven one square
     -> write mcu.encoder_counts = the exact counts per wheel turn: the encoder's counts times the
     gear ratio (two channels give four counts for each pulse)
 SKIPPED encoder counts: damaged
@@ -258,7 +258,7 @@ FAIL watchdog: none | none within {seconds:.1f} s
     robot drives on
     -> the firmware must stop the motors 300 ms after the last valid line
 FAIL? watchdog: late | {figure}
-    when the cable is pulled, the robot drives on for {seconds:.1f} s, which is as many metres at
+    when the cable is pulled, the robot drives on for {seconds:.1f} s, which is {seconds:.1f} m at
     1 m/s
     -> set the firmware's watchdog to 300 ms
 WARN? watchdog: early | {figure}
@@ -308,7 +308,7 @@ FAIL runaway: along | {letter}: commanded {told:.1f}, measured {seen:.1f} rad/s
     -> are the counts per turn in the firmware too low, or is its control loop unstable?
 FAIL runaway: against | {letter}: commanded {told:.1f}, measured {seen:.1f} rad/s
     the encoder of {motor} reports more than {most:g} rad/s, against the command: the firmware's
-    control loop drives it away
+    control loop makes the motor run away
     -> swap this motor's two leads, or A and B of its encoder
 FAIL stop: turns | turns {seconds:g} s after zeros
     according to its encoder, {motors} still turns although this computer sends zeros
@@ -339,8 +339,8 @@ FAIL restarts: pin | {times}
     the reset pin?
 FAIL restarts: silence | {times}
     the board restarted {told}: each time this computer had sent nothing for {silent:.1f} s or more
-    -> the firmware's watchdog restarts the whole board when no line comes: let it stop the motors
-    and go on, and restart the board only when the firmware hangs
+    -> the firmware's watchdog restarts the whole board when no line comes: let that watchdog only
+    stop the motors, and restart the board only when the firmware hangs
 FAIL restarts: gone | {times}
     the board restarted {told}, and did not answer again within {patience:g} s
     -> switch it off and on; does its bootloader hang after a reset by the watchdog, or does its

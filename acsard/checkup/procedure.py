@@ -46,14 +46,14 @@ STEPS = (
 """Names of all steps. After an early end of the check, one finding lists those that did not run."""
 
 SILENT: tuple[tuple[str, Callable[[Board], Finding | None]], ...] = (
-    ("listening at the configured baud rate, 3 s, then at the others", dialect.baud),
+    ("listening for 3 s at the configured baud rate, then at the others", dialect.baud),
     ("asking the board for its name", dialect.identity),
     ("measuring how often the board answers", dialect.rate),
     ("measuring how fast the board answers", dialect.trip),
     ("trying the comma at the end of the line", dialect.form),
     ("checking the form of the replies", dialect.replies),
     ("asking the board for the link check", dialect.check),
-    ("counting lost lines, 3 s and more", line_loss.finding),
+    ("counting lost lines for 3 s or more", line_loss.finding),
 )
 """The steps that send only zeros and questions, in order, each with a message for the operator."""
 
@@ -148,7 +148,9 @@ class _Steps:
         right = [channel.motor for channel in channels if channel.kind in ("right", "off")]
         self._measure("", lambda: line_loss.direction(board, operator, right))
         self._take("", lambda: encoder_counts.finding(board, right))
-        together = "the motors turn together, then this computer sends nothing; this may repeat"
+        together = (
+            "the motors turn together, then this computer sends nothing; this step may repeat"
+        )
         self._measure(together, lambda: watchdog.finding(board, right))
         broken = "sending broken lines; no motor may turn"
         self._measure(broken, lambda: damage.finding(board, right))

@@ -35,8 +35,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--follow",
         action="store_true",
-        help="continue until Ctrl-C; every S seconds print the result since the start, or of "
-        "the last ten minutes at most",
+        help="run until Ctrl-C and print a result every S seconds. Each result covers the time "
+        "since the start, but at most the last ten minutes",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object a line")
     add_bus(parser)

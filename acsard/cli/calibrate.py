@@ -69,9 +69,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME",
-        help="with --log and a ROS 2 bag: use this topic, if several fit. If it is an Imu, a "
-        "PoseStamped or an Odometry, the wheels are compared with no other topic; repeat the "
-        "option for more",
+        help="with --log and a ROS 2 bag: the topic to use if several fit; repeat the option "
+        "to name more. If you name topics with Imu, PoseStamped or Odometry messages, the wheels "
+        "are compared only with those topics",
     )
     parser.add_argument(
         "--yaw-axis",
@@ -154,7 +154,8 @@ def _require_fitting(args: argparse.Namespace) -> None:
         if getattr(args, name):
             option = "--" + name.replace("_", "-")
             raise UsageError(
-                f"{option} is for a guided drive and --log for a recorded one: leave one out"
+                f"{option} is for a guided drive, but --log reads a recorded drive: leave one of "
+                "the two options out"
             )
 
 
@@ -183,14 +184,15 @@ def _add_drive_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--positions",
         metavar="KEY",
-        help="for --method positions: the key that has the robot's positions (PoseStamped or "
-        "Odometry in JSON, msgpack or CDR): one that `acsard topics` lists, for example sim/pose, "
-        "or a full key",
+        help="for --method positions: the key on which the robot's positions are published "
+        "(PoseStamped or Odometry in JSON, msgpack or CDR). Give a key that `acsard topics` lists, "
+        "for example sim/pose, or a full key",
     )
     parser.add_argument(
         "--positions-at",
         metavar="ENDPOINT",
-        help="where that key is published if the daemon does not have it, for example a router",
+        help="address at which the key of --positions is published if the daemon does not have it, "
+        "for example the address of a router",
     )
     parser.add_argument(
         "--imu",
@@ -283,8 +285,8 @@ def _differing(config: Config, mine: Config, where: str) -> str:
         return ""
     return (
         f"the daemon runs with drive.wheel_radius = {same[0]:g} and drive.wheel_separation "
-        f"= {same[1]:g}, but {where} has other values: give --config the file that the "
-        "daemon uses"
+        f"= {same[1]:g}, but {where} has other values: name the daemon's file with "
+        "--config"
     )
 
 

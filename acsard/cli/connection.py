@@ -117,7 +117,7 @@ def require_asked(key: str) -> None:
     """
     if set(key.partition("?")[0]) & set("*$"):
         raise UsageError(
-            f"{key} stands for several keys, but get asks one; `acsard topics` lists them"
+            f"{key} stands for several keys, but get queries only one; `acsard topics` lists them"
         )
     row = row_of(key)
     if row is None:

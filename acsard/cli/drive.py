@@ -24,7 +24,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
             type=float,
             default=speed,
             metavar=unit,
-            help="speed at the start, which keys change (default: %(default)s)",
+            help="speed at the start; keys change it during the drive (default: %(default)s)",
         )
     parser.add_argument(
         "--source", default="teleop", help="command source to send as (default: teleop)"
@@ -36,7 +36,8 @@ def main(args: argparse.Namespace) -> int:
     require_one(args)
     if not sys.stdin.isatty():
         raise UsageError(
-            "drive reads single keys and needs a terminal; a program uses acsard.client"
+            "drive reads single keys, so run it in a terminal; a program must use acsard.client "
+            "instead"
         )
     with connected(args, args.source) as robot:
         if robot.where.tls and not has((us := robot.whoami()).role, COMMAND_ROLE):

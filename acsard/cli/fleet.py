@@ -30,7 +30,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--json",
         action="store_true",
-        help="print one list as JSON and end, with the whole `state` of each robot",
+        help="print one JSON list with the whole `state` of each robot, and end",
     )
     add_bus(parser, MANY + " (the default)")
 

@@ -47,7 +47,7 @@ def main(args: argparse.Namespace) -> int:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, lambda *_: bridge.end())
         try:
-            may = "; it shows and stops the robot; with --drive it also accepts commands"
+            may = "; viewers can see and stop the robot, and with --drive they can also drive it"
             where = f"ws://{address[0]}:{address[1]}: connect Foxglove there"
             told = f"{robot.where.robot_id} at {where}{'' if args.drive else may}"
             print(told, flush=True)

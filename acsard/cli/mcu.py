@@ -55,8 +55,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     check.add_argument(
         "--yes",
         action="store_true",
-        help="ask no questions: for the simulator, or on a robot only together with "
-        "--wheels-are-lifted",
+        help="ask no questions. With the simulator, this option is enough; with a robot, "
+        "--wheels-are-lifted is needed, too",
     )
     check.add_argument(
         "--wheels-are-lifted",
@@ -127,8 +127,8 @@ def _prompt(args: argparse.Namespace, port: str) -> TerminalPrompt | NoPrompt | 
     if port == SIMULATOR and args.port != SIMULATOR:
         raise UsageError(
             "no port is configured, so there is no board to check (mcu.port is the simulator, "
-            '"sim"): `acsard ports` lists the serial devices, then `acsard mcu check --port '
-            "DEVICE`; `--port sim` checks the built-in simulator",
+            '"sim"). Either find the device with `acsard ports` and run `acsard mcu check --port '
+            "DEVICE`, or check the built-in simulator with `--port sim`",
         )
     if args.json_lines:
         require_asking(args)
@@ -147,7 +147,7 @@ def _prompt(args: argparse.Namespace, port: str) -> TerminalPrompt | NoPrompt | 
         what = f"a pty of {master.name}" if master else "no simulator of acsard's"
         raise UsageError(
             f"{port} is {what}: a robot may be behind it, and --yes would turn its wheels without "
-            "a question. Leave --yes out; or lift the wheels, stay with the robot, and add "
+            "a question. Either leave --yes out, or lift the wheels, stay with the robot and add "
             "--wheels-are-lifted",
         )
     return NoPrompt(args.json)

@@ -69,14 +69,14 @@ EXPORT = """\
 Write the messages of a recorded robot as a file for Foxglove, Lichtblick, PlotJuggler and `ros2 bag
 play`. The file is MCAP with odom, tf, tf_static, joint_states, cmd_vel_out, cmd_vel_in of each
 source, diagnostics, state and log as ROS 2 messages, and with their definitions. With --config,
-write the messages that the robot would have published with another configuration. A part that a
-damaged place makes unreadable is left out. Exit codes: 0 complete, 65 a part is left out.
+write the messages that the robot would have published with another configuration. A part that
+cannot be read because of damage is left out. Exit codes: 0 complete, 65 a part is left out.
 """
 
 REPORT = """\
 Draw a recording as one HTML file that needs no network. Needs the library plotly; if it is missing,
-a message gives the command that installs it. A part that a damaged place makes unreadable is left
-out and named; the exit code stays 0.
+a message gives the command that installs it. A part that cannot be read because of damage is
+left out and named; the exit code stays 0.
 """
 
 
@@ -95,10 +95,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     shown.set_defaults(main=main_show)
     replay = actions.add_parser(
         "replay",
-        help="decide again on the recorded inputs, without a robot, and compare the results",
+        help="run the recorded inputs through the program again, without a robot, and compare the "
+        "results",
         description="Run the recorded inputs through the robot again, and compare every line, "
         "pose, mode, reason and event with the recorded ones. With --config, show what another "
-        "configuration would have changed. A part that a damaged place makes unreadable is not "
+        "configuration would have changed. A part that cannot be read because of damage is not "
         "compared. Exit codes: 0 everything is the same, 1 something differs, 65 a part was not "
         "compared and the rest is the same.",
     )
@@ -126,7 +127,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     report.set_defaults(main=main_report)
     number = "its number in the list of `acsard recording`"
     one = f"a recording, or {number} (default: the newest)"
-    default = "the newest; all if --from or --to has a time"
+    default = "the newest, or all if --from or --to is a date or a time"
     several = f"a recording, {number}, or `all` (default: {default})"
     for action, words in ((shown, several), (replay, one), (exported, several), (report, several)):
         action.add_argument("file", nargs="?", metavar="FILE", help=words)
@@ -418,9 +419,9 @@ def _files_to_write(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
     parts = _parts(args)
     if args.new is not None and len(parts) > 1:
         raise UsageError(
-            f"the recording of that time has {len(parts)} parts, because the daemon restarted or "
-            "steps are missing, and each part becomes a file of its own: leave out NEW, or choose "
-            "a shorter time with --from and --to"
+            f"this recording has {len(parts)} separate parts, because the daemon restarted or "
+            "steps are missing, and acsard writes each part into its own file: either leave out "
+            "NEW, or choose a shorter span of time with --from and --to"
         )
     return parts
 
@@ -441,8 +442,8 @@ def _range(args: argparse.Namespace) -> tuple[float, float]:
     """Return the times of --from and --to, s since 1970; infinite for an option that is missing."""
     if any(isinstance(when, Offset) for when in (args.begin, args.end)):
         raise UsageError(
-            "a number of seconds counts from the beginning of one recording: name that recording, "
-            f"or write a time, for example {EXAMPLES}"
+            "--from or --to in seconds counts from the beginning of one recording: either name "
+            f"that recording, or write a time, for example {EXAMPLES}"
         )
     try:
         return resolve(args.begin, args.end, time.time())
@@ -478,8 +479,8 @@ def _files(args: argparse.Namespace) -> tuple[Path, list[Path]]:
     except FileNotFoundError:
         raise MendableError(
             f"nothing is recorded in {where}: the directory does not exist. The service records "
-            "by itself; `acsard run --record DIRECTORY` records into DIRECTORY, and --directory "
-            "DIRECTORY reads from there",
+            "automatically. Without the service, record with `acsard run --record DIRECTORY`, then "
+            "name the same directory here with --directory DIRECTORY",
         ) from None
     except OSError as error:
         raise ExitError(

@@ -59,8 +59,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--record",
         metavar="DIRECTORY",
-        help="record all inputs and all lines to the board in this directory "
-        "(record.directory); `acsard recording` reads it",
+        help="directory in which the daemon records all inputs and all lines that it sends to the "
+        "board (record.directory); `acsard recording` reads it",
     )
     parser.add_argument(
         "--no-gateway",

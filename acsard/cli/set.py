@@ -48,15 +48,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     files.add_argument(
         "--keep",
         action="store_true",
-        help="the robot also writes them into its own configuration file, and keeps its comments. "
-        "Nothing is set if its daemon may not change that file, if git tracks the file, or if the "
-        "robot lacks the library tomlkit",
+        help="the robot also writes the settings into its own configuration file, whose comments "
+        "stay. Nothing is set if the daemon may not change that file, if git tracks the file, or "
+        "if the robot lacks the library tomlkit",
     )
     files.add_argument(
         "--write",
         action="store_true",
-        help="also write them into the local configuration file and keep its comments (needs an "
-        f"extra: {install('write')})",
+        help="also write the settings into the configuration file of this machine, whose comments "
+        f"stay (needs an extra: {install('write')})",
     )
     parser.add_argument("--json", action="store_true", help="print the answer or the list as JSON")
     add_bus(parser, MANY + " (to change settings)")
@@ -117,8 +117,7 @@ def _require_for_many(args: argparse.Namespace, settings: dict[str, Plain]) -> N
     if args.write:
         raise UsageError(
             f"--write changes only the file of this machine, but --id '{args.id}' names several "
-            "robots: "
-            "with --keep each robot writes its own file"
+            "robots: use --keep instead, and each robot writes its own file"
         )
 
 
@@ -148,9 +147,9 @@ def _file(path: str | None, settings: dict[str, Plain]) -> Path:
     if any(key.startswith("commands.sources.") for key in settings):
         raise UsageError(
             "--write cannot change [[commands.sources]]: set the timeout without --write, and "
-            "write it into the file yourself. If the file has no [[commands.sources]], copy all "
-            "of these tables from `acsard check`, because those in the file replace the "
-            "built-in ones"
+            "write it into the file yourself. If the file has no [[commands.sources]] yet, copy "
+            "all of these tables from the output of `acsard check` first, because the file's "
+            "tables replace all built-in ones"
         )
     return writable(path)
 

@@ -42,9 +42,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help=f"simulate a fault; may be repeated: {', '.join(FAULTS)}; with motors (a to d) or "
         f"numbers: {', '.join(_with_names())}; reset=SECONDS (repeatedly). START is the time in "
-        "seconds until the fault begins; with 0 SECONDS it stays. EVERY is the time in seconds "
-        "from one stall to the next. BUMPER is 1 to 4. The battery begins with PERCENT of its "
-        "charge, and a full one lasts MINUTES at rest",
+        "seconds until the fault begins. If SECONDS is 0, the fault does not end. EVERY is the "
+        "time in seconds from one stall to the next. BUMPER is 1 to 4. The battery starts with "
+        "PERCENT of its charge; a full battery lasts MINUTES while the robot is at rest",
     )
     parser.add_argument(
         "--link", metavar="PATH", help="also make a symbolic link at PATH to the device"

@@ -63,17 +63,17 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     more.set_defaults(main=main_add)
     renew = actions.add_parser(
         "renew",
-        help="replace a certificate that ends soon by a new one of the same authority",
-        description="Replace the robot's certificate, or with --name one that `tls add` made, "
-        "before it ends. The new one has the names and addresses of the old one. All other "
-        "certificates stay valid.",
+        help="replace a certificate that expires soon with a new one from the same authority",
+        description="Replace the robot's certificate before it expires. With --name, replace a "
+        "certificate that `tls add` made instead. The new certificate has the names and addresses "
+        "of the old one. All other certificates stay valid.",
     )
     renew.add_argument(
         "--name",
         type=_name,
         metavar="NAME",
-        help="the certificate in clients/NAME of the directory, for example robot4 of a fleet; "
-        "without it, the robot's own",
+        help="renew the certificate in the subdirectory clients/NAME, for example that of robot4 "
+        "in a fleet (default: the robot's own certificate)",
     )
     renew.set_defaults(main=main_renew)
     for action in (init, more, renew):
@@ -86,7 +86,7 @@ def _add_router(actions: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "router",
         help="print the configuration of a fleet's router",
         description="Print router.json5 for `acsard router` or zenohd. It says what each robot "
-        "and the certificate of each person may do. The steps are in "
+        "and each person's certificate may do. The steps are in "
         "deploy/zenoh/README.md.",
     )
     router.add_argument("robots", nargs="+", metavar="ROBOT", help="ids of the robots")
@@ -221,7 +221,7 @@ def _admit_service(directory: Path) -> None:
     if step is None:
         return
     step.do()
-    print(f"{step}\nThis is for the service's TLS gateway. Check the networks in it, then run:")
+    print(f"{step}\nThis file is for the service's TLS gateway. Check its networks, then run:")
     print("systemctl daemon-reload && systemctl restart acsard\n")
 
 
@@ -244,18 +244,21 @@ def _address(text: str) -> str:
 
 _ADDED = """\
 {place} is for {name}. Add the name to its role in the robot's acsard.toml, and keep the names
-that are there. The lines below have the names of {where}; --write FILE changes a file
-itself. Behind a fleet's router leave the lines out, because router.json5 has the roles.
+that are there. The lines below include the names in {where}. With --write FILE, this command
+changes the file for you. If the robot connects to a fleet's router, leave the lines out, because
+router.json5 has the roles.
 """
 
 TAKEN = """\
-`acsard router`, `acsard web` and the gateway of `acsard run` use it within 5 s by themselves. The
-gateway and the router disconnect their clients for about a second for this, and a robot that one
-of those clients drives ramps to zero. `acsard gateway` that you started by hand ends with code 1:
-start it again. A robot that connects to a router uses it for its next connection. Until then
-`acsard doctor` warns of the old one; a restart of `acsard run` ends the warning at once.
+`acsard router`, `acsard web` and the gateway of `acsard run` use the new certificate within 5 s by
+themselves. For this, the gateway and the router disconnect their clients for about a second, and a
+robot that one of those clients drives ramps to zero. If you started `acsard gateway` by hand, it
+ends with code 1: start it again. A robot that connects to a router uses the new certificate for its
+next connection. Until then, `acsard doctor` warns of the old certificate; a restart of `acsard run`
+ends the warning at once.
 
-A service of systemd has copies of the files. Type for it, where it runs; the robot drives on:
+A systemd service has copies of the files. To renew the copies, run these commands on the machine
+of the service. The robot keeps driving meanwhile:
 
   sudo systemctl try-reload-or-restart acsard-gateway acsard-web
   sudo systemctl reload acsard     if the robot connects to a router

@@ -146,9 +146,9 @@ def _invite(args: argparse.Namespace, config: Config, where: str) -> int:
     urls = invitations(listen, tls)
     if not urls:
         raise UsageError(
-            f"no browser could use the link: web.address in {where} has no https://. Add "
-            '"https://0.0.0.0:8443" there, or use another file (--config) or --address; '
-            "`acsard tls init` makes a certificate"
+            f"no browser could use the link: web.address in {where} has no https://. Either "
+            'add "https://0.0.0.0:8443" there, or name another file with --config, or give an '
+            "https:// address with --address; `acsard tls init` makes a certificate"
         )
     vault = _vault(args, config)
     days = 0 if args.hours else args.days or USUAL_DAYS

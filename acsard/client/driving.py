@@ -188,8 +188,8 @@ class _Drive:
                 "the daemon's state cannot be read: does the daemon have another version? Use the "
                 "same version here"
                 if watch.unreadable
-                else f"nothing received from the daemon for {watch.patience_s:g} s: does it run, "
-                "with this robot.id? `acsard fleet` lists the robots"
+                else f"nothing received from the daemon for {watch.patience_s:g} s: is it "
+                "running with this robot.id? `acsard fleet` lists the robots"
             )
 
     def require(self, grace: float) -> None:

@@ -294,7 +294,9 @@ class LatchFile:
 
     @property
     def _again(self) -> Event:
-        return Event("latch_file", f"a stop survives a restart again; it is stored in {self.where}")
+        return Event(
+            "latch_file", f"stops will survive a restart again; they are stored in {self.where}"
+        )
 
     def close(self) -> None:
         """Wait until the newest latches are written and synced, but at most `CLOSE_S`."""

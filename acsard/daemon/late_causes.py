@@ -229,7 +229,11 @@ CAUSES = (
     Cause("governor", governor, "choose the governor schedutil or performance"),
     Cause("quota", cgroup_quota, "raise CPUQuota= of the service, or --cpus of the container"),
     Cause("steal", stolen, "give the virtual machine a processor of its own"),
-    Cause("memory", memory, "free memory; the service locks the memory of the daemon"),
+    Cause(
+        "memory",
+        memory,
+        "free memory, or run acsard as the service, which locks the daemon's memory",
+    ),
     Cause("disk", disk, "find the program that uses the disk (`iotop`), or use a faster disk"),
     Cause(
         "processor",

@@ -195,7 +195,7 @@ class Bridge:
             if told.look(why, now_ns):
                 stays = f"drive {client}"
                 if told.told:
-                    words = f"your commands do not drive: {told.told}"
+                    words = f"your commands do not drive the robot: {told.told}"
                     self._notices.say("warning", "drive", words, stays=stays)
                 else:
                     self._notices.over(stays)

@@ -44,7 +44,10 @@ def encoding_of(encoding: str, schema_name: str) -> str:
     package, _, name = schema_name.partition("/")
     full = f"{package}/msg/{name.removeprefix('msg/')}"
     if full not in (TWISTS[0], STAMPED_TWISTS[0]):
-        text = f"a channel of the type {schema_name or '(none)'} does not drive: use {TWISTS[0]}"
+        text = (
+            f"a channel of the type {schema_name or '(none)'} cannot drive the robot: use "
+            f"{TWISTS[0]}"
+        )
         raise DecodeError("wrong_type", text)
     if encoding == "cdr":
         return f"{encoding_name('cdr')};{full}"
@@ -155,8 +158,8 @@ class Drives:
             self._notices.say(
                 "warning",
                 "drive",
-                "the panel publishes so seldom that the robot stops in between: set its publish "
-                "rate to 10 Hz or more",
+                "the panel publishes so seldom that the robot stops between its messages: set the "
+                "panel's publish rate to 10 Hz or more",
             )
 
     def withdrawn(self, client: int, channel: int) -> None:

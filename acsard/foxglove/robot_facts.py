@@ -64,8 +64,9 @@ def learn(robot: Client) -> Facts:
     forbidden, role, deaf = "", "maintainer", ""
     if robot.where.tls:
         deaf = (
-            "clients over TLS cannot receive the commands of the sources (/cmd_vel_in/…): see them "
-            "with `acsard foxglove` on the robot, or later with `acsard recording export`"
+            "clients over TLS cannot receive the commands of the sources (/cmd_vel_in/…): to see "
+            "these, either run `acsard foxglove` on the robot, or use `acsard recording export` "
+            "later"
         )
         us = robot.whoami()
         role = us.role

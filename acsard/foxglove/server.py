@@ -265,8 +265,8 @@ class Refusals(logging.Handler):
             self._notices.say(
                 "warning",
                 "refused",
-                "a client was refused, because it does not speak foxglove.sdk.v1 (Lichtblick "
-                "before 2026 does not) or is not a Foxglove viewer: use a newer viewer",
+                "a client was refused: either it is not a Foxglove viewer, or it is too old for "
+                "the protocol foxglove.sdk.v1 (as Lichtblick before 2026 is). Use a newer viewer",
             )
 
 

@@ -62,9 +62,9 @@ def writable(path: str | None) -> Path:
     where, text = find(path)
     if not text and not Path(where).is_file():
         raise MendableError(
-            "--write has no configuration file to change: run it on the robot, and name the "
-            "file with --config or make an acsard.toml there (it may be empty); a file on "
-            "another machine changes nothing on the robot",
+            "--write has no configuration file to change. Run this command on the robot, because a "
+            "file on another machine changes nothing there. Then either name the robot's file with "
+            "--config, or make an acsard.toml on the robot (it may be empty)",
         )
     if _is_reference(Path(where)):
         raise MendableError(

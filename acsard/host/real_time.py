@@ -41,9 +41,10 @@ def ask() -> str:
     if not refused:
         return ""
     return (
-        f"no permission for {', '.join(refused)}, so a period or a command can be late; run the "
-        "service, which has it (acsard service install), or give the user rtprio 10 and memlock "
-        "unlimited in /etc/security/limits.conf, or set control.real_time = false"
+        f"no permission for {', '.join(refused)}, so a control period or a command can be late. "
+        "Either run the service, which has permission (acsard service install), or give the user "
+        "rtprio 10 and memlock unlimited in /etc/security/limits.conf, or set "
+        "control.real_time = false"
     )
 
 

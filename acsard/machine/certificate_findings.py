@@ -56,7 +56,11 @@ def certificates(tls: str) -> Iterator[Finding]:
         return
     found = ends(tls)
     level, words = expiry(found, now().wall_ns)
-    mend = renewal(tls, first(found)[0]) if found else f"run {install('tls')}, to read them"
+    mend = (
+        renewal(tls, first(found)[0])
+        if found
+        else f"run {install('tls')}, so that acsard can read the certificates"
+    )
     yield Finding("certificates", LEVELS[level], f"{tls}: {words}", mend if level else "")
 
 
@@ -87,12 +91,12 @@ def renewal(tls: str, whose: str) -> str:
 def _mend_of_absent(directory: Path) -> str:
     """Return the remedy if a certificate file in the directory is missing or cannot be read."""
     if (directory / CA_KEY).exists():
-        return f"run `{_command('renew', directory)}`, or this command with sudo"
+        return f"run `{_command('renew', directory)}`, or run this command again with sudo"
     if not directory.is_dir() or not any(directory.iterdir()):
         return f"run `{_command('init', directory)}`, or copy the files of `acsard tls add` there"
     return (
-        f"run this command with sudo; or copy {CA}, {CERTIFICATE} and {KEY} there once more from "
-        f"the machine that has {CA_KEY}"
+        f"either run this command with sudo, or copy {CA}, {CERTIFICATE} and {KEY} there again "
+        f"from the machine that has {CA_KEY}"
     )
 
 

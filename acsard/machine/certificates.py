@@ -177,7 +177,7 @@ def _load(directory: Path) -> Authority:
         raise
     except FileNotFoundError:
         if (directory / CA).exists():
-            text = f"{directory} has no {CA_KEY}: bring the authority's key back for this command"
+            text = f"{directory} has no {CA_KEY}: copy the authority's key back there first"
         else:
             text = (
                 f"{directory} has no authority: name the directory of {CA_KEY} with --directory; "

@@ -61,22 +61,26 @@ WAYS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = (
     (
         lambda key: key in OPTIONS,
         "ok",
-        "by its options (`acsard run --help`) or another file, or the file has changed since",
-        "to keep {which}, write into the file: {lines}",
+        "from its options (`acsard run --help`) or from another file, or the file has changed "
+        "since the daemon started",
+        "to keep {which}, write these lines into the file: {lines}",
     ),
     (
         lambda key: key not in OPTIONS and live(key) is None,
         "warning",
-        "by another file or its environment, or the file has changed since",
-        "if it runs with another file, name that file with --config; otherwise write its values "
-        "into this file, or restart the daemon. The findings below are about the running daemon",
+        "from another file or from its environment, or the file has changed since the daemon "
+        "started",
+        "if the daemon runs with another file, name that file with --config; otherwise either "
+        "write the daemon's values into this file, or restart the daemon. The "
+        "findings below are about the running daemon",
     ),
     (
         lambda key: live(key) is not None,
         "warning",
-        "set while it ran, or by another file, or the file has changed since",
-        "its next start uses the file's values; `acsard set KEY VALUE --write` writes one into "
-        "the file",
+        "set while the daemon ran, or from another file, or the file has changed since the daemon "
+        "started",
+        "when the daemon starts again, it uses the file's values; `acsard set KEY VALUE --write` "
+        "writes a value into the file",
     ),
 )
 """Possible reasons why the daemon uses another value of a key than the configuration file has.
@@ -148,7 +152,7 @@ def compared(running: Running, file: Config) -> Iterator[Finding]:
     info, others = running.info, differences(running.config, file)
     who = f"acsard {info.version}, pid {info.pid}"
     if not others:
-        yield Finding("configuration", "ok", f"the running daemon ({who}) uses that of the file")
+        yield Finding("configuration", "ok", f"the running daemon ({who}) uses the file's values")
         return
     for belongs, level, how, mend in WAYS:
         its = {key: one for key, one in others.items() if belongs(key)}
@@ -205,7 +209,10 @@ def link(running: Running) -> Iterator[Finding]:
     # every loss of a link to it.
     if late := state.counters.get(f"link_lost{'' if config.mcu.simulated else '_host_stall'}", 0):
         late_times = many(late, "time")
-        text = f"lost {late_times} since the daemon's start because this computer did not run"
+        text = (
+            f"lost {late_times} since the daemon's start because this computer did not run the "
+            "daemon in time"
+        )
         yield Finding("link", "warning" if late > often else "ok", text, BUSY)
     problems = [*lost(passed, config), *(refused(passed) or refused(state.counters))]
     for text in problems:
@@ -239,7 +246,7 @@ def _bumpers(config: Config, state: RobotState, mend: str) -> Iterator[Finding]:
         # If the board has fallen silent, all bumpers count as pressed.
         todo = f"{RELEASE}; if none is pressed, {CHECK}; then `acsard call clear`"
         if safety.bumper == "away":
-            todo = f"drive straight away from it; if the robot is stopped, {todo}"
+            todo = f"drive away from it in a straight line; if the robot is stopped, {todo}"
         yield Finding("bumpers", "warning", bumpers.pressed_words(safety.bumpers, pressed), todo)
     elif pressed is not None:
         text = f"the board reports {many(len(pressed), 'bumper')}, and none is pressed"
@@ -278,7 +285,7 @@ def lost(passed: Mapping[str, int], config: Config) -> Iterator[str]:
         return
     yield (
         f"the board answered only {came} of {sent} lines that were sent in a second: lines or "
-        "answers get lost, or it reports by its own clock"
+        "answers get lost, or the board reports at times of its own instead of answering"
     )
 
 
@@ -327,7 +334,8 @@ GYRO_MENDS: dict[GyroDoes, str] = {
     "silent": "is its driver running, and does it publish on the key `imu` (ROS topic imu/data)?",
     "disagrees": "turn more slowly, or drive on other ground; if that does not help, check that "
     "its z axis points up and that it sends rad/s",
-    "reversed": "mount it with its z axis up, or let its driver negate angular_velocity.z",
+    "reversed": "if the wheels turn the right way (`acsard mcu check`), mount it with its z axis "
+    "up, or let its driver negate angular_velocity.z",
     "in degrees": "let its driver send rad/s: divide the degrees per second by 57.3",
     "dead": "check its cable and its driver: does angular_velocity.z change when the robot turns?",
     "not believed": "check that its z axis points up and that it sends rad/s; then `acsard "
@@ -386,8 +394,8 @@ def found(config: Config, address: Address) -> Running | Finding:
     if not answers(endpoint):
         if config.bus.mode == "client" and endpoint in map(reachable, config.bus.connect):
             text = (
-                f"cannot be asked: the router at {endpoint} is missing, and the daemon is "
-                "reached through it"
+                f"cannot be asked: the router at {endpoint} is missing, and this tool "
+                "reaches the daemon only through it"
             )
             mend = "start the router first; see `systemctl status acsard`"
             return Finding("daemon", "warning", text, mend)
@@ -414,7 +422,7 @@ def daemon(running: Running) -> Iterator[Finding]:
     yield from linked(rows)
     yield from certificate(rows.get("acsard: certificate"), running.here)
     if state.counters.get("gateway_full"):
-        text = "clients from the network took all connections at times: the log names them"
+        text = "at times, clients from the network used all connections: the log names them"
         mend = "remove the client's certificate from [access], or end its program"
         yield Finding("gateway", "warning", text, mend)
     if state.latch_file_error:
@@ -423,8 +431,8 @@ def daemon(running: Running) -> Iterator[Finding]:
     # If the daemon runs on this machine, `compared` has read its file.
     if state.settings_differ and not running.here:
         mend = (
-            "a restart of the daemon uses the file's values; `acsard set KEY VALUE --keep` writes "
-            "a present value into that file"
+            "when the daemon restarts, it uses the file's values; `acsard set KEY VALUE --keep` "
+            "writes a value into that file"
         )
         text = f"the settings in force differ from the robot's file: {state.settings_differ}"
         yield Finding("configuration", "warning", text, mend)
@@ -442,10 +450,11 @@ def certificate(row: DiagnosticStatus | None, here: bool) -> Iterator[Finding]:
     mend = "run `acsard doctor` on that machine, which examines its files"
     if here:
         mend = (
-            "if the files above are new, give the services their copies: `sudo systemctl "
-            "try-reload-or-restart acsard-gateway acsard-web`, and `sudo systemctl reload acsard` "
-            "on a robot that connects to a router. The robot uses them for its next connection; a "
-            "restart of its daemon, which stops the robot, ends this warning at once"
+            "if the files above are new, give the services copies of them: run `sudo systemctl "
+            "try-reload-or-restart acsard-gateway acsard-web`, and if the robot connects to a "
+            "router, also `sudo systemctl reload acsard`. The robot uses the new files for its "
+            "next connection. A restart of its daemon ends this warning at once, but stops the "
+            "robot"
         )
     text = f"the daemon's certificate that ends first: {row.message}"
     yield Finding("certificates", LEVELS[min(row.level, 2)], text, mend)
@@ -463,7 +472,9 @@ def late(running: Running) -> Iterator[Finding]:
     if missed > 0.01 * max(1, lines):
         told = [f"missed {missed} control periods"]
     for text in told:
-        mend = "`top` shows which other program uses the processor; the service runs real-time"
+        mend = (
+            "`top` shows which other program uses the processor; the service has real-time priority"
+        )
         yield Finding("daemon", "warning", text, mend)
     causes = [
         (event, cause)
@@ -490,7 +501,7 @@ def clocks(running: Running) -> Iterator[Finding]:
     if not running.here and abs(apart) > 0.4 + running.trip_ns / 2 / NS_PER_S:
         way = "ahead of" if apart > 0 else "behind"
         text = f"the daemon's clock is {abs(apart):.1f} s {way} this machine's"
-        yield Finding("clock", "warning", text, f"let NTP set both (timedatectl), {SIGN}")
+        yield Finding("clock", "warning", text, f"let NTP set both clocks (timedatectl), {SIGN}")
     replaced = counters.get("stamps_replaced", 0)
     if replaced:
         text = f"{replaced} commands came from clocks over 0.5 s ahead: their stamps were replaced"
@@ -513,7 +524,10 @@ def gyro(does: str, counters: Mapping[str, int]) -> Iterator[Finding]:
     if refused:
         most = sorted(refused.items(), key=lambda one: -one[1])
         told = ", ".join(f"{count} {reason.replace('_', ' ')}" for reason, count in most)
-        mend = "the log names the sender (imu_refused); send finite rad/s of one gyro, z up"
+        mend = (
+            "the log names the sender (imu_refused): let it send finite values in rad/s, from only "
+            "one gyro, whose z axis points up"
+        )
         yield Finding("gyro", "warning", f"samples on imu that were rejected: {told}", mend)
 
 

@@ -108,7 +108,8 @@ def serial_port(config: Config) -> Iterator[Finding]:
     if not os.path.exists(path):
         seen = ", ".join(port.device for port in serial_devices()) or "none"
         mend = (
-            "plug it in; names in by-id stay the same when it is plugged in again (`acsard ports`)"
+            "plug the board in; its name in /dev/serial/by-id stays the same when you plug it in "
+            "again (`acsard ports` lists the names)"
         )
         yield Finding("port", "failure", f"{path} does not exist; the ports are: {seen}", mend)
         return

@@ -426,8 +426,8 @@ def measured(recording: Recording) -> bytes:
             has_gyro = has_gyro or bool(step.inputs.gyro)
     if not has_gyro:
         raise RecordingError(
-            f"{recording.path} has no gyro samples with which to compare the wheels: record a "
-            "drive with [odometry] gyro = true, or export this one with --csv and add the columns "
-            "x and y of a sensor that measures positions"
+            f"{recording.path} has no gyro samples to compare the wheels with: either record a "
+            "drive with [odometry] gyro = true, or export this recording with --csv and add the "
+            "columns x and y of a sensor that measures positions"
         )
     return ("\n".join(lines) + "\n").encode()

@@ -362,8 +362,8 @@ def _failed_step(recording: Recording, robot: Robot, last: int | None) -> str:
     try:
         robot.step(step.inputs)
     except Exception as error:  # noqa: BLE001 - the failure may be any exception
-        return f"{name} ends this version too, by {type(error).__name__}: {short(error)}"
-    return f"{name} does not end the robot of this version"
+        return f"{name} ends this version too, with {type(error).__name__}: {short(error)}"
+    return f"{name} does not end this version"
 
 
 class DisplayReplay(_Source):
@@ -390,8 +390,8 @@ class DisplayReplay(_Source):
         except RecordingError as error:
             self._state, self.replay = None, Replay(self.config)
             self.notes.append(
-                "the replay begins with a robot that has just started, so it may differ from the "
-                f"recorded one: {error}"
+                "the replay begins with a robot that has just started, which may differ from the "
+                f"recorded robot: {error}"
             )
 
     def steps(self) -> Iterator[tuple[Step, Outputs, Robot]]:
@@ -525,7 +525,7 @@ class EventCopies:
             if event != copy:
                 if copy is not None or not missing:
                     self._differs(
-                        f"the events of the file differ: {_words(event)} in a step, but "
+                        f"the file has two versions of an event: {_words(event)} in a step, but "
                         f"{_words(copy)} in the channel `events`"
                     )
                 return

@@ -68,13 +68,13 @@ def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
         else:
             if not _finish_in_place(recording, part, cut):
                 message = (
-                    f"{whole.name} was cut off and gets no end record, because the disk is full; "
-                    "everything else is in it"
+                    f"{whole.name} was cut off. Because the disk is full, the file gets no end "
+                    "record, but it has all other data"
                 )
             part.rename(whole)
     except RecordingError as error:
         part.rename(whole)
-        return f"a recording was cut off and cannot be finished; it is now {whole.name}: {error}"
+        return f"a recording was cut off and cannot be finished; its file is {whole.name}: {error}"
     # The file time must be the time of the recording's end, not of its recovery.
     os.utime(whole, ns=(before.st_atime_ns, before.st_mtime_ns))
     return message

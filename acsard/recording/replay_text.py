@@ -52,10 +52,11 @@ def explain_verdict(other: bool) -> str:
     """
     computed = "with that configuration" if other else "by this version"
     return (
-        "(Each line to the board, each pose by odometry to the um, the mode, reason, link and "
-        "source of each step, and each event with its text and its client is computed "
-        f"{computed} from the recorded inputs, and compared with the recorded one. "
-        "The names in the inputs are compared with a checksum.)"
+        "(The replay computes its outputs "
+        f"{computed} from the recorded inputs, and compares them with the recorded outputs: each "
+        "line to the board; each pose by odometry, to the um; the mode, reason, link and source of "
+        "each step; and each event with its text and its client. A checksum verifies the names in "
+        "the inputs.)"
     )
 
 
@@ -75,10 +76,10 @@ def describe_gaps(gaps: Sequence[Gap], how: str) -> str:
     if skipped:
         parts.append(
             f"{many(skipped, 'step')} with {many(lines, 'line')} can be read, but not replayed, "
-            "because the next state of the robot comes after them"
+            "because the replay resumes only at the robot's next recorded state, which comes later"
         )
     if any(gap.end_lost for gap in gaps):
-        parts.append("the end of the recording cannot be read and may have more steps")
+        parts.append("the end of the recording cannot be read; more steps may be in it")
     because = f" ({'; '.join(parts)})" if parts else ""
     return f"{how}: {seconds:.1f} s in {many(len(gaps), 'damaged place')}{because}"
 
@@ -140,15 +141,18 @@ def explain_settings(
         speeds = _speeds(fastest(first.recorded.line), fastest(first.replayed.line))
         shaping = [key for key in keys if key.startswith(LINE_SETTINGS)]
         because = f", because of {', '.join(shaping[:MAX_KEYS])}" if shaping else ""
-        rows.append(f"the fastest wheel of that line: {speeds}{because}")
+        rows.append(f"the highest wheel speed in that line: {speeds}{because}")
     if fault is not None:
         seconds = (fault.at.mono_ns - began_ns) / 1e9
-        rows.append(f"in fault from {seconds:.3f} s on: {printable(fault.replayed.status[1])}")
+        rows.append(
+            f"the replayed robot is in fault from {seconds:.3f} s on: "
+            f"{printable(fault.replayed.status[1])}"
+        )
         if first is not None and first.number < fault.number:
             rows.append(
-                "  the recorded wheels obeyed the recorded commands, not those of this replay: a "
-                "robot with this configuration need not have had that fault. Only the part before "
-                "it counts"
+                "  the recorded wheels obeyed the recorded commands, not those of this replay, so "
+                "a robot with this configuration might not have had that fault. Only the part "
+                "before the fault is reliable"
             )
     return rows
 
@@ -166,8 +170,8 @@ def describe_outcome(comparison: Comparison) -> list[str]:
     rows = [
         f"{comparison.lines - comparison.lines_same} of {comparison.lines} lines to the board "
         f"differ from the recorded ones, and {comparison.steps - comparison.modes_same} of "
-        f"{comparison.steps} steps have another mode",
-        f"the fastest wheel of all lines: {_speeds(*comparison.fastest)}",
+        f"{comparison.steps} steps have a different mode",
+        f"the highest wheel speed in any line: {_speeds(*comparison.fastest)}",
     ]
     if comparison.end is not None:
         (x, y, _), (new_x, new_y, _) = comparison.end

@@ -144,7 +144,7 @@ def part_class(module: str, name: str) -> type:
     )
     found = vars(sys.modules[module]).get(name) if ours and module in sys.modules else None
     if not isinstance(found, type) or found.__module__ != module or found.__name__ != name:
-        raise ValueError(f"{module:.50}.{name:.50} is not a part of a robot")
+        raise ValueError(f"{module:.50}.{name:.50} is not a class of a robot's state")
     return found
 
 

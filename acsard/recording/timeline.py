@@ -211,7 +211,7 @@ class BoardIdentity:
                 continue
             self._reported_ns = now.mono_ns
             words = printable_bytes(found[1], MAX_IDENTITY_BYTES)
-            text = f"the microcontroller names itself, as after a start or a question: {words}"
+            text = f"the microcontroller sent its name, as after a start or a query: {words}"
             yield TimelineEntry(now.wall_ns / 1e9, "board", text)
 
 
@@ -350,7 +350,7 @@ class TimelineWriter:
         if self._pose is not None:
             x, y, yaw = [value / MICRO for value in self._pose]
             at = f"at x {x:.2f} m, y {y:.2f} m, yaw {math.degrees(yaw):.1f} deg"
-        text = f"an earlier recording goes on here: {does}, link {link}, {at}"
+        text = f"this recording continues an earlier one: {does}, link {link}, {at}"
         yield TimelineEntry(first.inputs.now.wall_ns / 1e9, "continues", text, by=source)
 
     def _entries(self, step: Step) -> Iterator[TimelineEntry]:
@@ -361,7 +361,7 @@ class TimelineWriter:
             missing = step.number - self._number - 1
             seconds = (step.inputs.now.mono_ns - self._now.mono_ns) / 1e9
             gap = (
-                f"{many(missing, 'step is', 'steps are')} missing before this one: {seconds:.1f} s"
+                f"{many(missing, 'step is', 'steps are')} missing before this step: {seconds:.1f} s"
             )
             yield TimelineEntry(wall_s, "gap", gap, "warning")
         yield from self._clock(step.inputs.now)

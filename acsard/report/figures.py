@@ -219,7 +219,7 @@ def path_figure(data: ReportData) -> Figure:
         "margin": {"l": 58, "r": 12, "t": 8, "b": 48},
     }
     caption = (
-        "By odometry; both axes are in m and have the same scale."
+        "This is the path by odometry. Both axes are in m and have the same scale."
         if places
         else "There is no valid feedback, so the path is unknown."
     )
@@ -367,8 +367,8 @@ class TimeFigures:
         """Draw how late the control loop ran each period."""
         late = Line("late", LIMITED, self._data.lateness.points(), "hv")
         caption = (
-            "Delay of each period's step after the time at which the period was due. The smallest "
-            "delay counts as zero."
+            "Delay of each period's step after the time when the period was due, compared with "
+            "the smallest such delay."
         )
         return self._stack("loop", "The control loop", caption, [Part("late, ms", [late])], 200)
 

@@ -173,9 +173,9 @@ def notes(data: ReportData, origin: Origin) -> list[str]:
         )
     if data.marks.counts["clock"]:
         found.append(
-            "The clock of the robot's computer was set during this time. The list of events has "
-            "the time of the clock at each event; the pictures go on by the clock at their "
-            "beginning."
+            "The clock of the robot's computer was set during this time. The list of events shows "
+            "the time of the clock at each event. The time axes of the pictures ignore the change "
+            "and count on from the time at their beginning."
         )
     curves = [*data.linear.values(), *data.angular.values()]
     width = max(curve.width for curve in curves)

@@ -278,7 +278,7 @@ class JsonPrompt:
                     self._take(line)
                 heard_s = time.monotonic()
             elif self._moves and time.monotonic() - heard_s > HEARD_S and not self._readable(0.0):
-                return f"no sign of life of the operator arrived for {HEARD_S:g} s"
+                return f"no sign of life from the operator arrived for {HEARD_S:g} s"
         return ""
 
     def _readable(self, wait_s: float) -> bool:

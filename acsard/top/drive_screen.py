@@ -62,7 +62,7 @@ def lines(seen: Teleop, width: int, height: int | None = None) -> list[Text]:
         if seen.objection:
             shown += _wrapped(refused(seen.objection), width, "bold red")
         shown += flow(measured(state), width)
-    shown.append(Text(f"keys ask {asked(seen)}"))
+    shown.append(Text(f"keys ask for {asked(seen)}"))
     below = [Text(line, "dim") for line in HELP]
     if height is not None and len(shown) + len(below) >= height:
         shown = [*shown[: max(1, height - len(below))], *below][:height]
@@ -75,7 +75,7 @@ def lines(seen: Teleop, width: int, height: int | None = None) -> list[Text]:
 
 def news(seen: Teleop, width: int) -> list[str]:
     """Return the lines of a report: the content of the screen, without the help."""
-    told = [f"keys ask {asked(seen)}"]
+    told = [f"keys ask for {asked(seen)}"]
     if seen.state is None or seen.silent:
         return _words([silence(seen), *told], width)
     if seen.objection:
@@ -118,7 +118,7 @@ def refused(objection: str) -> str:
     If the robot waits for a zero command, the sentence also says how to send one with the keys.
     """
     release = " (release the key, and press it again)" if "must send a zero" in objection else ""
-    return f"your keys do not drive: {printable(objection)}{release}"
+    return f"your keys do not drive the robot: {printable(objection)}{release}"
 
 
 def asked(seen: Teleop) -> str:

@@ -92,7 +92,7 @@ def link(seen: ScreenData, state: RobotState, width: int) -> list[Text]:
     superseded = state.counters.get("lines_superseded", 0)
     told += [Text(f"superseded {count(superseded)}"), missed(state, before), overrun(state)]
     if met := state.counters.get("commands_of_new_senders", 0):
-        told.append(Text(f"of new senders {count(met)}"))
+        told.append(Text(f"commands of new senders {count(met)}"))
     lines += flow([one for one in told if one], width, 0)
     if state.gyro != "off":
         lines += folded(f"gyro {clean(state.gyro)}", width, 2)

@@ -38,7 +38,7 @@ FIGURES = {
     "command_to_wire": ("arrival → first line", "from a command to the first line it causes"),
     "feedback_to_bus": (
         "line read → published",
-        "from reading a feedback line to publishing its last message",
+        "from reading a line to publishing its messages",
     ),
     "mcu_round_trip": ("line out → answer in", "from a line to its answer; checked link"),
 }

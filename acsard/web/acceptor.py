@@ -432,7 +432,7 @@ class Reader(RequestHandler):
         self._counted.refuse("host" if nameless else "malformed", peer)
         response = problem(
             status,
-            "the request has no `Host`, the name of the robot"
+            "the request has no `Host` header, which must name the robot"
             if nameless
             else "that is not an HTTP request",
         )

@@ -188,8 +188,8 @@ class Page:
         if present is not None and not who.may(present.role):
             raise TroubleError(
                 409,
-                f"this browser is {present.name} ({present.role}) here; the link makes it "
-                f"{who.name} ({who.role}), which may do less",
+                f"this browser is {present.name} ({present.role}) already; the link would "
+                f"make it {who.name} ({who.role}), which has fewer permissions",
             )
         left_s = await in_thread(lambda: self._vault.left_s(who.token), READ_S)
         response = web.Response(status=303, headers={"Location": "/"})
@@ -272,8 +272,8 @@ class Page:
         robot = given.pop("robot", "")
         if not isinstance(robot, str):
             text = (
-                "robot must be a text, the id of a robot; from here, another robot can only be "
-                "stopped"
+                "robot must be the id of a robot, as text; for another robot, this page accepts "
+                "only stop"
             )
             raise RefusedError("malformed", text)
         verb = request.path.removeprefix("/api/srv/")
@@ -384,7 +384,7 @@ async def _token_posted(request: web.Request) -> TokenForm:
     except (msgspec.MsgspecError, ValueError, LookupError, RecursionError):
         pass
     raise RefusedError(
-        "malformed", "send the token as a form, token=..., or as JSON, both in UTF-8"
+        "malformed", "send the token in UTF-8, either as a form (token=...) or as JSON"
     )
 
 
@@ -403,9 +403,10 @@ ROUTES: tuple[Route, ...] = (
         "exchanges a token for a cookie that no script can read; only over HTTPS",
         takes=TokenForm, forms=(JSON, FORM),
         gives={303: Body("The token is valid. `Location` is the page.", media=""),
-               409: Body("The browser's cookie has more permissions: `replace` it?", Problem)}),
+               409: Body("The browser's cookie has more permissions; `replace` overwrites it.",
+                         Problem)}),
     Route("GET", "/ws", "viewer", Page.socket,
-        "a WebSocket with JSON as text in both directions: follows, drives, stops",
+        "a WebSocket that carries JSON text both ways, to follow keys, to drive and to stop",
         gives={101: Body("It is open.", media="")}, rate=OPENINGS, waits=True),
     Route("GET", "/api", "viewer", Page.api, "this document", gives={200: Body("OpenAPI 3.1.")}),
     Route("GET", "/api/whoami", "viewer", Page.whoami, "the caller's role and name",
@@ -417,9 +418,9 @@ ROUTES: tuple[Route, ...] = (
         "the values that `begin` on the WebSocket accepts: methods of calibration, ports to check",
         gives={200: Body("The choices.", Choices)}),
     Route("GET", "/api/camera", "viewer", Page.picture,
-        "the newest picture of the camera, with its age (`Age-Ms`) and the time for which the "
-        "request waited here (`Waited-Ms`), ms, as headers; with the `ETag` of the last one as "
-        "`If-None-Match` it waits up to a second for a newer one",
+        "the newest picture of the camera; the headers give its age (`Age-Ms`) and how long the "
+        "request waited here (`Waited-Ms`), in ms; a request that has the last picture's `ETag` "
+        "as `If-None-Match` waits up to a second for a newer picture",
         gives={200: Body("A picture.", str, "image/jpeg"),
                304: Body("There is no newer picture.", media="")},
         rate=PICTURES, waits=True),
@@ -430,8 +431,8 @@ ROUTES: tuple[Route, ...] = (
         "one recording as a file",
         gives={200: Body("MCAP.", media="application/octet-stream")}),
     Route("POST", "/api/recordings/{name}/report", RECORDINGS, Page.draw,
-        "draws the report of a recording, or reports the progress; ask again until 200",
-        gives={200: Body("It is drawn, and at `href`.", ReportState),
+        "draws the report of a recording, or returns the progress; ask until the status is 200",
+        gives={200: Body("The report is drawn; get it at `href`.", ReportState),
                202: Body("This report or another one is being drawn.", ReportState),
                503: Body("The report cannot be drawn; the reason is in the answer.", ReportState)}),
     Route("GET", "/report/{name}", RECORDINGS, Page.report,

@@ -114,7 +114,7 @@ def place(asked: Asked, names: Collection[str]) -> Place:
         raise RefusedError(
             "proxy",
             "the request came through a proxy, which hides the browser's machine: open this page "
-            "without a proxy, and from another machine by https",
+            "without a proxy; from another machine, use https",
         )
     host = host_name(asked.host)
     if is_loopback(asked.peer) and (host == "localhost" or is_loopback(host)):

@@ -276,8 +276,8 @@ def _require_stop(verb: str, robot: str) -> None:
     if verb != "stop":
         raise RefusedError(
             "role",
-            f"{robot} is not this page's robot: here you can see it and stop it; for {verb} open "
-            "its own page",
+            f"{robot} is not this page's robot: here you can only see it and stop it; for {verb} "
+            "open that robot's own page",
         )
 
 

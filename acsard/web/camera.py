@@ -80,7 +80,7 @@ class Parts:
         head = self._buffer.find(b"\r\n\r\n", 0, MAX_HEAD)
         if head < 0:
             if len(self._buffer) >= MAX_HEAD:
-                raise ValueError("no header lines precede a picture")
+                raise ValueError("a picture has no header lines before it")
             return None
         begin = head + 4
         if found := _LENGTH.search(self._buffer, 0, head):
@@ -118,7 +118,7 @@ class Camera:
         """
         if not self._url:
             raise TroubleError(
-                404, "this robot has no camera: to show one, set web.camera to its MJPEG stream"
+                404, "this robot has no camera: to show one, set web.camera to its stream's address"
             )
         self._asked_ns = clock.mono_ns()
         if self._reading is None or self._reading.done():
@@ -175,8 +175,8 @@ class Camera:
             boundary = kind.get_boundary()
             if answer.status != 200 or boundary is None:
                 raise ValueError(
-                    f"the answer {answer.status} {answer.content_type} is not an MJPEG stream: "
-                    "correct web.camera"
+                    f"the camera answered {answer.status} {answer.content_type}, not an MJPEG "
+                    "stream: correct web.camera"
                 )
             parts = Parts(boundary)
             async for data in answer.content.iter_any():

@@ -140,7 +140,7 @@ class Guide:
         """Pass a viewer's answer to the child. Return "" or the reason for a refusal."""
         errand = self._of(viewer)
         if errand is None or not errand.answer(reply):
-            return f"the question {reply.reply} is not open: answer the newest one of this page"
+            return f"the question {reply.reply} is not open: answer the newest question here"
         return ""
 
     def press(self, viewer: object, press: Press) -> None:
@@ -265,7 +265,8 @@ def _method(begin: Begin) -> list[str]:
         raise FrameError("begin", f"method must be one of {', '.join(NEEDS)}")
     if (begin.method == POSITIONS) != bool(begin.positions):
         raise FrameError(
-            "begin", f"give `positions`, a key, with the method {POSITIONS} and no other"
+            "begin",
+            f"`positions`, a key, is required by the method {POSITIONS} and valid only there",
         )
     if begin.positions and not KEY.match(begin.positions):
         raise FrameError("begin", "`positions` must be a key like sim/pose: letters, digits, _ / -")

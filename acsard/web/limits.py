@@ -258,8 +258,8 @@ class Seats:
         )
         spread = f"{CONNECTIONS_OF_TOKEN} pages with this token are open already: close some"
         full = (
-            f"{CONNECTIONS} pages are open already, or {CONNECTIONS_OF_ONE} from this address: "
-            "close some"
+            f"{CONNECTIONS} pages are open in total, or {CONNECTIONS_OF_ONE} from this address: "
+            "close some of them"
         )
         return [
             (self._alike, f"{address} {token}", alike),

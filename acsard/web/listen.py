@@ -62,7 +62,9 @@ def listens(text: str) -> Listen:
             f"{text} is not an address; write it like http://127.0.0.1:8080 or https://0.0.0.0:8443"
         )
     if scheme == "http" and not (host == "localhost" or is_loopback(host)):
-        raise UsageError(f"{text}: other machines may use only https, with the robot's certificate")
+        raise UsageError(
+            f"{text}: use https, with the robot's certificate; http is only for this machine"
+        )
     return Listen(scheme == "https", host, number)
 
 
@@ -105,8 +107,8 @@ def require_certificate(listen: Sequence[Listen], tls: str) -> None:
     away = [one for one in listen if one.secure]
     if away and not tls:
         raise CertificateError(
-            f"{away[0].url} needs a certificate: `acsard tls init` makes one; then set bus.tls, "
-            "or --tls DIRECTORY"
+            f"{away[0].url} needs a certificate: run `acsard tls init` to make it; then set "
+            "bus.tls or give --tls DIRECTORY"
         )
     if away:
         require_usable(tls)

@@ -48,7 +48,12 @@ def text(
 
     add("up", "gauge", "1 while messages from the daemon arrive", [({}, float(heard))])
     if state is not None and heard:
-        add("info", "gauge", "1, with the version of the daemon", [({"version": version}, 1.0)])
+        add(
+            "info",
+            "gauge",
+            "always 1; the label is the version of the daemon",
+            [({"version": version}, 1.0)],
+        )
         for name, kind, what, samples in _of_robot(state):
             add(name, kind, what, samples)
     add("page_viewers", "gauge", "pages and programs connected", [({}, viewers)])
@@ -74,30 +79,40 @@ def _of_robot(state: RobotState) -> Iterator[tuple[str, Kind, str, Iterable[Samp
     )
     warned = {one.what for one in warnings(state)}
     subjects = [({"what": what}, float(what in warned)) for what in WHATS]
-    yield "warning", "gauge", "1 while the robot warns of this, else 0", subjects
+    yield "warning", "gauge", "1 while the robot gives this warning, else 0", subjects
     if state.certificate_days is not None:
         left: list[Sample] = [({}, state.certificate_days * 86400.0)]
-        yield "certificate_seconds", "gauge", "until the first TLS certificate ends", left
+        yield (
+            "certificate_seconds",
+            "gauge",
+            "seconds until the first TLS certificate expires",
+            left,
+        )
     if state.emergency_stop:
         pressed = float(state.emergency_stop != "released")
-        yield "emergency_stop", "gauge", "1 while it counts as pressed, else 0", [({}, pressed)]
+        yield (
+            "emergency_stop",
+            "gauge",
+            "1 while the emergency stop counts as pressed, else 0",
+            [({}, pressed)],
+        )
     bumpers = [({"bumper": str(n)}, float(one)) for n, one in enumerate(state.bumpers or (), 1)]
     if bumpers:
-        yield "bumper", "gauge", "1 while it counts as pressed, else 0", bumpers
+        yield "bumper", "gauge", "1 while the bumper counts as pressed, else 0", bumpers
     battery = state.battery
     if battery is not None:
         for name, what, value, scale in (
             ("volts", "voltage", battery.volts, 1.0),
-            ("amperes", "current, negative while it discharges", battery.amps, 1.0),
+            ("amperes", "current; negative while the battery discharges", battery.amps, 1.0),
             ("charge_ratio", "state of charge, 0 to 1", battery.percent, 0.01),
         ):
             if value is not None:
                 yield f"battery_{name}", "gauge", what, [({}, value * scale)]
     if state.linear is not None and state.angular is not None:
         yield "linear_speed_mps", "gauge", "measured, forward", [({}, state.linear)]
-        yield "angular_speed_radps", "gauge", "measured, to the left", [({}, state.angular)]
+        yield "angular_speed_radps", "gauge", "measured; left is positive", [({}, state.angular)]
     pose = [({"axis": a}, v) for a, v in (("x", state.x), ("y", state.y), ("yaw", state.yaw))]
-    yield "pose", "gauge", "in odom, m and rad", pose
+    yield "pose", "gauge", "pose in the frame odom, m and rad", pose
     wheels = [({"wheel": w}, v) for w, v in zip(WHEELS, state.wheels, strict=False)]
     if wheels:
         yield "wheel_speed_radps", "gauge", "measured", wheels

@@ -70,7 +70,7 @@ class Recording(Struct, frozen=True):
 
     name: str
     begin: Annotated[float | None, Meta(description="s since 1970; null if unknown")]
-    seconds: Annotated[float | None, Meta(description="null without an end marker")]
+    seconds: Annotated[float | None, Meta(description="null if there is no end marker")]
     bytes: int
     events: Annotated[str, Meta(description="summary of the recorded events")]
 
@@ -183,7 +183,7 @@ class ReportState(Struct, frozen=True, omit_defaults=True):
     """The state of a report."""
 
     report: State
-    text: Annotated[str, Meta(description="why it failed, or the reason to wait")] = ""
+    text: Annotated[str, Meta(description="why the report failed, or why to wait")] = ""
     percent: int = 0
     seconds: Annotated[float, Meta(description="since the drawing began")] = 0.0
     href: Annotated[str, Meta(description="the finished report, relative to the page")] = ""

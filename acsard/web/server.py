@@ -223,4 +223,7 @@ async def _renew(
         with suppress(OSError, ValueError):
             _load(context, directory)
             names |= _names(directory)
-            log.info("configuration", text="the page has a new certificate; connections stay")
+            log.info(
+                "configuration",
+                text="the page has a new certificate and keeps its open connections",
+            )

@@ -223,7 +223,7 @@ class Keys:
             self._out.wake()
         elif len(self._out.following) >= MOST:
             self._out.refuse(
-                "subscribe", "too_many", f"more than {MOST} keys: unsubscribe from some"
+                "subscribe", "too_many", f"more than {MOST} keys followed: unsubscribe from some"
             )
         elif robot != self._robots.id and not self._shares.enter(self._holder, (robot, key)):
             text = (

@@ -108,7 +108,7 @@ class Vault:
             return ""
         return (
             f"this token is in {self.path}, which the service on this machine does not read: to "
-            "invite to the page of the service, run this command with sudo"
+            "invite users to the page of the service, run this command with sudo"
         )
 
     def invite(self, role: Role, name: str, days: int, hours: int = 0) -> tuple[str, Token]:
@@ -122,11 +122,11 @@ class Vault:
             ours = [one for one in tokens if one.robot == self.robot]
             if any(one.name == name for one in ours):
                 raise UsageError(
-                    f"a token {name} exists already: give another --name, or end it with --revoke "
-                    f"{name}"
+                    f"the token {name} exists already: either give another --name, or revoke the "
+                    f"old token with --revoke {name}"
                 )
             if len(ours) >= MOST:
-                raise UsageError(f"there are {MOST} tokens already: end some with --revoke NAME")
+                raise UsageError(f"there are {MOST} tokens already: revoke some with --revoke NAME")
             text = secrets.token_urlsafe(32)
             ends = now_s + days * DAY_S + hours * HOUR_S
             token = Token(name, role, _digest(text), now_s, ends, self.robot)
@@ -140,7 +140,7 @@ class Vault:
             if all(one.name != name for one in ours):
                 known = ", ".join(one.name for one in ours) or "none"
                 raise UsageError(
-                    f"there is no token {name} of {self.robot} in {self.path}; there are: {known}"
+                    f"there is no token {name} of {self.robot} in {self.path}; its tokens: {known}"
                 )
             tokens[:] = [one for one in tokens if (one.name, one.robot) != (name, self.robot)]
 

@@ -268,7 +268,7 @@ def first_run(host: Host) -> None:
     host.note(
         "undervoltage of the board",
         "^link stale: the microcontroller has fallen silent",
-        "^board: the microcontroller names itself, .* reset=brown-out",
+        "^board: the microcontroller sent its name, .* reset=brown-out",
         "^mode: driving -> waiting:",
         r"^drive: drove \d\.\d\d m in \d\.\d s \(by nav\)",
         after=0.3,
@@ -342,7 +342,7 @@ def first_run(host: Host) -> None:
         "the disk has room again",
         r"^recording: to .* again; \d+ steps are missing, at most \d\.0 s "
         r"\(.*No space left on device\)",
-        r"^continues: an earlier recording goes on here: driving, link up, .* \(by nav\)",
+        r"^continues: this recording continues an earlier one: driving, link up, .* \(by nav\)",
     )
     host.hold(NAV, "nav", 0.5, 4.0)
     host.note(

@@ -1,6 +1,6 @@
 """Drive a headless Chromium by its DevTools protocol: touch, keys, sizes, pictures.
 
-The browser is Debian's `chromium`; tests skip if it is not installed.
+The browser is Debian's `chromium-headless-shell` or `chromium`; tests skip if both are missing.
 """
 
 from __future__ import annotations

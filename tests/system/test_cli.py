@@ -220,12 +220,12 @@ def test_echo_of_silence_ends_with_1_after_its_timeout(shared: Daemon) -> None:
     [
         (
             ["echo", "state", "--short", "--id", "acsra"],
-            "there is no robot acsra. The robots here are acsar",
+            "there is no robot acsra. Robots here: acsar",
         ),
-        (["hz", "odom", "--id", "acsra"], "there is no robot acsra. The robots here are acsar"),
+        (["hz", "odom", "--id", "acsra"], "there is no robot acsra. Robots here: acsar"),
         (
             ["echo", "imu", "--csv", "--id", "acsra"],
-            "there is no robot acsra. The robots here are acsar",
+            "there is no robot acsra. Robots here: acsar",
         ),
         (["echo", "cmd/nobody"], "robot acsar is there, but no program sends on cmd/nobody now"),
     ],
@@ -340,7 +340,7 @@ def test_a_robot_of_another_id_is_not_reached_and_that_is_reported(shared: Daemo
     ended = tool(shared, "call", "stop", "--id", "other")
     assert (ended.code, ended.out) == (69, "")
     assert "other" in ended.err
-    assert "The robots here are acsar; use --id acsar" in ended.err
+    assert "Robots here: acsar; use --id acsar" in ended.err
 
 
 @each("robot_id", ["a/b*", "", "**", "robot 1"])
@@ -490,7 +490,7 @@ def test_set_alone_lists_what_can_be_set_and_when(shared: Daemon, bus: Bus) -> N
         (("limits.linear_speed", "20"), 1, "expected a number from 0 to 10 m/s"),
         (("mcu.port", "/dev/x"), 1, "read only when the daemon starts"),
         (("limits.linear_speed",), 2, "pairs of KEY VALUE"),
-        (("commands.sources.nav.timeout", "0.5", "--write"), 2, "from `acsard check`"),
+        (("commands.sources.nav.timeout", "0.5", "--write"), 2, "output of `acsard check`"),
         (("--write",), 2, "--write needs a setting"),
     ],
 )

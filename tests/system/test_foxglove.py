@@ -389,7 +389,7 @@ def test_unless_it_is_to_drive_it_shows_and_stops_and_takes_nothing_else(
 def test_an_older_viewer_is_turned_away_and_the_terminal_says_why(shows: Shows, bus: Bus) -> None:
     with pytest.raises(InvalidStatus):
         Viewer(shows.port, "foxglove.websocket.v1")
-    until(lambda: "Lichtblick before 2026 does not" in shows.stderr, 5.0, shows.stderr)
+    until(lambda: "as Lichtblick before 2026 is" in shows.stderr, 5.0, shows.stderr)
 
 
 # services and parameters
@@ -447,7 +447,8 @@ def test_each_viewer_is_a_sender_of_its_own(viewer: Viewer, shows: Shows, bus: B
         first = driving(bus, 0.1)["sender"]
         with Viewer(shows.port) as other, Panel(other, speed(-0.2)):
             other.status(
-                f"your commands do not drive: another program, {first}, drives the robot as app"
+                f"your commands do not drive the robot: another program, {first}, drives the "
+                "robot as app"
             )
             assert (bus.state()["linear"] or 0.0) > 0.0
     bus.at_rest()
@@ -459,7 +460,7 @@ def test_each_viewer_is_a_sender_of_its_own(viewer: Viewer, shows: Shows, bus: B
 def test_who_drives_in_vain_is_told_why_until_it_is_over(viewer: Viewer, bus: Bus) -> None:
     bus.get("srv/stop")
     with Panel(viewer, speed(0.2)):
-        told = viewer.status("your commands do not drive: stopped by unnamed (native) at")
+        told = viewer.status("your commands do not drive the robot: stopped by unnamed (native) at")
         assert bus.get("srv/clear")["success"]
     until(lambda: told["id"] in viewer.removed, 5.0, "it is over")
 
@@ -481,7 +482,7 @@ def test_a_publisher_that_sends_too_seldom_is_reported(viewer: Viewer) -> None:
     while not viewer.statuses and time.monotonic() < until_told:
         send(speed(0.0))
         time.sleep(0.5)
-    viewer.status("set its publish rate to 10 Hz or more")
+    viewer.status("publish rate to 10 Hz or more")
 
 
 @SLOW

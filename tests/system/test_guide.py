@@ -158,7 +158,7 @@ async def test_who_is_not_heard_any_more_drives_no_more(page: Page, standing: Bu
             if "no sign of life" in end["text"]:
                 break
             await guided.says(lambda said: said.get("running") == "")
-        assert f"no sign of life of the operator arrived for {HEARD_S:g} s" in end["text"]
+        assert f"no sign of life from the operator arrived for {HEARD_S:g} s" in end["text"]
         await beside(standing.at_rest)
 
 
@@ -367,7 +367,7 @@ async def test_what_may_be_begun_is_listed(page: Page) -> None:
     told = json.loads(await text(f"{page.here}/api/guide"))
     assert sorted(told["methods"]) == ["gyro", "positions", "tape", "umbmark", "wall"]
     assert told["method"] == "positions"
-    assert "no floor to lay a tape on" in told["advice"]
+    assert "no floor to measure with a tape" in told["advice"]
     assert told["ports"][0]["port"] == "sim"  # the configured port
     if len(told["ports"]) == 1:
         assert "systemctl stop acsard" in told["note"]

@@ -233,7 +233,7 @@ def test_on_the_simulator_the_card_says_which_way_makes_sense_and_has_chosen_it(
     person = Person(browser, server)
     assert browser.js("document.getElementById('method').value") == "positions"
     assert not person.hidden("positions-row")
-    person.shows("advice", "no floor to lay a tape on")
+    person.shows("advice", "no floor to measure with a tape")
     # The default works, and a different choice is kept.
     person.click("calibrate")
     person.asked("1. Place the", 30.0)

@@ -41,28 +41,33 @@ def test_its_exposure_is_small(container: Container, unit: str) -> None:
 
 def test_the_unit_of_a_fleet_s_router_runs_the_router(container: Container) -> None:
     unit, place = "acsard-router.service", ("127.0.0.1", 7460)
-    container.run("useradd", "--system", "zenohd")
-    container.write(f"/etc/systemd/system/{unit}", (ROOT / "deploy/zenoh" / unit).read_text())
+    file = f"/etc/systemd/system/{unit}"
     router = {
         "mode": "router",
         "listen": {"endpoints": [f"tcp/{place[0]}:{place[1]}"]},
         "scouting": {"multicast": {"enabled": False}},
     }
-    container.write("/etc/zenohd/router.json5", json.dumps(router))
-    checked = container.run("systemd-analyze", "verify", f"/etc/systemd/system/{unit}")
-    assert (checked.code, checked.out, checked.err) == (0, "", "")
-    container.run("systemctl", "daemon-reload")
+    assert container.run("useradd", "--system", "zenohd").code == 0
     try:
+        container.write(file, (ROOT / "deploy/zenoh" / unit).read_text())
+        container.write("/etc/zenohd/router.json5", json.dumps(router))
+        checked = container.run("systemd-analyze", "verify", file)
+        assert (checked.code, checked.out, checked.err) == (0, "", "")
+        assert container.run("systemctl", "daemon-reload").code == 0
         assert container.start(unit).code == 0
         connect = f"import socket; socket.create_connection({place}, 1.0)"
         words = ("/opt/acsard/venv/bin/python", "-c", connect)
-        until(lambda: container.run(*words).code == 0, 10.0, container.messages(unit))
+        until(lambda: container.run(*words).code == 0, 10.0, "the router listens")
         assert (container.show("ActiveState", unit), container.show("User", unit)) == (
             "active",
             "zenohd",
         )
     finally:
+        print(container.messages(unit))
         container.run("systemctl", "stop", unit)
+        container.run("rm", "-r", file, "/etc/zenohd")
+        container.run("systemctl", "daemon-reload")
+        container.run("userdel", "zenohd")
 
 
 def opened(container: Container) -> None:

@@ -21,13 +21,13 @@ MEANING: dict[Cause, str] = {
 }
 
 ADVICE: dict[Cause, str] = {
-    "time": "the times of feedback lines are wrong by {late:.1f} ms: set the latency_timer of the "
-    "serial adapter to 1 (acsard's udev rules do that), or set mcu.link_check and "
+    "time": "the times of feedback lines are wrong by {late:.1f} ms: either set the latency_timer "
+    "of the serial adapter to 1 (acsard's udev rules do that), or set mcu.link_check and "
     "mcu.encoder_counts, so that the microcontroller adds its clock and encoder counts to the "
     "feedback lines",
     "gaps": "{missing} feedback lines were lost, so {unseen:.2f} s of driving were not measured: "
-    "look for a loose cable, noise on the wire or a busy machine (`acsard top`), or let the "
-    "feedback lines carry encoder counts, which lose no distance (mcu.link_check, "
+    "look for a loose cable, noise on the wire or a busy machine (`acsard top`); if the feedback "
+    "lines carry encoder counts, a lost line loses no distance (mcu.link_check, "
     "mcu.encoder_counts)",
     "slip": "drive on other ground or turn less on the spot; a gyro measures turns that "
     "skidding wheels do not show ([odometry] gyro)",
@@ -42,15 +42,15 @@ BASIS: dict[Basis, str] = {
 }
 
 COARSE = (
-    "the encoders are coarse and the daemon does not know their counts, so an error in the time of "
-    "a feedback line becomes an error of the heading: write mcu.encoder_counts, the counts per "
-    "wheel turn (`acsard mcu check` says about how many)"
+    "the encoders are coarse and the daemon does not know their counts, so an error in the time "
+    "of a feedback line becomes an error of the heading: write mcu.encoder_counts, the counts per "
+    "wheel turn (`acsard mcu check` estimates them)"
 )
 """Advice for a robot with coarse encoders."""
 
 CALIBRATE = (
-    "the error of wheel radii and track width is unknown, and on wheels that skid it is mostly "
-    "the largest: run `acsard calibrate`"
+    "the error of wheel radii and track width is unknown, and if the wheels skid, it is usually "
+    "the largest error: run `acsard calibrate`"
 )
 """Advice for a robot that is not calibrated."""
 
@@ -83,7 +83,7 @@ def advice(budget: Budget) -> str:
         advice.append(CALIBRATE)
     if largest is not None and largest is not measured:
         advice.append(
-            f"the largest cause is {largest.cause}, by the settings in [odometry]: "
+            f"according to the settings in [odometry], the largest cause is {largest.cause}: "
             f"{_advice_on(largest, budget)}"
         )
     if measured is not None:
@@ -118,15 +118,15 @@ def _track(budget: Budget, learned: float) -> str:
     implied = f"{learned:.3f} (standard deviation {budget.learned_std:.3f})"
     if budget.learned_used:
         return (
-            f"By the gyro drive.wheel_separation_multiplier is {implied}. Odometry uses this "
-            "value while only the wheels measure the turn; the configured value is "
+            f"According to the gyro, drive.wheel_separation_multiplier is {implied}. Odometry "
+            "uses this value while only the wheels measure the turn; the configured value is "
             f"{budget.multiplier:.3f}."
         )
     return (
-        f"By the gyro drive.wheel_separation_multiplier would be {implied}. Odometry uses the "
-        f"configured value, {budget.multiplier:.3f}. If both differ on the ground that matters, "
-        "run `acsard calibrate`, or set [odometry] learned_track, which uses the gyro's value "
-        "while the gyro is silent."
+        f"According to the gyro, drive.wheel_separation_multiplier would be {implied}. Odometry "
+        f"uses the configured value, {budget.multiplier:.3f}. If the two values differ on the "
+        "ground where the robot works, either run `acsard calibrate`, or set [odometry] "
+        "learned_track, which uses the gyro's value while the gyro is silent."
     )
 
 

@@ -38,9 +38,9 @@ NEEDS: dict[str, str] = {
 
 SIMULATED = (
     "positions",
-    "On the simulator there is no floor to lay a tape on: use positions with sim/pose, the true "
-    "position, or gyro if [odometry] gyro is on, with its distance left empty. tape, wall and "
-    "umbmark are for a real robot.",
+    "The simulator has no floor to measure with a tape. Use either the method positions with the "
+    "key sim/pose (the true position), or the method gyro if [odometry] gyro is on; then leave "
+    "its distance empty. The methods tape, wall and umbmark are for a real robot.",
 )
 """The method of calibration to use first on the simulator, and the reason."""
 
@@ -312,8 +312,8 @@ def setup(config: Config) -> Setup:
     speed = min(speed, wheel)
     if speed < LEAST_SPEED or limits.angular_speed < LEAST_TURN:
         raise GuideError(
-            f"the robot may not drive at {LEAST_SPEED} m/s and turn at {LEAST_TURN} rad/s: raise "
-            "limits.linear_speed, limits.angular_speed, limits.wheel_speed or "
+            f"the limits do not let the robot drive at {LEAST_SPEED} m/s and turn at {LEAST_TURN} "
+            "rad/s: either raise limits.linear_speed, limits.angular_speed, limits.wheel_speed or "
             "limits.linear_deceleration, or record a drive and use --log"
         )
     reach = REACH * drive.wheel_separation + drive.wheel_radius / 2

@@ -60,7 +60,7 @@ ROUND = "once round"
 """Name of the leg that turns once on the spot. A person ends this leg with a key."""
 
 FROM_MARK = Ask(
-    "How far is that wheel from its mark now, in a straight line?", "m", LEAST_M, 2 * ROOM,
+    "How far is the marked wheel from its mark now, in a straight line?", "m", LEAST_M, 2 * ROOM,
     name="metres",
 )  # fmt: skip
 DISTANCE = Mean("distance", ("metres",), TAPE_M)
@@ -172,7 +172,9 @@ SQUARE = (
 def _corners(end: str) -> tuple[Ask, Ask]:
     return (
         Ask(f"How far is the robot's {end} left corner from the wall?", "mm", 0, 2500, name="left"),
-        Ask(f"How far is its {end} right corner from the wall?", "mm", 0, 2500, name="right"),
+        Ask(
+            f"How far is the robot's {end} right corner from the wall?", "mm", 0, 2500, name="right"
+        ),
     )
 
 
@@ -201,8 +203,9 @@ def _wall(setup: Setup, track: float) -> tuple[Leg, ...]:
     return (
         Leg(
             "out",
-            f"Along a straight wall, {ROOM:g} m x {ROOM:g} m must be free. {SQUARE}, in the middle "
-            f"of that floor. The robot drives {setup.length:.2f} m away from the wall.",
+            f"Along a straight wall, {ROOM:g} m x {ROOM:g} m must be free. {SQUARE}, in the "
+            "middle of the free floor. The robot drives straight away from the wall for "
+            f"{setup.length:.2f} m.",
             (STOP, out, STOP),
             (
                 Ask(
@@ -252,7 +255,9 @@ def side_of_square(setup: Setup) -> float:
 
 def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
     edge = side_of_square(setup)
-    marks = "How far ahead of its mark is the middle of its {} side (negative if behind it)?"
+    marks = (
+        "How far ahead of its mark is the middle of the robot's {} side (negative if behind it)?"
+    )
     ends = (
         Ask(marks.format("left"), "mm", -1500, 1500, name="left"),
         Ask(marks.format("right"), "mm", -1500, 1500, name="right"),
@@ -266,10 +271,11 @@ def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
         corner = setup.turn(side * math.pi / 2, CORNER_RATE, track)
         return Leg(
             f"square to the {to}",
-            f"Place the robot's middle {(ROOM - edge) / 2:.2f} m from the near edge and as far "
-            f"from the {other} edge, facing the far edge. Make a mark on the floor exactly beside "
-            "the middle of its left side and of its right side. The robot drives a square of "
-            f"{edge:.2f} m with turns to the {to}, and ends about where it started.",
+            f"Place the robot's middle {(ROOM - edge) / 2:.2f} m from the near edge and the same "
+            f"distance from the {other} edge, facing the far edge. Make two marks on the floor: "
+            "one exactly beside the middle of its left side, one exactly beside the middle of its "
+            f"right side. The robot drives a square of {edge:.2f} m with turns to the {to}, and "
+            "ends about where it started.",
             (STOP, *(setup.ahead(edge), STOP, corner, STOP) * 4),
             ends,
             (
@@ -354,7 +360,8 @@ def _gyro(setup: Setup, track: float) -> tuple[Leg, ...]:
     for rate in (CURVE, -CURVE, 0.0):
         moves += _there_and_back(setup, rate)
     far = Ask(
-        "How far is that wheel from its mark now, in a straight line? Enter alone: not measured",
+        "How far is the marked wheel from its mark now, in a straight line? Press Enter alone if "
+        "you did not measure it",
         "m", 0.0, 2 * setup.length, 0.0, "metres",
     )  # fmt: skip
     return (

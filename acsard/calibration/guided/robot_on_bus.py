@@ -87,7 +87,8 @@ class Sensor:
         while not self.receive(lambda message, now: None, 0.0):
             if time.monotonic() > end:
                 raise GuideError(
-                    f"{what} does not arrive on {self.key}: does its sender run, with this key?"
+                    f"{what} does not arrive on {self.key}: does its sender run, and does it "
+                    "publish on this key?"
                 )
             time.sleep(LOOK_S)
 

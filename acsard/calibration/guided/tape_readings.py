@@ -216,8 +216,8 @@ def _solved(readings: Sequence[Reading], base: Base, start: Floats) -> tuple[Flo
         inner = normal[np.ix_(ACTIVE, ACTIVE)]
         if condition(inner) > WORST_CONDITION:
             raise RefusedError(
-                "the measurements cannot separate the wheels from the track: the robot hardly "
-                "moved or hardly turned. Give it room, and start again"
+                "the measurements cannot separate errors of the wheels from errors of the track: "
+                "the robot hardly moved or hardly turned. Give it room, and start again"
             )
         step = np.linalg.solve(inner, score[ACTIVE])
         parameters[ACTIVE] += step * min(1.0, 0.3 / (float(np.abs(step).max()) or 1.0))
@@ -225,7 +225,7 @@ def _solved(readings: Sequence[Reading], base: Base, start: Floats) -> tuple[Flo
             return parameters, normal
     raise RefusedError(
         "the measurements contradict each other: is each number in the unit that was asked for, "
-        "and was it measured at the end that the question names? Start again"
+        "and was it measured at the end of the robot that the question names? Start again"
     )
 
 

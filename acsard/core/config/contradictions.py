@@ -125,7 +125,7 @@ def _wire_problems(config: Config) -> list[str]:
     ms = wire_ns(count, mcu.baud_rate) / 1e6
     most, good = (highest_rate(mcu.baud_rate, count, use) for use in (1.0, COMFORTABLE_USE))
     bauds = [b for b in (19200, 38400, 57600, 115200) if wire_use(rate, b, count) <= 1.0]
-    faster = f"mcu.baud_rate = {bauds[0]} or more, or " if bauds else ""
+    faster = f"mcu.baud_rate = {bauds[0]} or more; or " if bauds else ""
     return [
         f"control.rate = {rate:g}: a line of {count} B at {mcu.baud_rate} baud takes {ms:.1f} ms, "
         f"so at most {most} Hz is possible, and {good} Hz uses 80 % of the wire; write "
@@ -140,7 +140,7 @@ def _shorter_lines(mcu: McuConfig, rate: float) -> str:
     for check, fix in fixes:
         count = line_bytes(mcu.trailing_comma, check)
         if count < mcu.line_bytes and wire_use(rate, mcu.baud_rate, count) <= 1.0:
-            return f", or {fix} (lines of {count} B)"
+            return f"; or {fix} (lines of {count} B)"
     return ""
 
 
@@ -158,8 +158,8 @@ def _count_problems(config: Config) -> list[str]:
         f"{config.feedback.wheel_speed:g} rad/s a wheel's counter could wrap round within "
         f"{FIELD / 2 / fastest / counts * 1000:.0f} ms, which is less than {LEAST_WRAP_PERIODS} "
         f"control periods ({lasts * 1000:.0f} ms); write "
-        f"mcu.encoder_counts = {int(FIELD / 2 / fastest / lasts)} or less and let the firmware "
-        "count fewer edges, or lower feedback.wheel_speed, or write mcu.encoder_counts = 0"
+        f"mcu.encoder_counts = {int(FIELD / 2 / fastest / lasts)} or less and make the firmware "
+        "count fewer edges; or lower feedback.wheel_speed; or write mcu.encoder_counts = 0"
     ]
 
 
@@ -215,7 +215,7 @@ def _battery_problems(config: Config) -> list[str]:
         if below + battery.hysteresis > most:
             found.append(
                 f"{name} = {below:g}: with battery.hysteresis = {battery.hysteresis:g} the level "
-                f"would end only above {most:g}, which no board reports; lower one of the two"
+                f"would end only above {most:g}, which no board reports; lower either value"
             )
     return found
 
@@ -291,9 +291,9 @@ def _endpoint_problems(config: Config, key: str) -> list[str]:
         elif not _is_loopback(host) and not bus.insecure:
             found.append(
                 f"{where}: this endpoint is on the network, without encryption or access "
-                "control; use 127.0.0.1 (a laptop connects through an SSH tunnel), use "
-                'certificates (`acsard tls init`, then "tls/…"), or accept that anyone on the '
-                "network can drive the robot: bus.insecure = true"
+                "control; choose one: (1) write 127.0.0.1, and connect a laptop through an "
+                'SSH tunnel; (2) run `acsard tls init`, then write "tls/…"; (3) if anyone on '
+                "the network may drive the robot, write bus.insecure = true"
             )
     return found
 

@@ -77,13 +77,14 @@ def _braking_problems(config: Config, axis: str, speed: float, unit: str) -> lis
         if name != softer and value < normal:
             found.append(
                 f"limits.{name} = {value:g}: lower than limits.{softer}; a stop must brake at "
-                f"least as hard as the end of the commands: write {max(normal, least):.10g} or more"
+                f"least as hard as the robot brakes when commands end: write "
+                f"{max(normal, least):.10g} or more"
             )
         elif value < least:
             found.append(
                 f"limits.{name} = {value:g}: braking from full speed ({speed:g} {unit}) would "
-                f"take {speed / value:.1f} s, and the longest that is allowed is {most_s:g} s; "
-                f"write {least:g} or more, or a lower limits.{axis}_speed"
+                f"take {speed / value:.1f} s, but at most {most_s:g} s are allowed; "
+                f"either write {least:g} or more, or lower limits.{axis}_speed"
             )
     return found
 
@@ -106,8 +107,8 @@ def _feedback_problems(config: Config, asked: float) -> list[str]:
         return []
     return [
         f"feedback.wheel_speed = {most:g}: the limits allow commands of {asked:.1f} rad/s for a "
-        f"wheel, but feedback above {most:g} counts as a fault; write {needed:g} or more, or a "
-        "lower limits.wheel_speed"
+        f"wheel, but feedback above {most:g} counts as a fault; either write {needed:g} or "
+        "more, or lower limits.wheel_speed"
     ]
 
 
@@ -119,10 +120,10 @@ def _reply_problems(config: Config) -> list[str]:
         return []
     fix = ""
     if period <= LONGEST_REPLY_S:
-        fix = f", or feedback.fault_time = {_rounded_up(period * LINES_OF_EVIDENCE):g}"
+        fix = f"; or write feedback.fault_time = {_rounded_up(period * LINES_OF_EVIDENCE):g}"
     return [
         f"mcu.reply_period = {period:g}: one lost line would look like a wheel fault or like a "
-        f"restart of the board; write {most:g} at most (the firmware must report more often){fix}"
+        f"restart of the board; write {most:g} or less and make the firmware report more often{fix}"
     ]
 
 

@@ -90,8 +90,8 @@ def named(text: str) -> NamedFault:
         raise ValueError("the seconds between resets must be above 0")
     if name == "stalls" and not fault.values[0] > fault.values[1] >= SHORTEST_S:
         raise ValueError(
-            "give the seconds from one stall to the next, then fewer seconds for each stall; "
-            f"both at least {SHORTEST_S}"
+            "give the seconds from one stall to the next, then the shorter duration of each "
+            f"stall in seconds; both values must be at least {SHORTEST_S}"
         )
     if name == "bumper_pressed" and fault.values[0] not in (1, 2, 3, 4):
         raise ValueError(

@@ -134,7 +134,7 @@ def expected(kind: inspect.Type) -> str:
         case inspect.UnionType(types=types):
             return " or ".join(expected(type_) for type_ in types)
         case inspect.TupleType(item_types=items):
-            return f"a list of {len(items)}, each {expected(items[0])}"
+            return f"a list of {len(items)} values, each {expected(items[0])}"
         case inspect.VarTupleType(item_type=item):
             return f"a list, each {expected(item)}"
         case _:
@@ -175,4 +175,4 @@ def write(value: object) -> str:
             try:
                 return str(value)
             except ValueError:
-                return "a number of thousands of digits"
+                return "a number with thousands of digits"

@@ -480,7 +480,8 @@ class Release(Message, frozen=True):
     """Payload of the services `clear` and `activate`."""
 
     latch: LatchNumber | None = None
-    """Number of the latch to release, as in `RobotState.latch`; null for any number."""
+    """Number of the latch to release, as in `RobotState.latch`. If it is null, the call is refused
+    for 2 s after the latch."""
 
 
 class Settings(Message, frozen=True):

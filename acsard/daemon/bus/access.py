@@ -197,7 +197,9 @@ class _Keys:
             return COMMAND_ROLE if native.rpartition("/")[2] in self._sources else None
         if row_of(native) is None:
             # `least_role` would let every role use the ROS key.
-            raise LookupError(f"{endpoint.key} has no native key, and therefore no role")
+            raise LookupError(
+                f"the table of keys has no row for {native}, the key of {endpoint.key}"
+            )
         return least_role(native)
 
 

@@ -148,9 +148,9 @@ class ZenohBus:
             return (
                 "another robot on this bus already has ros.namespace = "
                 f'"{self._config.ros.namespace}": '
-                f"a ROS cmd_vel over {' or '.join(transports)} would drive both robots; give this "
-                "robot its own namespace, with [ros] namespace or `acsard run --namespace NAME`, "
-                f"or set {off}"
+                f"a ROS cmd_vel over {' or '.join(transports)} would drive both robots. Either "
+                "give this robot its own namespace ([ros] namespace or `acsard run --namespace "
+                f"NAME`), or set {off}"
             )
         return ""
 

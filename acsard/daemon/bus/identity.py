@@ -77,9 +77,9 @@ class Identity(Struct, frozen=True):
         if not self.certificate:
             return message
         return (
-            f"{message} If so, your certificate, {self.certificate}, may be missing from every "
-            "role's list. The lists are in [access] of the robot's acsard.toml, or behind a router "
-            "in the router's file. The robot answers only certificates in a list"
+            f"{message} If the daemon runs, your certificate, {self.certificate}, may be missing "
+            "from every role's list. The lists are in [access] of the robot's acsard.toml; behind "
+            "a router, they are in the router's file. The robot answers only certificates in a list"
         )
 
     def words(self) -> str:

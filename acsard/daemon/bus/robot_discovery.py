@@ -161,7 +161,7 @@ def explain_silence(key: str, robot_id: str, endpoint: str, presence: Presence) 
         near = get_close_matches(robot_id, presence.others, MAX_NAMED, 0.0)
         more = len(presence.others) - len(near)
         named = ", ".join(near) + (f" and {more} more (`acsard fleet`)" if more else "")
-        return f"there is no robot {robot_id}. The robots here are {named}; use --id {near[0]}"
+        return f"there is no robot {robot_id}. Robots here: {named}; use --id {near[0]}"
     if endpoint.startswith(TLS):
         return (
             f"robot {robot_id} is not visible: no robot at {endpoint} has this robot.id, or your "
@@ -201,6 +201,6 @@ def _unpublished(key: str, row: Topic) -> str:
                 "state -n 1 --short` shows whether it does"
             )
     return (
-        f"{key} does not arrive: may you read it (`acsard whoami` shows your role)? On the "
-        "robot, `acsard doctor` checks the daemon"
+        f"{key} does not arrive: either your role lacks the permission to read it (`acsard whoami` "
+        "shows your role), or the daemon has a fault (`acsard doctor` on the robot checks it)"
     )

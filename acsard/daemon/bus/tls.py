@@ -53,9 +53,9 @@ def require_usable(directory: str) -> None:
     why = unusable(*files_in(directory))
     if why:
         raise CertificateError(
-            f"the certificates in {directory} cannot be used ({why}): they are not PEM, or the "
-            "key belongs to another certificate or has a password; make new ones with `acsard tls "
-            "init` or `acsard tls add`",
+            f"the certificates in {directory} cannot be used ({why}): either they are not PEM, "
+            "or the key belongs to another certificate, or the key has a password; make new "
+            "certificates with `acsard tls init` or `acsard tls add`",
         )
 
 
@@ -302,13 +302,13 @@ def _server_rejected(error: ssl.SSLCertVerificationError, host: str, directory: 
             return (
                 f"the certificate of {host} has expired, according to this machine's clock "
                 f"({now}); if the clock is right, run `acsard tls renew` on the machine that has "
-                "ca-key.pem (with `--name NAME` for a robot of a fleet); it says what to do next"
+                "ca-key.pem (with `--name NAME` for a robot of a fleet); it prints the next step"
             )
         case code if code == NOT_YET:
             return (
                 f"the certificate of {host} is not valid yet, according to this machine's clock "
-                f"({now}); set this clock (`timedatectl`), or set the clock of the machine that "
-                "made the certificate, and renew the certificate"
+                f"({now}); either set this clock (`timedatectl`), or set the clock of the machine "
+                "that made the certificate and then renew the certificate"
             )
         case code if code in (WRONG_NAME, WRONG_ADDRESS):
             return (
@@ -330,13 +330,13 @@ def _client_rejected(reason: str, host: str, directory: str) -> str:
     certificate = f"{directory}/{CERTIFICATE}"
     if "CERTIFICATE_EXPIRED" in reason:
         return (
-            f"{host} says that {certificate} has expired or is not valid yet: make a new one with "
-            "`acsard tls add` on the machine that has ca-key.pem, or set the clocks of both "
-            "machines (`timedatectl`)"
+            f"{host} says that {certificate} has expired or is not valid yet: either make a new "
+            "one with `acsard tls add` on the machine that has ca-key.pem, or set the clocks of "
+            "this machine and of that host (`timedatectl`)"
         )
     if "UNKNOWN_CA" in reason or "CERTIFICATE" in reason or "DECRYPT" in reason:
         return (
             f"{host} does not accept {certificate}: this certificate comes from another authority "
-            "than the robot's; get one that `acsard tls add` made for this robot"
+            "than the robot's; get a certificate that `acsard tls add` made for this robot"
         )
     return f"{host} does not speak TLS here ({reason}); a plain endpoint begins with tcp/"

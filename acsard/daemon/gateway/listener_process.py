@@ -133,8 +133,8 @@ class SessionHealth:
             self._linked_ns, self._patience_ns = observed.at_ns, ALONE_NS
         if stuck:
             text = (
-                "a client keeps Zenoh so busy that it does not respond; this process restarts, "
-                "which disconnects all clients"
+                "Zenoh does not respond, because a client keeps it too busy; this process "
+                "restarts, which disconnects all clients"
             )
             return Event(self._events["stuck"], text, "error")
         if observed.at_ns - self._linked_ns > self._patience_ns:

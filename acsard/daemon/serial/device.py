@@ -194,9 +194,9 @@ def refusal(path: str, error: OSError) -> MendableError:
 _LISTED = "`acsard ports` lists the serial ports"
 _FREE = "stop it first (`systemctl stop acsard` if it is the service)"
 _JOIN = (
-    "add the user to the device's group (`sudo usermod -aG dialout $USER`, then log in again; a "
-    "service is in dialout already: does the device have another group, or a type that the unit "
-    "does not allow?)"
+    "add the user to the device's group (`sudo usermod -aG dialout $USER`), then log in again; "
+    "the service is in dialout already, so its device has either another group or a type that the "
+    "unit does not allow"
 )
 
 

@@ -42,7 +42,7 @@ def test_people_are_told_what_it_improves_and_what_remains() -> None:
     told = plain(*parts(REPORT, FOUND, "acsard.toml"), width=SENTENCES)
     assert "wheel_separation_multiplier   " in told
     assert f"error of a turn of 360 deg: {REPORT.turn_error_before:.0f} deg now" in told
-    assert "what remains" in told
+    assert "the error that remains" in told
     assert "--distance METRES" in told
 
 

@@ -365,8 +365,8 @@ def test_noise_is_written_beside_the_geometry_and_told(found: Calibration) -> No
     assert after.yaw_variance_per_radian < before.yaw_variance_per_radian / 10
     assert after.distance_variance_per_metre < before.distance_variance_per_metre
     told = plain(*parts(report("a.csv", found, DriveConfig(), ""), found, "f"), width=SENTENCES)
-    assert "chance errors of the heading after 10 m, as the odometry states them: " in told
-    assert "chance errors of the distance after 10 m" in told
+    assert "random errors of the heading after 10 m, as odometry publishes them: " in told
+    assert "random errors of the distance after 10 m" in told
 
 
 @pytest.mark.slow

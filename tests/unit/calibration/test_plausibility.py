@@ -71,7 +71,7 @@ WRONG = {
         ("sides", True, False, "left and right are swapped"),
         ("sides", False, True, "left and right are swapped"),
         ("sides", True, True, "left and right are swapped"),
-        ("ahead", True, True, "ahead is negative on both sides"),
+        ("ahead", True, True, "wheel speeds of both sides are negative ahead"),
         ("left", True, False, "the left wheels turn backwards"),
         ("left", False, True, "the left wheels turn backwards"),
         ("right", True, False, "the right wheels turn backwards"),

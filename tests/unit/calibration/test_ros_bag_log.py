@@ -284,7 +284,7 @@ def again(seen: Drive) -> Iterator[RosMessage]:
     [
         ([imu(SHORT)], "no wheel angles.*Its topics: /imu/data .Imu."),
         ([], "no wheel angles.*no message at all"),
-        ([joint_states(SHORT, names=("a", "b")), imu(SHORT)], r"joints are a, b\. .*\[joints\]"),
+        ([joint_states(SHORT, names=("a", "b")), imu(SHORT)], r"but are a, b\. .*\[joints\]"),
         ([joint_states(SHORT)], "nothing with which to compare the wheels"),
         ([joint_states(SHORT), as_encoding(imu(SHORT), "ros1")], "encoded as ros1, not as cdr"),
         ([cut(joint_states(SHORT)), imu(SHORT)], "of /joint_states .JointState. cannot be read"),

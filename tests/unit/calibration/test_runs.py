@@ -38,7 +38,7 @@ def test_repeated_times_are_taken_once_and_told() -> None:
 def test_a_time_that_begins_anew_begins_a_run() -> None:
     names, ends, notes = of(rows(0, 500) + rows(0, 300))
     assert (names, len(ends)) == (["1", "2"], 2)
-    assert any("restart of the time begins a new run: 1 of them" in note for note in notes)
+    assert any("jump back of the time begins a new run: 1 of them" in note for note in notes)
 
 
 def test_halves_of_a_drive_in_the_wrong_order_stay_one_run() -> None:
@@ -75,7 +75,7 @@ def test_stamps_in_ns_and_us_since_1970_are_told_from_seconds(per_second: float)
 @pytest.mark.parametrize("form", ["{:g}", "{:.0f}"])
 def test_times_that_were_rounded_away_are_reported(form: str) -> None:
     lines = [f"{form.format(1.7e9 + i / 100)},{i},{i},{i}," for i in range(3000)]
-    with pytest.raises(LogError, match="write it with 3 decimals"):
+    with pytest.raises(LogError, match="write t in seconds with 3 decimals"):
         of(lines)
 
 
@@ -90,7 +90,7 @@ def test_a_pause_of_a_day_parts_two_drives() -> None:
     names, ends, notes = of(rows(0, 500) + rows(86_400, 300))
     assert names == ["1", "2"]
     assert ends == pytest.approx([4.99, 2.99])
-    assert any("over 60 s begins a new run: 1 of" in note for note in notes)
+    assert any("over 60 s in the wheel speeds begins a new run: 1 of" in note for note in notes)
 
 
 def test_a_column_without_any_number_is_named() -> None:
@@ -161,7 +161,7 @@ def test_positions_that_a_logger_says_again_until_the_next_one_are_taken_once() 
     moving = run.place_t >= 3.3
     assert np.diff(run.place_t[moving]) == pytest.approx(0.2)
     assert (run.place_t < 3.0).sum() == 1, "many of one sample would outweigh those on the way"
-    assert any("x y repeat their value between samples" in note for note in log.notes)
+    assert any("x y repeat their last value between samples" in note for note in log.notes)
 
 
 def test_positions_of_half_the_rate_are_recognized_in_one_note_for_all_runs() -> None:
@@ -176,7 +176,9 @@ def test_positions_of_half_the_rate_are_recognized_in_one_note_for_all_runs() ->
     log = runs(read(("t,left,right,x,y,run\n" + "\n".join(rows)).encode()))
     assert [len(run.place) for run in log.runs] == [50, 55] * 6
     (note,) = log.notes
-    assert note.startswith("x y repeat their value between samples: 570 such rows")
+    assert note.startswith(
+        "x y repeat their last value between samples: such rows are left out, 570 of"
+    )
 
 
 def test_what_happens_in_many_runs_is_one_note_with_its_sum() -> None:

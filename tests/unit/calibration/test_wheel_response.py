@@ -84,7 +84,7 @@ def test_a_slow_robot_that_reverses_would_be_faulty_and_its_response_time_is_pro
     assert not found(REVERSING, 2.0, response_time=made.proposed).false_fault
 
 
-def test_if_every_response_time_causes_a_fault_the_sentence_names_the_fault_time() -> None:
+def test_if_no_response_time_leaves_a_reserve_the_sentence_names_the_fault_time() -> None:
     """Something holds the wheels for 1.5 s in the middle of the drive."""
     rest, ahead = (3.0, 0.0, 0.0), (4.0, 0.5, 0.0)
     (run,) = log([rest, ahead, (1.5, 0.0, 0.0), ahead, rest], 0.2).runs
@@ -93,10 +93,10 @@ def test_if_every_response_time_causes_a_fault_the_sentence_names_the_fault_time
     made = response([held], DriveConfig(), FeedbackConfig())
     assert made is not None
     assert (made.false_fault, made.proposed, made.settings()) == (True, None, {})
-    assert (
-        "so would every other value; if they are healthy, raise feedback.fault_time"
-        in (made.sentences()[0])
-    )
+    assert "if the wheels are healthy, raise feedback.fault_time" in made.sentences()[0]
+    slow = structs.replace(made, fastest=6.0).sentences()
+    assert "lower limits.wheel_speed first" in slow[0]
+    assert "limits.wheel_speed = 6" in slow[1]
 
 
 def test_a_response_time_that_causes_no_fault_is_one_sentence() -> None:

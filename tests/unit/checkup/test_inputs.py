@@ -69,7 +69,7 @@ def test_bumpers_that_are_only_reported_are_pressed_by_their_numbers() -> None:
     presses = {"bumper 1": 1, "bumper 2": 2}
     assert checked("bumpers", presses=presses)[0].figure == "bumper 1, bumper 2"
     found, _ = checked("bumpers", presses={"bumper 1": 2, "bumper 2": 2})
-    assert found.text == "bumper 1: no press was reported; instead that of the bumper 2"
+    assert found.text == "bumper 1: no press was reported; instead the board reported the bumper 2"
 
 
 def test_without_a_person_the_check_names_what_it_did_not_check() -> None:
@@ -93,8 +93,8 @@ def test_a_configured_input_that_is_not_reported_fails(
     ("presses", "text"),
     [
         ({"front bumper": 2, "rear bumper": 1},
-         "front bumper: no press was reported; instead that of the rear bumper; "
-         "rear bumper: no press was reported; instead that of the front bumper"),
+         "front bumper: no press was reported; instead the board reported the rear bumper; "
+         "rear bumper: no press was reported; instead the board reported the front bumper"),
         ({"front bumper": 1}, "rear bumper: no press was reported"),
     ],
 )  # fmt: skip

@@ -143,7 +143,7 @@ class Resetting(Robot):
 def test_a_watchdog_that_restarts_the_whole_board_is_named() -> None:
     checked = Checked(Resetting())
     assert checked.failed == ["restarts"]
-    assert "let it stop the motors and go on" in checked["restarts"].mend
+    assert "let that watchdog only stop the motors" in checked["restarts"].mend
     assert "sent nothing for" in checked["restarts"].text
 
 

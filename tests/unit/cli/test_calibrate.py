@@ -71,7 +71,7 @@ def test_write_keeps_the_comments_and_a_second_time_finds_nothing_to_improve(
     assert "yaw_variance_per_metre" in found["odometry"]
     for name, value in found["odometry"].items():
         assert getattr(config.odometry, name) == value
-    with pytest.raises(MendableError, match="not surely better") as end:
+    with pytest.raises(MendableError, match="not clearly better") as end:
         called(tmp_path, GOOD, "--json", "--write", text=text)
     assert end.value.code == Exit.FAILURE
     assert (tmp_path / "acsard.toml").read_text() == text
@@ -196,7 +196,7 @@ def test_a_bag_that_was_cut_off_is_read_up_to_the_cut(
     log = write_mcap(tmp_path / "bag.mcap", in_order(joint_states(seen), imu(seen)), compression)
     log.write_bytes(log.read_bytes()[: log.stat().st_size * 8 // 10])
     assert of_bag(tmp_path, log) == 0
-    assert "bag.mcap has no end" in json.loads(capsys.readouterr().out)["notes"][0]
+    assert "bag.mcap is cut off" in json.loads(capsys.readouterr().out)["notes"][0]
 
 
 def test_the_files_of_a_bag_are_one_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -239,7 +239,7 @@ def test_a_directory_that_is_no_bag_is_told(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("word", ["--topic=/imu", "--yaw-axis=x"])
 def test_the_options_of_a_bag_are_refused_for_a_csv_file(word: str, tmp_path: Path) -> None:
-    with pytest.raises(MendableError, match="are for a ROS 2 bag, and this is not one"):
+    with pytest.raises(MendableError, match="are only for a ROS 2 bag, and this log is not"):
         called(tmp_path, GOOD, word)
 
 

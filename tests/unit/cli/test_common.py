@@ -222,8 +222,8 @@ def test_what_is_never_published_says_what_to_type_instead(key: str, instead: st
         ("cmd/app", "echo cmd/app"),
         ("cmd/app/anna", "echo cmd/app/anna"),
         ("alive", "acsard fleet"),
-        ("**", "get asks one"),
-        ("schema/*", "get asks one"),
+        ("**", "get queries only one"),
+        ("schema/*", "get queries only one"),
     ],
 )
 def test_what_answers_nothing_or_acts_is_not_asked(key: str, instead: str) -> None:
@@ -263,7 +263,7 @@ def test_who_has_no_file_to_write_to_is_sent_to_the_robot(places: Places) -> Non
     with pytest.raises(MendableError) as raised:
         writable(None)
     assert "on the robot" in str(raised.value)
-    assert "acsard.toml there" in str(raised.value)
+    assert "acsard.toml on the robot" in str(raised.value)
 
 
 def test_a_file_that_this_user_may_not_write_is_refused_before_the_work(

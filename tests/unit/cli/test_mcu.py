@@ -250,7 +250,7 @@ def test_progress_is_one_line_on_a_terminal_that_the_next_one_writes_over(
 ) -> None:
     check = ("--port", "sim", "--yes")
     written = on_terminal(columns, lambda: called(tmp_path, *check), monkeypatch)
-    assert "listening at the configured baud" in written
+    assert "listening for 3 s at the configu" in written
     assert "\n" not in written
     shown = [line for line in written.split("\r\033[K") if line]
     assert len(shown) > 8

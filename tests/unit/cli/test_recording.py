@@ -336,7 +336,7 @@ def test_a_replay_says_what_it_has_compared(where: Path) -> None:
     _, out, _ = log(where, "replay", "1")
     _, told = out.splitlines()
     for word in (
-        "Each line to the board",
+        "each line to the board",
         "each pose",
         "the mode, reason, link and source of each step",
         "each event",
@@ -360,7 +360,7 @@ def test_with_another_configuration_it_tells_what_would_have_been(
     assert code == 0
     assert " s after the beginning: line, sent line\n" in out
     assert "  recorded  ap" in out
-    assert "the fastest wheel of all lines: 10.00 rad/s recorded, 6.00 rad/s replayed" in out
+    assert "the highest wheel speed in any line: 10.00 rad/s recorded, 6.00 rad/s replayed" in out
 
 
 def test_it_tells_which_limits_are_others_what_they_do_and_that_the_wheels_knew_nothing_of_it(
@@ -373,13 +373,15 @@ def test_it_tells_which_limits_are_others_what_they_do_and_that_the_wheels_knew_
     (keys,) = [line for line in out.splitlines() if line.startswith("changed settings: ")]
     assert "limits.linear_speed was 1.0, is 0.1" in keys
     assert "limits.linear_acceleration was 1.0, is 0.5" in keys
-    (told,) = [line for line in out.splitlines() if line.startswith("the fastest wheel of that")]
+    (told,) = [
+        line for line in out.splitlines() if line.startswith("the highest wheel speed in that")
+    ]
     assert told.endswith(", because of limits.linear_speed, limits.linear_acceleration")
     then, now = (float(word) for word in re.findall(r"(\d+\.\d+) rad/s", told))
     assert then > now
     (fault,) = [line for line in out.splitlines() if "in fault from " in line]
     assert "wheel" in fault
-    assert "a robot with this configuration need not have had that fault" in out
+    assert "a robot with this configuration might not have had that fault" in out
 
 
 def test_settings_that_change_no_line_are_told_all_the_same(where: Path, tmp_path: Path) -> None:
@@ -387,7 +389,7 @@ def test_settings_that_change_no_line_are_told_all_the_same(where: Path, tmp_pat
     same.write_text("[rates]\nstate = 5.0\n")
     code, out, _ = log(where, "replay", "1", "--config", str(same))
     assert (code, "differs" in out) == (0, False)
-    assert "computed with that configuration from the recorded inputs" in out
+    assert "computes its outputs with that configuration from the recorded inputs" in out
     assert out.splitlines()[-1].startswith("changed settings: rates.state was 10.0, is 5.0")
 
 

@@ -235,7 +235,7 @@ def test_two_runs_of_the_daemon_become_two_files(
         World(recorder=tape).run(1.0)
         tape.write(where / f"00000{number}-20270115T080000Z.mcap", Config())
     code, _, err = recording(where, "export", "all", "both.csv", "--csv")
-    assert (code, "has 2 parts, because the daemon restarted" in err) == (2, True)
+    assert (code, "has 2 separate parts, because the daemon restarted" in err) == (2, True)
     assert recording(where, "export", "all", "--csv")[0] == 0
     assert len([*tmp_path.glob("00000[12]-*.csv")]) == 2
 

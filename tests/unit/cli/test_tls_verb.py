@@ -572,7 +572,7 @@ def test_without_the_authority_s_key_the_message_asks_for_it(
 ) -> None:
     (own / "ca-key.pem").rename(own.parent / "ca-key.pem")
     assert tls("renew", "--directory", str(own)) == Exit.FAILURE
-    assert "has no ca-key.pem: bring the authority's key back" in capsys.readouterr().err
+    assert "has no ca-key.pem: copy the authority's key back" in capsys.readouterr().err
 
 
 def test_add_prints_a_list_that_keeps_who_is_there(

@@ -650,7 +650,7 @@ def test_a_disk_that_hangs_later_is_reported_once_and_so_is_its_answer(
     stuck.goes.set()
     until(lambda: file.trouble == "")
     assert file.news() == [
-        Event("latch_file", f"a stop survives a restart again; it is stored in {path}")
+        Event("latch_file", f"stops will survive a restart again; they are stored in {path}")
     ]
 
 
@@ -699,6 +699,6 @@ def test_a_disk_that_fills_up_is_reported_once_and_tried_until_it_takes(
     monkeypatch.setattr(module, "replace", replace_file)
     until(lambda: file.trouble == "")
     assert file.news() == [
-        Event("latch_file", f"a stop survives a restart again; it is stored in {path}")
+        Event("latch_file", f"stops will survive a restart again; they are stored in {path}")
     ]
     assert path.read_bytes() == encode("acsar", STOP)

@@ -90,7 +90,7 @@ def test_what_run_was_told_by_an_option_is_offered_as_lines_of_the_file() -> Non
 def test_what_is_no_option_of_run_is_a_warning() -> None:
     (finding,) = compared(running(replace(FILE, odometry=replace(FILE.odometry, gyro=True))), FILE)
     assert (finding.level, "odometry.gyro = true, not false" in finding.text) == ("warning", True)
-    assert "if it runs with another file, name that file with --config" in finding.mend
+    assert "if the daemon runs with another file, name that file with --config" in finding.mend
 
 
 def test_what_was_set_while_it_ran_is_told_apart_from_options() -> None:
@@ -103,7 +103,7 @@ def test_what_was_set_while_it_ran_is_told_apart_from_options() -> None:
     (finding,) = compared(running(runs), FILE)
     assert "limits.linear_speed = 0.4, not 1.0" in finding.text
     assert f"commands.sources.{sources[0].name}.timeout = 0.4, not 0.25" in finding.text
-    assert "set while it ran" in finding.text
+    assert "set while the daemon ran" in finding.text
     assert "acsard set KEY VALUE --write" in finding.mend
     assert "options" not in finding.text + finding.mend
     both = replace(runs, mcu=McuConfig(port="/dev/pts/3"))
@@ -227,7 +227,7 @@ CONFIG = Config(mcu=McuConfig(port="/dev/ttyX"))
     ("here", "mend"),
     [
         (True, "try-reload-or-restart acsard-gateway acsard-web"),
-        (True, "`sudo systemctl reload acsard` on a robot that connects to a router"),
+        (True, "if the robot connects to a router, also `sudo systemctl reload acsard`"),
         (False, "`acsard doctor` on that machine"),
     ],
 )
@@ -367,7 +367,7 @@ def test_a_bumper_that_only_limits_lets_the_robot_drive_away_before_a_clear() ->
     state = replace(STATE, bumpers=[True])
     *_, finding = link(Running(INFO, config, state, state, 0))
     assert finding.mend.startswith(
-        "drive straight away from it; if the robot is stopped, release it at the robot"
+        "drive away from it in a straight line; if the robot is stopped, release it at the robot"
     )
 
 

@@ -417,8 +417,8 @@ def test_a_bug_of_the_daemon_is_recorded_with_the_inputs_of_the_failed_step(
     assert step.number == number
     assert [one.verb for one in step.inputs.requests] == ["stop"]
     assert step.inputs.now.mono_ns <= bench.world.now_ns
-    assert "does not end the robot of this version" in result.failed_step
-    assert ("ends this version too, by ZeroDivisionError" in ended) is (broken == "robot")
+    assert "does not end this version" in result.failed_step
+    assert ("ends this version too, with ZeroDivisionError" in ended) is (broken == "robot")
     rewrite(recording, new := path.with_name("new.mcap"))
     assert read_end(new) == last
     assert replay_file(Recording(new)) == result

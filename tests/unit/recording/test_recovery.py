@@ -96,7 +96,7 @@ def test_a_disk_that_refuses_the_end_costs_no_chunk_and_is_reported(
     monkeypatch.setattr(os, "fsync", full)
     told = recover(part, whole, "crash", room=False)
     assert whole.read_bytes() == cut
-    assert "a.mcap was cut off and gets no end record, because the disk is full" in told
+    assert "a.mcap was cut off. Because the disk is full, the file gets no end record" in told
     assert (part.exists(), whole.stat().st_mtime) == (False, 1e9)
 
 
@@ -201,7 +201,7 @@ def test_a_short_file_with_a_bad_sector_at_its_beginning_stays_and_is_reported(
     bad[begin : begin + 512] = bytes(512)
     assert len(bad) < NOTHING_BYTES
     part.write_bytes(bad)
-    assert "it is now a.mcap" in recover(part, whole, "crash", room)
+    assert "its file is a.mcap" in recover(part, whole, "crash", room)
     assert whole.read_bytes() == bad
     assert not part.exists()
 

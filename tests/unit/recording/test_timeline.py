@@ -62,7 +62,7 @@ def test_a_recording_that_continues_another_begins_with_what_the_robot_does() ->
     assert entry.seconds == steps[0].inputs.now.wall_ns / 1e9
     assert entry.by == "app"
     assert entry.text == (
-        "an earlier recording goes on here: driving, link up, "
+        "this recording continues an earlier one: driving, link up, "
         f"at x {x / 1e6:.2f} m, y {y / 1e6:.2f} m, yaw {math.degrees(yaw / 1e6):.1f} deg"
     )
     assert "continues" not in [other.name for other in others]
@@ -78,7 +78,7 @@ def test_without_a_link_a_recording_that_continues_another_begins_without_a_pose
     ]
     (entry,) = [entry for entry in [*entries, *writer.end()] if entry.name == "continues"]
     assert entry is entries[0]
-    assert "an earlier recording goes on here: waiting (" in entry.text
+    assert "this recording continues an earlier one: waiting (" in entry.text
     assert entry.text.endswith(", the pose is not known")
 
 
@@ -246,7 +246,7 @@ def restarted(identity: bytes) -> list[TimelineEntry]:
 def test_a_board_that_names_itself_after_a_lost_link_has_an_entry_with_its_last_reset() -> None:
     identity = b"!acsard-mcu 1 counts=3200 check=1 sample=1 lines=0 reset=brown-out\r\n"
     (board,) = [entry for entry in restarted(identity) if entry.name == "board"]
-    assert board.text.startswith("the microcontroller names itself,")
+    assert board.text.startswith("the microcontroller sent its name,")
     assert board.text.endswith(": 1 counts=3200 check=1 sample=1 lines=0 reset=brown-out")
 
 
@@ -323,7 +323,7 @@ def test_lines_during_a_silence_do_not_count_as_another_silence() -> None:
 
 def test_missing_steps_are_reported() -> None:
     gaps = [one.text for one in story(driven(), range(100, 160)) if one.name == "gap"]
-    assert gaps == ["60 steps are missing before this one: 0.3 s"]
+    assert gaps == ["60 steps are missing before this step: 0.3 s"]
 
 
 def test_a_pressed_emergency_stop_is_a_serious_incident_and_its_release_is_none() -> None:

@@ -210,7 +210,7 @@ def test_silence_ends_what_moves_and_signs_of_life_do_not(
             program.say({})
             assert person.keys(0.05) == ""
         interrupted(program, lambda: person.keys(60.0))
-    assert "no sign of life of the operator arrived for 0.25 s" in capfd.readouterr().err
+    assert "no sign of life from the operator arrived for 0.25 s" in capfd.readouterr().err
 
 
 def test_a_question_waits_for_a_person_for_as_long_as_he_takes(

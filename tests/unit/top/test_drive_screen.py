@@ -69,7 +69,7 @@ def test_help_stays_on_a_screen_of_few_lines() -> None:
 def test_a_refused_key_that_is_held_is_to_be_let_go() -> None:
     why = "send a zero first: teleop must send a zero before it can drive"
     told = " ".join(news(replace(SEEN, objection=why), 200))
-    assert f"your keys do not drive: {why} (release the key, and press it again)" in told
+    assert f"your keys do not drive the robot: {why} (release the key, and press it again)" in told
     assert "let go" not in " ".join(news(replace(SEEN, objection="stopped by anna"), 200))
 
 

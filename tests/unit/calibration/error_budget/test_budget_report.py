@@ -62,7 +62,7 @@ def test_coarse_encoders_whose_counts_nobody_knows_come_first() -> None:
 
 def test_what_is_only_declared_does_not_hide_what_was_measured() -> None:
     told = advice(of(("slip", 900.0, "settings"), ("time", 50.0, "measured"), KNOWN))
-    assert told.startswith("the largest cause is slip, by the settings in [odometry]")
+    assert told.startswith("according to the settings in [odometry], the largest cause is slip")
     assert "the largest measured cause is time" in told
 
 
@@ -98,7 +98,7 @@ def test_the_track_that_a_gyro_implies_stands_beside_the_configured_one(still: b
         "multiplier would be 1.700 (standard deviation 0.050). Odometry uses the configured value,"
         in told
     )
-    assert "value, 1.500. If both differ" in told
+    assert "value, 1.500. If the two values differ" in told
     assert "would be" not in text(of(KNOWN, still=still))
     told = " ".join(text(replace(found, learned_used=True)).split())
     assert "multiplier is 1.700 (standard deviation 0.050). Odometry uses this value" in told

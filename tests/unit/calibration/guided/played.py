@@ -108,8 +108,8 @@ class Player:
             ("front left wheel", 0.3 - LENGTH * half), ("rear left wheel", 0.3 + LENGTH * half),
             ("rear left corner", 0.3 - WIDTH * half), ("rear right corner", 0.3 + WIDTH * half),
             ("front left corner", 0.3 + WIDTH * half), ("front right corner", 0.3 - WIDTH * half),
-            ("its left side", self.place.real - WIDTH * half),
-            ("its right side", self.place.real + WIDTH * half),
+            ("robot's left side", self.place.real - WIDTH * half),
+            ("robot's right side", self.place.real + WIDTH * half),
             ("left of its marks", self.place.imag),
             ("from the wall now", self.place.real), ("How far is", abs(self.place)),
         ):  # fmt: skip

@@ -121,7 +121,7 @@ def test_checked_lines_take_more_of_the_wire() -> None:
     assert line == (
         "control.rate = 25: a line of 41 B at 9600 baud takes 42.7 ms, so at most 23 Hz is "
         "possible, and 18 Hz uses 80 % of the wire; "
-        'write mcu.baud_rate = 19200 or more, or control.rate = 18 or "auto", or '
+        'write mcu.baud_rate = 19200 or more; or control.rate = 18 or "auto"; or '
         'mcu.link_check = "off" (lines of 33 B)'
     )
     assert Config(mcu=mcu, control=ControlConfig(rate="auto")).rate_hz == 18
@@ -133,7 +133,7 @@ def test_the_sample_fields_take_more_still() -> None:
     assert line == (
         "control.rate = 100: a line of 62 B at 57600 baud takes 10.8 ms, so at most 92 Hz is "
         "possible, and 74 Hz uses 80 % of the wire; "
-        'write mcu.baud_rate = 115200 or more, or control.rate = 74 or "auto", or '
+        'write mcu.baud_rate = 115200 or more; or control.rate = 74 or "auto"; or '
         "mcu.encoder_counts = 0 (lines of 41 B)"
     )
     assert problems(mcu=mcu, control=ControlConfig(rate=92)) == []
@@ -241,12 +241,12 @@ def test_motion_away_from_a_bumper_needs_its_place() -> None:
         (
             BatteryConfig("percent", warning_below=99.8),
             "battery.warning_below = 99.8: with battery.hysteresis = 0.5 the level would end "
-            "only above 100, which no board reports; lower one of the two",
+            "only above 100, which no board reports; lower either value",
         ),
         (
             BatteryConfig(stop_below=60.0, hysteresis=40.0),
             "battery.stop_below = 60: with battery.hysteresis = 40 the level would end only above "
-            "99.99, which no board reports; lower one of the two",
+            "99.99, which no board reports; lower either value",
         ),
     ],
 )

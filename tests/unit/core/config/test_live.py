@@ -139,7 +139,7 @@ def test_one_that_cannot_be_refuses_all() -> None:
 
 def test_a_rule_between_keys_refuses_what_breaks_it_and_takes_both_together() -> None:
     softer: dict[str, object] = {"limits.linear_deceleration": 0.15}
-    assert "would take 6.7 s, and the longest" in problems(softer)[0]
+    assert "would take 6.7 s, but at most" in problems(softer)[0]
     made, _ = changed(CONFIG, softer | {"limits.linear_speed": 0.5}, True)
     assert made.limits.linear_deceleration == 0.15
 

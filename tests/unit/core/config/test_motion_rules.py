@@ -168,4 +168,4 @@ def test_a_fault_rests_on_two_lines_and_a_lost_line_is_no_new_start(
     found = problems(
         Config(mcu=McuConfig(reply_period=period), feedback=FeedbackConfig(fault_time=fault_s))
     )
-    assert [f"write {most} at most" in line for line in found] == [True] * (most is not None)
+    assert [f"write {most} or less" in line for line in found] == [True] * (most is not None)

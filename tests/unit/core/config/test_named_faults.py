@@ -47,8 +47,8 @@ REFUSED = [
     ("pushed=-inf", "write a number like"),
     ("pushed=1000001", "up to 1e+06"),
     ("wrong_baud=300", "the baud rate must be one of 9600"),
-    ("stalls=0.1:0.2", "fewer seconds for each"),
-    ("stalls=0.2:0.2", "fewer seconds for each"),
+    ("stalls=0.1:0.2", "the shorter duration of each"),
+    ("stalls=0.2:0.2", "the shorter duration of each"),
     ("estop_pressed=-1:2", "give the seconds from the start to the fault"),
     ("estop_silent=1:-2", "give the seconds from the start to the fault"),
     (
@@ -57,8 +57,8 @@ REFUSED = [
     ),
     ("bumper_pressed=1:-1:2", "give the seconds from the start to the fault"),
     ("driver_fault=1:-2", "give the seconds from the start to the fault"),
-    ("stalls=5:0", "both at least 0.001"),
-    ("stalls=5:0.0009", "both at least 0.001"),
+    ("stalls=5:0", "both values must be at least 0.001"),
+    ("stalls=5:0.0009", "both values must be at least 0.001"),
 ]
 
 

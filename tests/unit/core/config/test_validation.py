@@ -90,7 +90,7 @@ def test_a_whole_number_stands_for_a_float() -> None:
             'wood = "elm": expected one of "ash", "oak"; the default is wood = "oak"',
         ),
         ({"heavy": 1}, "heavy = 1: expected true or false; the default is heavy = false"),
-        ({"pair": [1.0]}, "pair = [1.0]: expected a list of 2, each a number; "),
+        ({"pair": [1.0]}, "pair = [1.0]: expected a list of 2 values, each a number; "),
         ({"marks": "a"}, 'marks = "a": expected a list, each a text in quotes; '),
         ({"marks": [1]}, "marks = [1]: expected a list, each a text in quotes; "),
         ({"speed": 0.5}, 'speed = 0.5: expected a number from 1 to 9 m/s or one of "auto"; '),

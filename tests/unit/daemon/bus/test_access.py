@@ -241,7 +241,7 @@ def test_the_rules_have_the_least_role_of_each_key() -> None:
 def test_a_ros_key_without_a_native_key_is_granted_to_no_role() -> None:
     keys, (endpoint, *_) = _Keys(Config()), endpoints(Config().ros, "*")
     assert keys._least(endpoint)
-    with pytest.raises(LookupError, match="has no native key"):
+    with pytest.raises(LookupError, match="no row for forgotten"):
         keys._least(structs.replace(endpoint, native="forgotten"))
 
 
