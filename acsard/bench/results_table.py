@@ -74,7 +74,8 @@ class Result(Struct, frozen=True, omit_defaults=False):
     lines_told: int
     """Number of feedback lines whose odometry the benchmark received."""
     lines_waiting_max: int | None
-    """Largest number of newer lines that the board had written when the odometry of a line arrived.
+    """Largest number of lines that the board had written after a line, when the odometry that was
+    computed from that line arrived.
 
     It is null on a real port.
     """

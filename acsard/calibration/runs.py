@@ -65,7 +65,8 @@ Streams = dict[str, tuple[Floats, ...]]
 """The times and the values of each sensor, by the sensor's name in `STREAMS`."""
 
 MOST_RUNS = 1000
-"""Largest number of different values in the column `run`. If there are more, none names a run."""
+"""Largest number of different values in the column `run`. If there are more, the column does
+not name runs."""
 
 TOGETHER = 50
 """Number of rows whose speeds are summed before the two wheels of a side are compared."""

@@ -38,9 +38,9 @@ def add_outcome(parser: argparse.ArgumentParser, result: str) -> None:
     form.add_argument(
         "--json-lines",
         action="store_true",
-        help="for a program that asks the operator: this tool writes its messages and questions to "
-        "standard output as JSON, one object per line, and reads the answers from standard "
-        "input in the same form (deploy/web/README.md)",
+        help="for a program that puts the questions to the operator itself: write messages and "
+        "questions to standard output as JSON, one object per line, and read the answers from "
+        "standard input in the same form (deploy/web/README.md)",
     )
     parser.add_argument(
         "--write",

@@ -59,8 +59,8 @@ class Memory(Struct, frozen=True):
     """Longest time that the robot may need from full speed to rest, ns. It covers all limits that
     were in force since the robot was last at rest."""
     stop_ramp_ns: int = 0
-    """Longest time that the robot may need from full speed to rest at the stop decelerations, ns.
-    It covers all limits that were in force since the robot was last at rest."""
+    """Longest time, ns, that a stop from full speed may take. It is the largest of the times with
+    each set of limits that was in force since the robot was last at rest."""
 
 
 class Guard:

@@ -144,7 +144,8 @@ class ReasonChanges:
         self._reported_ns = -REASON_NS
         """Monotonic time of the last entry, ns.
 
-        A change to the mode `waiting`, or an event with the reason for it, counts as an entry too.
+        A change to the mode `waiting` counts as an entry, and so does an event with the reason for
+        waiting.
         """
         self._sender = ("", "")
         """The last source that the robot followed, and the last sender on that source."""
