@@ -39,8 +39,8 @@ HEAD = """\
 #
 #     pip install -r requirements.lock
 #
-# Written by `python -m tests.lock`. .ci/run tests on it, and runs unit tests once more on
-# the lowest versions that pyproject.toml allows.
+# Written by `python -m tests.lock`. .ci/run tests on it. The nightly job runs the unit tests
+# on the lowest versions that pyproject.toml allows.
 """
 
 

@@ -37,6 +37,7 @@ auto_activate = false
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_it_measures_the_simulator_and_moves_nothing_on_a_real_port(
     tmp_path: Path, peer: Peer
 ) -> None:

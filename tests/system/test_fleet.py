@@ -439,6 +439,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
 
 @pytest.mark.parametrize("verb", get_args(Verb))
 @pytest.mark.parametrize("name", NAMES)
+@pytest.mark.nightly
 def test_each_may_do_what_the_table_says_and_nothing_else(
     fleet: Fleet, name: str, verb: Verb
 ) -> None:

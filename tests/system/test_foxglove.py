@@ -328,6 +328,7 @@ def exported(path: Path) -> dict[str, list[Any]]:
 
 
 @SLOW
+@pytest.mark.nightly
 def test_the_log_tells_the_daemon_s_events_each_once(viewer: Viewer, bus: Bus) -> None:
     looked = viewer.show("/log")
     looked.first()

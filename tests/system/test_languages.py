@@ -80,6 +80,7 @@ def driven(words: Sequence[str], where: Path, bus: Bus, **more: str) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_the_node_program_drives_the_robot(page: Page, standing: Bus, tmp_path: Path) -> None:
     node = program("node", "it runs the program")
     version = run([node, "--version"], tmp_path)
@@ -91,6 +92,7 @@ def test_the_node_program_drives_the_robot(page: Page, standing: Bus, tmp_path: 
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_the_java_program_drives_the_robot(page: Page, standing: Bus, tmp_path: Path) -> None:
     java = program("java", "it runs the program")
     words = [java, str(CLIENTS / "java/Drive.java")]

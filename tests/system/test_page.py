@@ -943,6 +943,7 @@ async def test_a_page_that_has_no_place_says_why_and_stops(page: Phone) -> None:
         await asyncio.to_thread(look)
 
 
+@pytest.mark.nightly
 def test_nothing_stands_in_the_way_of_a_screen_reader(page: Phone) -> None:
     looked = itertools.product((PHONE, SIDEWAYS, DESKTOP), (False, True), (False, True), VIEWS)
     for size, dark, stopped, view in looked:

@@ -124,6 +124,7 @@ for arguments in json.loads(sys.argv[1]):
 
 @pytest.mark.network
 @pytest.mark.timeout(600)
+@pytest.mark.nightly
 def test_each_call_that_proves_a_promise_finds_tests() -> None:
     asked = [words for words in promises() if any(word.startswith("tests/") for word in words)]
     done = finish([sys.executable, "-c", COLLECT, json.dumps(asked)], ROOT, 500.0)

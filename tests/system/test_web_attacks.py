@@ -663,6 +663,7 @@ class Cost(NamedTuple):
     """Periods for which the control loop waited for a core."""
 
 
+@pytest.mark.nightly
 async def test_stops_of_robots_that_do_not_exist_cost_no_more_than_pings_and_no_periods(
     table: Table, bus: Bus, tokens: dict[str, str]
 ) -> None:
