@@ -122,7 +122,7 @@ def thaw(data: bytes) -> State:
     match made:
         case (Robot() as robot, Memory() as memory):
             return State(robot, memory)
-    raise StateError("the stored state at its start is not valid")
+    raise StateError("the state at its start is not valid")
 
 
 def short(error: Exception) -> str:
