@@ -84,13 +84,13 @@ class WheelResponse(Struct, frozen=True):
         follow = f"the wheels follow their commands with a response time of {self.seconds:.2g} s"
         if self.false_fault:
             then = (
-                f", so the daemon would take them for faulty with feedback.response_time = "
-                f"{self.present:g}: "
+                f", but with feedback.response_time = {self.present:g} the daemon would take them "
+                "for faulty: "
             )
             if self.proposed is not None:
                 then += f"the new value is {self.proposed:g}"
             elif np.isfinite(self.fastest):
-                then += "lower limits.wheel_speed first"
+                then += "first lower limits.wheel_speed as below"
             else:
                 then += (
                     "no longer response time leaves enough reserve; if the wheels are healthy, "

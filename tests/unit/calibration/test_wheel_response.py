@@ -95,7 +95,7 @@ def test_if_no_response_time_leaves_a_reserve_the_sentence_names_the_fault_time(
     assert (made.false_fault, made.proposed, made.settings()) == (True, None, {})
     assert "if the wheels are healthy, raise feedback.fault_time" in made.sentences()[0]
     slow = structs.replace(made, fastest=6.0).sentences()
-    assert "lower limits.wheel_speed first" in slow[0]
+    assert "first lower limits.wheel_speed" in slow[0]
     assert "limits.wheel_speed = 6" in slow[1]
 
 
