@@ -1,8 +1,7 @@
-"""The far end of the serial wire in a benchmark: a program that simulates the board on a pty.
+"""The far end of the serial wire in a benchmark: a process that simulates the board on a pty.
 
-The far end is a separate process with real-time priority, if that is permitted. So it measures the
-times on the wire independently of the daemon and of the benchmark program. Its first line of output
-is the path of the pty. When its standard input ends, it writes all recorded data and ends.
+It has real-time priority if that is permitted. Its first line of output is the path of the pty.
+When its standard input ends, it writes all recorded data and ends.
 """
 
 from __future__ import annotations
@@ -30,15 +29,9 @@ class Part(msgspec.Struct, frozen=True):
 
     config: dict[str, object]
     free_running: float = 0.0
-    """Period of the reports of a board that reports without being asked, s.
-
-    0 means that the board answers each line.
-    """
+    """Period of unprompted reports, s. 0 means that the board answers each line."""
     baud_rate: int = 0
-    """Baud rate of the simulated board. 0 means the configured one.
-
-    Rates that the configuration rejects are accepted here.
-    """
+    """Baud rate of the simulated board, not validated. 0 means the configured one."""
 
 
 class NumberedMcu(FakeMcu):

@@ -1,8 +1,7 @@
-"""The record of a benchmark, and the figures that are computed from it. This module is pure.
+"""The record of a benchmark, and the figures that are computed from it.
 
-The far end is the process that simulates the board. Successive commands and feedback lines have
-different speeds. So each output of the measured daemon is matched with its input by the speed, and
-not by the time. Times are monotonic, in ns.
+Successive commands and feedback lines have different speeds. Each output of the measured daemon is
+therefore matched with its input by the speed, not by the time. Times are monotonic, in ns.
 """
 
 from __future__ import annotations
@@ -21,9 +20,9 @@ STEPS = 1000
 """Number of different speeds. Lines with equal speeds are distinguished by their times."""
 
 LOWEST, STEP = 5.0, 0.02
-"""Lowest wheel speed, and difference of successive wheel speeds, rad/s.
+"""Lowest wheel speed, and the step between successive speeds, rad/s.
 
-The difference is so small that the limits on acceleration do not change the speeds.
+The step is so small that the limits on acceleration do not change the speeds.
 """
 
 PATIENCE_NS = 1_000_000_000
@@ -64,9 +63,9 @@ def staircase(number: int) -> float:
 
 
 def lines_of(chunks: Iterable[Chunk]) -> list[Chunk]:
-    """Return the lines in these bytes, each with the time of its first byte, ns.
+    """Return the non-empty lines, each with the time of its first byte, ns.
 
-    Line ends, trailing commas and empty lines are removed.
+    Line ends and trailing commas are removed.
     """
     lines, held, began_ns = [], b"", 0
     for at_ns, data in chunks:
@@ -132,9 +131,9 @@ def _key(speed: float) -> int:
 
 
 def summary(durations_ns: Sequence[int]) -> Summary | None:
-    """Return the number, the percentiles and the maximum of durations; None if there are none.
+    """Return the figures of these durations, or None if there are none.
 
-    Each percentile is one of the measured durations, not an interpolation.
+    Each percentile is one of the durations, not an interpolation.
     """
     if not durations_ns:
         return None
@@ -172,15 +171,10 @@ class Sample(Struct, frozen=True):
 
 
 class Record(Struct, frozen=True):
-    """The raw times of one benchmark."""
-
     began_ns: int
     """Monotonic time just before the daemon was started, ns."""
     window_ns: tuple[int, int]
-    """Begin and end of the evaluated time, ns, monotonic.
-
-    It begins when the daemon has started up, and ends just before the daemon is shut down.
-    """
+    """Evaluated time, ns: from the end of the daemon's start-up until just before its shutdown."""
     seen: Seen | None
     """Data on the wire; None on a real port, whose wire cannot be observed."""
     sent: list[Sent]

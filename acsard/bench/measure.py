@@ -1,8 +1,4 @@
-"""Runs one benchmark and computes the figures from its record.
-
-The measured daemon reads a temporary file with the user's configuration, in which some settings are
-changed.
-"""
+"""Runs one benchmark and computes the figures from its record."""
 
 from __future__ import annotations
 
@@ -44,7 +40,7 @@ from acsard.host.errors import MendableError
 
 
 def bench_config(config: Config, *, simulated: bool) -> Config:
-    """Return the configuration of the measured daemon, with its own robot id, bus and source.
+    """Return the configuration of the measured daemon: it has a separate robot id, bus and source.
 
     With the simulated board, more settings change. The limits are so high that each command reaches
     the next line unchanged. Feedback that contradicts the commands is not a fault. Lines have no

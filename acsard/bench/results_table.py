@@ -1,4 +1,4 @@
-"""Makes the tables of the figures of `acsard bench`, with the machine and the measuring points."""
+"""Makes the tables that `acsard bench` prints."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ POINTS = {
     "feedback_to_odometry": "last byte of a feedback line written -> its odometry here",
     "read_to_odometry": "feedback sampled by the microcontroller (its stamp) -> its odometry here",
 }
-"""Names of the times that the benchmark measures, with the two events that begin and end each time.
+"""Times that the benchmark measures, and the events that begin and end each time.
 
 "Here" is the process of the benchmark.
 """
@@ -33,22 +33,16 @@ OWN = {
     "feedback_to_bus": "feedback line read -> its last message handed to the bus",
     "mcu_round_trip": "line -> end of its answer (on a checked link)",
 }
-"""Names of the times that the daemon measures, with the two events that begin and end each time.
-
-The names are those of `latencies.Name`.
-"""
+"""Times that the daemon measures (`latencies.Name`), and the events that begin and end each."""
 
 
 class Machine(Struct, frozen=True):
-    """The machine on which the figures were measured."""
-
     cpu: str
     cores: int
     kernel: str
     python: str
     acsard: str
     realtime_permitted: bool
-    """True if this user may use real-time scheduling."""
 
 
 class Result(Struct, frozen=True, omit_defaults=False):
@@ -74,11 +68,7 @@ class Result(Struct, frozen=True, omit_defaults=False):
     lines_told: int
     """Number of feedback lines whose odometry the benchmark received."""
     lines_waiting_max: int | None
-    """Largest number of lines that the board had written after a line, when the odometry that was
-    computed from that line arrived.
-
-    It is null on a real port.
-    """
+    """Largest `Fed.waiting` of the feedback lines; null on a real port."""
     lines_sent: int
     """Number of lines that the daemon had written to the port when `missed_periods` was read."""
     missed_periods: int
@@ -103,7 +93,6 @@ def this_machine() -> Machine:
 
 
 def _cpu_model() -> str:
-    """Return the name of the board, such as a Raspberry Pi model, or else that of the processor."""
     try:
         board = Path("/proc/device-tree/model").read_text().strip("\0\n ")
         if board:
@@ -118,7 +107,6 @@ def _cpu_model() -> str:
 
 
 def parts(result: Result) -> Iterator[RenderableType]:
-    """Yield tables of the figures, for people to read."""
     outside = _figures("measured from outside", POINTS, result.outside)
     own = _figures("measured by the daemon itself", OWN, result.own)
     yield table(_about(result))

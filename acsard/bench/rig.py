@@ -2,10 +2,9 @@
 
     bench (bus client)  <- loopback TCP ->  daemon  <- pty ->  far_end.py (simulated MCU)
 
-The three processes use the same monotonic clock, so their times can be compared. This module starts
-the daemon, sends commands to it, ends it and collects raw times, which `matching.py` evaluates. The
-measured program is usually acsard. Any other program that accepts `--config` and `--port` and uses
-the same keys can be measured in its place.
+The three processes use the same monotonic clock, so their times can be compared. The measured
+program is usually acsard. Any other program that accepts `--config` and `--port` and uses the same
+keys can be measured in its place.
 """
 
 from __future__ import annotations
@@ -48,18 +47,14 @@ END_S = 5.0
 
 
 def ended(who: str, code: int, said: str = "") -> MendableError:
-    """Return an error which says that the process named `who` ended unexpectedly.
-
-    `code` is the return code of the process, and `said` its error message or "".
-    """
+    """Return an error which says that the process `who` ended with `code` and message `said`."""
     return MendableError(f"{who} {how_it_ended(code)}" + (f": {said}" if said else ""))
 
 
 def daemon_ended(code: int, log: Path) -> MendableError:
-    """Return an error that says why the daemon ended by itself.
+    """Return an error that says why the daemon ended by itself, with the last message in `log`.
 
-    `code` is the daemon's exit code, and `log` its log file. The error contains the last message in
-    the file. If there is a message and `code` is in `Exit`, the benchmark also exits with `code`.
+    If there is such a message and `code` is in `Exit`, the benchmark also exits with `code`.
     """
     lines = log.read_text(errors="replace").splitlines()
     # The daemon's log lines are JSON; its reason for ending is plain text.
@@ -87,8 +82,7 @@ T = TypeVar("T")
 ACSARD = (sys.executable, "-m", "acsard", "run")
 
 START_S = 15.0
-"""Time limit of the start, s. A start usually takes 0.3 s, and 2 s more if opening the port resets
-the board."""
+"""Time limit of a start, s. A start takes 0.3 s, or 2.3 s if opening the port resets the board."""
 
 SETTLED = 10
 """Number of odometry samples after which the start of the daemon counts as complete."""
@@ -99,9 +93,7 @@ LOOK_S = 0.5
 FAR_END = "the simulated microcontroller's process"
 
 SPACING_S = (0.02, 0.06)
-"""Shortest and longest time between two commands, s. The times are uniformly distributed, so that
-commands arrive at any phase of the control period.
-"""
+"""Range of the random times between commands, s. Commands thus arrive at any control phase."""
 
 
 class Rig:
@@ -226,7 +218,6 @@ class Rig:
             time.sleep(0.01)
 
     def _why(self) -> str:
-        """Return the daemon's reason for its mode, after ": "; "" if the daemon does not answer."""
         try:
             return f": {self.state().reason}"
         except NoAnswerError:
@@ -246,10 +237,7 @@ class Rig:
         self._arrived.append((clock.now(), sample.payload.to_bytes()))
 
     def follow(self, seconds: float) -> float:
-        """Receive odometry for `seconds` without sending commands.
-
-        Returns the processor use of the measured program as a share of one core.
-        """
+        """Receive odometry for `seconds`. Return the program's CPU use as a share of one core."""
         began_ns, used_ns = clock.mono_ns(), processor_ns(self.process.pid)
         end_ns = began_ns + int(seconds * NS_PER_S)
         while (left_ns := end_ns - clock.mono_ns()) > 0:
@@ -258,15 +246,10 @@ class Rig:
         return self._share(began_ns, used_ns)
 
     def command(self, seconds: float, wheel_speed: Callable[[int], float], seed: int = 1) -> float:
-        """Send commands at random intervals for `seconds`.
+        """Send commands at random intervals. Return the program's CPU use as a share of one core.
 
-        Returns the processor use of the measured program as a share of one core.
-
-        Args:
-            seconds: the duration, s.
-            wheel_speed: a function that takes the number of a command, which counts from 0, and
-                returns the speed of all wheels, rad/s.
-            seed: the seed of the random intervals.
+        `wheel_speed` takes the number of a command (0, 1, ...) and returns the wheels' speed,
+        rad/s.
         """
         phases, number = random.Random(seed), 0
         self._neutral(phases)
@@ -282,10 +265,7 @@ class Rig:
         return self._share(began_ns, used_ns)
 
     def _neutral(self, phases: random.Random) -> None:
-        """Send zeros until the daemon accepts one.
-
-        The daemon ignores the first commands of a new sender while it checks their delays.
-        """
+        """Send zeros until the daemon accepts one: it does not accept a new sender at once."""
         before = self._counted()
 
         def look() -> bool | None:
@@ -297,7 +277,6 @@ class Rig:
         time.sleep(0.2)
 
     def _counted(self) -> int | None:
-        """Return the number of accepted commands, or None if the program does not report it."""
         try:
             return self.state().counters.get("commands", 0)
         except NoAnswerError:
@@ -352,7 +331,6 @@ class Rig:
 
 
 def _last_words(far_end: subprocess.Popen[bytes]) -> Seen:
-    """End the process of the far end, and return the data that it recorded."""
     assert far_end.stdin is not None
     assert far_end.stdout is not None
     far_end.stdin.close()

@@ -24,10 +24,7 @@ NAMES = (
 """Settings of `[drive]` in the order of `Multipliers.values`."""
 
 DIGITS = 5
-"""Precision of the written settings.
-
-Multipliers have this many decimals, and settings of `[odometry]` this many significant digits.
-"""
+"""Decimals of the written multipliers, and significant digits of the settings of `[odometry]`."""
 
 
 class Refusal(Struct, frozen=True):
@@ -37,7 +34,6 @@ class Refusal(Struct, frozen=True):
     refused: str
     """The reason why there is no calibration, and what to do."""
     notes: Sequence[str] = ()
-    """Sentences about the log that may explain the reason."""
 
 
 class Report(Struct, frozen=True):
@@ -65,15 +61,9 @@ class Report(Struct, frozen=True):
     covariance: Sequence[Sequence[float]]
     """Covariance of the multipliers of wheel separation, left radius and right radius."""
     odometry: dict[str, float]
-    """New settings of `[odometry]` by name.
-
-    They state the uncertainty of the geometry and, if `Noise.better` is true, the noise.
-    """
+    """New settings of `[odometry]`: the geometry's uncertainty, and the noise if `Noise.better`."""
     feedback: dict[str, float]
-    """New settings of `[feedback]` by name.
-
-    It is empty unless the configured settings make healthy wheels look faulty to the daemon.
-    """
+    """New settings of `[feedback]`; empty unless the old ones make good wheels look faulty."""
     effective_track: float
     """Effective track, m."""
     effective_track_std: float | None
@@ -99,25 +89,17 @@ class Report(Struct, frozen=True):
     heading_noise_before: float | None
     """Standard deviation (deg) of the heading after 10 m, due to the configured noise settings.
 
-    The 10 m are assumed to contain as much turning per metre as the log. The value is None if the
-    noise settings of `[odometry]` stay as configured.
+    It assumes the turning per metre of the log. None means that the settings do not change.
     """
     heading_noise_after: float | None
-    """Standard deviation (deg) of the heading after 10 m, due to the new noise settings.
-
-    The 10 m are assumed to contain as much turning per metre as the log. The value is None if the
-    noise settings of `[odometry]` stay as configured.
-    """
+    """The same figure as `heading_noise_before`, with the new noise settings."""
     distance_noise_before: float | None
     """Standard deviation (m) of the distance after 10 m, due to the configured noise settings.
 
     It is None if the noise settings stay as configured, or if the log has no positions.
     """
     distance_noise_after: float | None
-    """Standard deviation (m) of the distance after 10 m, due to the new noise settings.
-
-    It is None if the noise settings stay as configured, or if the log has no positions.
-    """
+    """The same figure as `distance_noise_before`, with the new noise settings."""
     time_offsets: dict[str, float]
     """Delay of each sensor's times relative to those of the wheels, s, by the sensor's name."""
     gyro_bias: float
@@ -131,7 +113,6 @@ class Report(Struct, frozen=True):
     kept: Sequence[str]
     """Quantities that stay as configured, because the log does not improve them, in words."""
     notes: Sequence[str]
-    """Sentences about the log that the user should know."""
     written: str | None
     """File to which the tool wrote the settings, or None."""
     refused: None = None
@@ -140,11 +121,7 @@ class Report(Struct, frozen=True):
 def report(log: str, calibration: Calibration, drive: DriveConfig, written: str) -> Report:
     """Return the report of a calibration.
 
-    Args:
-        log: the name of the log, or of the guided drive.
-        calibration: the calibration.
-        drive: the configured geometry.
-        written: the name of the file to which the tool wrote the settings, or "".
+    `drive` is the configured geometry. `written` names the file with the new settings, or is "".
     """
     multipliers = calibration.multipliers
     track, left, right = multipliers.values.tolist()
@@ -179,10 +156,7 @@ def report(log: str, calibration: Calibration, drive: DriveConfig, written: str)
 
 
 def _noise(calibration: Calibration) -> tuple[BeforeAfter, BeforeAfter]:
-    """Return the uncertainty of heading (deg) and distance (m) that noise causes within `METRES`.
-
-    These are standard deviations, or `NOTHING` if the noise settings stay as configured.
-    """
+    """Return the noise of heading (deg) and distance (m) after `METRES`, as standard deviations."""
     noise = calibration.noise
     if noise is None or not noise.better:
         return NOTHING, NOTHING
@@ -191,7 +165,6 @@ def _noise(calibration: Calibration) -> tuple[BeforeAfter, BeforeAfter]:
 
 
 def _deviations(calibration: Calibration) -> list[float | None]:
-    """Return the standard deviation of each multiplier; None for one that stays as configured."""
     kept = TRACK in calibration.kept, RATIO in calibration.kept, RATIO in calibration.kept
     deviations = calibration.multipliers.std.tolist()
     return [None if stays else std for stays, std in zip(kept, deviations, strict=True)]
@@ -242,7 +215,6 @@ def parts(report: Report, calibration: Calibration, where: str) -> Iterator[Rend
 
 
 def _better(report: Report) -> list[str]:
-    """Return sentences about the improvement that the calibration brings."""
     noise = f"random errors of the {{}} after {METRES:g} m, as odometry publishes them"
     sentences = [
         f"{words}: {_two(before * factor)} {unit} now, {_two(after * factor)} {unit} with the new "
@@ -272,7 +244,6 @@ def _two(value: float) -> str:
 
 
 def _remains(report: Report, calibration: Calibration) -> list[str]:
-    """Return sentences about the errors that the calibration cannot remove."""
     fastest = calibration.drives.fastest
     multipliers = calibration.multipliers
     share = multipliers.std[SEPARATION] / multipliers.values[SEPARATION]

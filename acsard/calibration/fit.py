@@ -2,10 +2,8 @@
 
 The fit is a Gauss-Newton fit. The evidence of a sensor is its contribution to the normal equations,
 summed over each block (a few seconds of driving). The standard deviations come from a jackknife
-over the blocks (Quenouille and Tukey): each block is left out in turn, and the changes of the
-parameters show the effect of chance. These deviations are right even if the errors within a block
-are correlated. Each change is computed by one linear step from the fit to all blocks. If there are
-few blocks, the standard deviation is widened to that of Student's t.
+over the blocks (Quenouille and Tukey): each block is left out in turn, by one linear step from the
+fit to all blocks. These deviations are right even if the errors within a block are correlated.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ from acsard.core.config.settings import DriveConfig
 
 
 class P(IntEnum):
-    """Indices of the fitted parameters in their array, which contains `COUNT` numbers."""
+    """Indices of the fitted parameters in an array of `COUNT` numbers."""
 
     LEFT = 0
     """Ratio of the left wheels' radius to the configured wheel radius."""
@@ -76,20 +74,15 @@ class Base(Struct, frozen=True):
 
     @property
     def gain(self) -> float:
-        """Wheel radius divided by wheel separation.
-
-        If the first three parameters are 1, the robot turns by `gain` times the angle by which the
-        right wheels rolled further than the left wheels.
-        """
+        """Wheel radius / wheel separation: turn per radian that the right side rolls further."""
         return self.radius / self.separation
 
 
 class Evidence(Struct, frozen=True):
     """The weighted normal equations of one sensor, block by block.
 
-    Let J be the Jacobian (the derivatives of the predictions with respect to the parameters), r the
-    residuals and W their weights. Then `normal` is J^T W J, and `score` is J^T W r. `fit` divides
-    both by the noise variance of the sensor.
+    J is the Jacobian of the predictions with respect to the parameters, r the residuals and W their
+    weights. `fit` divides J^T W J and J^T W r by the noise variance of the sensor.
     """
 
     normal: Floats
@@ -110,9 +103,7 @@ def of_rows(
     Args:
         jacobian: derivatives of each prediction by the parameters, shape (measurements, COUNT).
         residual: measured minus predicted values.
-        weight: weights of the measurements.
         block: index of the block of each measurement.
-        blocks: number of blocks.
     """
     normal = np.zeros((blocks, COUNT, COUNT))
     score = np.zeros((blocks, COUNT))
@@ -125,10 +116,7 @@ def of_rows(
 
 
 def condition(normal: Floats) -> float:
-    """Return the condition number of normal equations, independent of the parameters' units.
-
-    It is infinite if one of the parameters does not occur in the equations.
-    """
+    """Return the condition number, independent of units; infinite if a parameter does not occur."""
     size = np.sqrt(np.diag(normal))
     if not np.all(size > 0.0):
         return np.inf
@@ -150,31 +138,19 @@ Source = Callable[[Floats], Evidence]
 
 MOST_STEPS = 30
 SMALL, SETTLED = 1e-5, 0.02
-"""Limits for the relative change of the radii and the track in one step of the fit.
-
-A step below `SMALL` ends the fit. The fit has converged if its last step is below `SETTLED`.
-"""
+"""Relative steps of radii and track below which the fit ends, and below which it has converged."""
 
 USUAL = {P.TRACK_GROWTH: 0.06, P.DELAY: 1.0, P.SENSOR_X: 0.5, P.SENSOR_Y: 0.5}
 """Prior standard deviations of parameters that some logs do not determine, in their own units."""
 
 GYRO_SCALE = 0.005
-"""Prior standard deviation of a MEMS gyro's scale, as a fraction.
-
-Only a comparison with positions shows the error of the scale.
-"""
+"""Prior standard deviation of a MEMS gyro's scale, as a fraction. Only positions show its error."""
 
 HELD = 1e9
-"""Weight of a constraint (`Held`) in the normal equations, large enough to enforce it.
-
-For example, a constraint fixes the mean radius if no sensor measures it.
-"""
+"""Weight of a constraint (`Held`) in the normal equations, large enough to enforce it."""
 
 Held = tuple[Floats, float]
-"""Constraint of a fit that fixes a weighted sum of the parameters at a value.
-
-The tuple contains the weights of the parameters, shape (COUNT,), and the value.
-"""
+"""Constraint on a weighted sum of the parameters: their weights, shape (COUNT,), and the sum."""
 
 MANY = 16
 """Minimum number of blocks for a jackknife that also leaves out pairs of neighbouring blocks."""
@@ -184,10 +160,7 @@ LEAST_BLOCKS = 5
 
 
 def student_factor(free: Floats | float) -> Floats:
-    """Return the variance of Student's t for `free` degrees of freedom.
-
-    Fewer than 3 degrees of freedom are taken as 3, because the variance is infinite at 2.
-    """
+    """Return the variance of Student's t for `free` degrees of freedom (3 if fewer)."""
     free = np.maximum(3.0, free)
     return np.asarray(free / (free - 2))
 
@@ -209,20 +182,16 @@ class Fit(Struct, frozen=True):
     """Prior standard deviation of each parameter that has one."""
 
     def without(self, blocks: Mask) -> Floats:
-        """Return the parameters that fit the evidence without the blocks in the mask `blocks`.
-
-        They are computed from the fit to all blocks by one linear step.
-        """
+        """Return the parameters without the masked blocks, by one linear step from this fit."""
         rest = self.normal[~blocks].sum(axis=0) + self.known
         found = self.parameters.copy()
         found[list(self.active)] -= _solved(rest, self.score[blocks].sum(axis=0), self.active)
         return found
 
     def marginal(self) -> Floats:
-        """Return the normal equations of both radii and the inverse track.
+        """Return the normal equations of radii and inverse track; other parameters are eliminated.
 
-        The other parameters are eliminated. If no sensor measures the mean radius, there are only
-        two unknowns: the difference of the radii, and the inverse track.
+        If no sensor measures sizes, the unknowns are the radii's difference and the inverse track.
         """
         total = self.normal.sum(axis=0) + self.known
         rest = [index for index in self.active if index > P.INVERSE_TRACK]
@@ -236,7 +205,7 @@ class Fit(Struct, frozen=True):
         """Return the covariance of the parameters, from the jackknife and the prior information.
 
         `runs` contains the index of the run of each block. If there are at least `LEAST_BLOCKS`
-        runs, the jackknife also leaves out whole runs. With () it does not.
+        runs, the jackknife also leaves out whole runs.
         """
         alone = np.arange(len(self.score))
         change, size = self._changes(alone)
@@ -255,12 +224,11 @@ class Fit(Struct, frozen=True):
         return np.asarray(chance + pull @ np.diag(1 / np.where(usual, usual, np.inf)) @ pull.T)
 
     def _changes(self, group: npt.NDArray[np.int64]) -> tuple[Floats, Floats]:
-        """Return how the parameters change if each group is left out in turn, and their variances.
+        """Return how the parameters change without each group, and the variances of the jackknife.
 
-        `group` gives the index of the group of each block. The variances are those of a jackknife
-        over the groups, widened to those of Student's t. The degrees of freedom are few if few
-        groups cause most of a variance. They are estimated with the formula of Satterthwaite (An
-        approximate distribution of estimates of variance components, 1946).
+        `group` gives the group of each block. The variances are widened to those of Student's t,
+        with the degrees of freedom of Satterthwaite (An approximate distribution of estimates of
+        variance components, 1946).
         """
         change = np.array(
             [self.without(group == number) - self.parameters for number in np.unique(group)]
@@ -278,12 +246,9 @@ def fit(
     """Return the fit of the parameters to the evidence of all sensors.
 
     Args:
-        sources: the evidence of each sensor as a function of the parameters.
         start: the parameters to start from, which must be nearly right.
         places, gyro: whether positions and a gyro are among the sources.
-        bias_std: standard deviation of the gyro bias, rad/s. 0 means that the fit does not change
-            the bias.
-        held: constraints that the fit keeps.
+        bias_std: standard deviation of the gyro bias, rad/s; 0 if the fit must not change the bias.
     """
     active: tuple[P, ...] = tuple(P)[: P.BIAS_ERROR if places else P.DELAY]
     usual = dict(USUAL)
@@ -344,10 +309,7 @@ def _weight(part: Evidence) -> float:
 def _known(
     parameters: Floats, held: Sequence[Held], usual: Mapping[P, float]
 ) -> tuple[Floats, Floats]:
-    """Return the normal equations of the prior information at these parameters.
-
-    `held` contains the constraints, and `usual` the prior standard deviations.
-    """
+    """Return the normal equations of the constraints `held` and the prior deviations `usual`."""
     normal, score = np.zeros((COUNT, COUNT)), np.zeros(COUNT)
     for index, deviation in usual.items():
         normal[index, index] = deviation**-2

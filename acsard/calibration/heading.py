@@ -22,16 +22,10 @@ from acsard.calibration.log_table import Floats, LogError
 from acsard.calibration.runs import Block, Run, cumulative, gaps, inside, rests
 
 REST_S, EDGE_S = 0.6, 0.3
-"""Shortest rest that shows the bias of a gyro, and the margin cut off both of its ends, s.
-
-In the margin, the robot may still shake.
-"""
+"""Shortest rest for a gyro's bias, s, and the margin at both ends in which the robot may shake."""
 
 TURNED_BY_HAND = 0.05
-"""Largest difference between the gyro bias in a rest and the median bias of all rests, rad/s.
-
-A larger difference shows that a person turned the robot, so the rest is not used.
-"""
+"""Deviation of a rest's gyro bias from the median, rad/s, above which a person turned the robot."""
 
 LEAST_SAMPLES = 5
 """Minimum number of gyro samples in a rest."""
@@ -56,7 +50,7 @@ DEGREES = 10.0
 
 
 class Heading(Struct, frozen=True):
-    """The heading of a run as a sensor measured it, at the sensor's own times."""
+    """The heading of a run as a sensor measured it."""
 
     t: Floats
     """Times of the sensor's samples, s."""
@@ -72,21 +66,14 @@ class Headings(Struct, frozen=True):
     source: str
     """Column of the log from which the headings come: "yaw_rate" or "yaw"."""
     of: tuple[Heading, ...]
-    """The heading of each run."""
     delay: float
     """Delay of the sensor's times behind those of the wheels for the same event, s."""
     bias: float
-    """Median of the gyro's bias in all rests, rad/s; 0 without a gyro or without a rest.
-
-    The turn rates of a run with rests are corrected by the bias interpolated between its rests.
-    """
+    """Median of the gyro's bias in all rests, rad/s; 0 without a gyro or without a rest."""
     bias_unknown: bool
     """Whether the robot never rested, so that only a comparison with the wheels shows the bias."""
     bias_std: float = 0.0
-    """Standard deviation of the bias while the robot moves, rad/s.
-
-    It is 0 if the sensor has no bias or if `bias_unknown` is true.
-    """
+    """Standard deviation of the bias while the robot moves, rad/s; 0 without a known bias."""
 
 
 TURNING = 0.05
@@ -107,10 +94,7 @@ class Rows(Struct, frozen=True):
     """Angle by which the left wheels rolled, rad."""
     right: Floats
     fast: Floats
-    """Integral of |w| w over each interval, rad2/s. w is the right minus the left wheels' speed.
-
-    If the track grows with the turn rate, the turn changes in proportion to this integral.
-    """
+    """Integral of |w| w over each interval, rad2/s. w is the right minus the left wheels' speed."""
     seconds: Floats
     """Length of each interval, s."""
 
@@ -156,8 +140,7 @@ def of_gyro(driven: Sequence[Run]) -> Headings | None:
 def of_yaw(driven: Sequence[Run], gain: float) -> Headings | None:
     """Return the headings in the column yaw, or None if no run has this column.
 
-    Raises `LogError` if the yaw is in degrees, because jumps of 360 would not be recognized as
-    whole turns. `gain` is the configured wheel radius divided by the wheel separation.
+    `gain` is wheel radius / wheel separation. Raises `LogError` if the yaw is in degrees.
     """
     if not any(len(run.yaw) for run in driven):
         return None
@@ -200,8 +183,7 @@ def _mean(samples: Floats) -> tuple[float, float]:
     """Return the mean of a rest's gyro samples without outliers, and the variance of this mean.
 
     The variance comes from the means of five parts, so it is right for correlated noise as well.
-    The function does not use the median, because the median of a coarse gyro is always one of the
-    discrete values that the gyro reports.
+    The median of a coarse gyro would always be one of the discrete values that the gyro reports.
     """
     off = np.abs(samples - np.median(samples))
     steps = np.diff(np.unique(samples))
@@ -216,8 +198,7 @@ def _mean(samples: Floats) -> tuple[float, float]:
 def _bias_std(rested: Sequence[Rests], seconds: Sequence[float]) -> float:
     """Return the standard deviation of the mean bias over all runs, rad/s.
 
-    The mean is uncertain because of the noise in the rests, and because the bias walks at random
-    outside of them. `seconds` contains the length of each run, s.
+    Its causes are the noise in the rests, and the random walk of the bias outside of them.
     """
     count = sum(len(t) for t, _, _ in rested)
     noise = sum(float(variance.sum()) for _, _, variance in rested) / max(1, count) ** 2
@@ -244,8 +225,7 @@ def _sums(rate: Floats, steps: Floats) -> Floats:
 def offset(found: Sequence[Heading], driven: Sequence[Run]) -> float:
     """Return the delay of the sensor, s, for which its turns correlate best with the wheels'.
 
-    `found` contains the sensor's heading of each run. The turn of the wheels is proportional to the
-    right minus the left angle. In case one side has the wrong sign, the sum is tried as well.
+    In case one side of the wheels has the wrong sign, the sum of both angles is tried as well.
     """
     reach = round(FURTHEST_S / GRID_S)
     scores, sizes = np.zeros((2, 2 * reach + 1)), np.zeros(2)
@@ -283,10 +263,9 @@ def _correlation(later: Floats, earlier: Floats, reach: int) -> Floats:
 
 
 def rows(headings: Headings | None, driven: Sequence[Run], parts: Sequence[Block]) -> Rows:
-    """Divide the blocks `parts` into intervals of about `ROW_S` s, and return the motion in each.
+    """Return the motion in intervals of about `ROW_S` s, into which the blocks `parts` are divided.
 
-    An interval is left out if the heading sensor has no samples there. If `headings` is None, there
-    is no sensor, and all intervals are returned.
+    Intervals without samples of the sensor are left out. If `headings` is None, none is left out.
     """
     fast = [_fast(run) for run in driven]
     found: list[tuple[Floats, ...]] = []
@@ -347,8 +326,7 @@ def _fast(run: Run) -> Floats:
 NOISE, SHARE = 0.01, 0.03
 """Usual difference between the sensor's and the wheels' turn in an interval of the log.
 
-It is the root of the sum of two squares: `NOISE` rad/s over the interval, and the fraction `SHARE`
-of the turn. A much larger difference is an outlier.
+Its parts, added as squares, are `NOISE` rad/s and the fraction `SHARE` of the wheels' turn.
 """
 
 
@@ -367,10 +345,7 @@ def _by_growth(rows: Rows, base: Base, parameters: Floats) -> Floats:
 
 
 def evidence(rows: Rows, base: Base, parameters: Floats, blocks: int) -> Evidence:
-    """Return the evidence of a heading sensor: how its turns in `rows` contribute to the fit.
-
-    The evidence is linearized at `parameters`. `blocks` is the number of blocks of the log.
-    """
+    """Return the evidence of a heading sensor in `rows`, linearized at `parameters`."""
     turn = parameters[P.INVERSE_TRACK]
     by_wheels = turned(rows, base, parameters)
     jacobian = np.zeros((len(rows.turned), COUNT))
@@ -388,15 +363,11 @@ def evidence(rows: Rows, base: Base, parameters: Floats, blocks: int) -> Evidenc
 
 
 def _weight(rows: Rows, residual: Floats, by_wheels: Floats) -> Floats:
-    """Return Huber's weight of each interval. `by_wheels` contains the turns of the wheels, rad."""
     return huber(residual / np.hypot(NOISE * rows.seconds, SHARE * by_wheels), 1.0)
 
 
 def bias(rows: Rows, by_wheels: Floats) -> float:
-    """Return the bias of the gyro, rad/s: its mean turn rate minus that of the wheels.
-
-    `by_wheels` contains the turn of the wheels in each interval of `rows`, rad.
-    """
+    """Return the bias of the gyro, rad/s: its mean turn rate minus that of the wheels."""
     seconds, found = rows.seconds, 0.0
     off = rows.turned - by_wheels
     for _ in range(10):
@@ -408,9 +379,8 @@ def bias(rows: Rows, by_wheels: Floats) -> float:
 def first(rows: Rows, base: Base) -> Floats:
     """Return the factors of the left and of the right wheels that fit the sensor's turns best.
 
-    A factor is wheel radius / effective track, divided by `base.gain`. A negative factor means that
-    the sign of this side's wheels, or of the sensor, is wrong. The robust least-squares fit needs
-    no starting values.
+    A factor is wheel radius / effective track, divided by `base.gain`. It is negative if the sign
+    of this side's wheels, or of the sensor, is wrong.
     """
     columns = base.gain * np.column_stack((-rows.left, rows.right))
     weight = np.ones(len(rows.turned))

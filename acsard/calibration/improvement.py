@@ -2,8 +2,8 @@
 
 This is a cross-validation. Each run (one drive in the log) is left out in turn: the parameters are
 fitted to the other runs, and the odometry error is measured on this run. If the log has fewer than
-three runs, each fifth of the log is left out instead. Of several fits, the one that improves the
-odometry most is used. The configured values are kept unless the new ones are surely better.
+three runs, each fifth of the log is left out instead. The configured values are kept unless the new
+ones are surely better.
 """
 
 from __future__ import annotations
@@ -29,22 +29,14 @@ STRAIGHT = 0.1
 """Largest curvature that counts as straight, rad/m, computed from the rolling of the wheels."""
 
 STRAIGHT_M = 1.0
-"""Distance of straight driving in a log, m, below which its heading error is not reported.
-
-The error is reported per 10 m, and an extrapolation from a few millimetres would be noise.
-"""
+"""Minimum straight driving for a heading error, m: with less, the error per 10 m would be noise."""
 
 
 class BeforeAfter(Struct, frozen=True):
-    """One odometry error, with the configured and with the new multipliers of radii and track.
-
-    Both numbers are None if the log does not show this error.
-    """
+    """One odometry error with the configured and with the new multipliers; None if unmeasured."""
 
     before: float | None
-    """The error with the configured multipliers."""
     after: float | None
-    """The error with the new multipliers."""
 
 
 NOTHING = BeforeAfter(None, None)
@@ -55,16 +47,15 @@ SURE = 2.0
 HALVED = float(np.log(2.0))
 """The value of `Improvement.gain` if the calibration halves one error.
 
-A larger gain counts as sure, even if its standard deviation is large. In a guided drive, one leg
-may show nearly all of the error. The standard deviation is then large although the gain is real.
+A larger gain always counts as sure. In a guided drive, one leg may show nearly all of the error.
+The standard deviation is then large although the gain is real.
 """
 
 NEAR, FAR = 2.0, 3.0
 """Limits for the distance of the new multipliers from the configured ones, in standard deviations.
 
-Up to `NEAR`, the log does not contradict the configured multipliers, so they are kept. Chance
-causes a distance above `FAR` in one log of thirty. Above `FAR`, a smaller gain is enough to accept
-the new multipliers: at twice `FAR`, half of the usual gain.
+Up to `NEAR`, the configured multipliers are kept. Above `FAR`, which chance causes in one log of
+thirty, a smaller gain is enough: at twice `FAR`, half of the usual gain.
 """
 
 LEAST_SQUARE = 1e-9
@@ -77,28 +68,18 @@ class Improvement(Struct, frozen=True):
     turn: BeforeAfter
     """Heading error after a turn of 360 deg, deg."""
     straight: BeforeAfter
-    """Heading error after 10 m straight ahead, deg: the turn that the wheels do not show.
-
-    Both numbers are None if the log has less than `STRAIGHT_M` of straight driving.
-    """
+    """Heading error after 10 m straight ahead, deg: the turn that the wheels do not show."""
     heading: BeforeAfter
     """RMS error of the heading over whole drives, deg, after each drive was rotated to fit best."""
     place: BeforeAfter
-    """RMS error of the position over whole drives, m.
-
-    The path of each drive is first shifted and rotated so that it fits the positions best.
-    """
+    """RMS error of the position over whole drives, m, after each path was aligned to fit best."""
     gain: float = np.inf
     """Natural logarithm of (error before / error after); inf if it was not computed.
 
-    The errors are RMS errors over whole drives. If the log has headings and positions, the two
-    logarithms are added.
+    The logarithms for headings and for positions (RMS errors over whole drives) are added.
     """
     chance: float = 0.0
-    """Standard deviation of `gain`, from the differences between drives; inf for a single drive.
-
-    If there are few drives, it is widened to that of Student's t.
-    """
+    """Standard deviation of `gain`, from the differences between drives; inf for a single drive."""
     apart: float = FAR
     """Distance of the new multipliers from the configured ones, in standard deviations."""
 
@@ -144,9 +125,8 @@ def positions_of(drive: Block, driven: Sequence[Run]) -> list[Segment]:
 def folds(fit: Fit, parts: Sequence[Block], left_out: Sequence[Block], rate: Rates) -> list[Fold]:
     """Return a fold for each drive in `left_out`, with the parameters that fit all other drives.
 
-    `parts` contains the blocks of the fit (a few seconds of driving each). A fold leaves out the
-    blocks that overlap its drive. If no block or every block overlaps, the drive gets no fold.
-    `with_constant_track` adapts the track of each fold to the turn rates `rate`.
+    A fold leaves out the blocks of the fit, `parts`, that overlap its drive. If no block or every
+    block overlaps, the drive gets no fold. The track is adapted to the turn rates `rate`.
     """
     run, begin, end = (
         np.array(column) for column in zip(*((p.run, p.begin, p.end) for p in parts), strict=True)
@@ -160,10 +140,9 @@ def folds(fit: Fit, parts: Sequence[Block], left_out: Sequence[Block], rate: Rat
 
 
 def with_constant_track(parameters: Floats, rate: Rates) -> Floats:
-    """Return the parameters with a track that is the same for all turn rates.
+    """Return the parameters with one track for all turn rates, as in the daemon's odometry.
 
-    It is the fitted track at the mean turn rate of the log. The odometry of the daemon also uses
-    one track for all turn rates.
+    It is the fitted track at the mean turn rate of the log.
     """
     fixed = parameters.copy()
     fixed[P.INVERSE_TRACK] *= 1.0 - fixed[P.TRACK_GROWTH] * rate.mean
@@ -180,7 +159,6 @@ def improvement(
     Args:
         held: the folds: each drive, with the parameters that were fitted without it.
         configured: the parameters with the configured multipliers.
-        base: the configured geometry.
         rows: the motion in intervals of about a second. The measured turns are 0 without a sensor.
         places: for each fold, the measured positions of its drive.
         steps: the wheel steps of each run; empty if the log has no positions.
@@ -214,10 +192,7 @@ def improvement(
 
 
 def rms(sums: Floats) -> BeforeAfter:
-    """Return the RMS errors before and after the calibration.
-
-    `sums` contains the sum of squared errors before, the same sum after, and the number of samples.
-    """
+    """Return RMS errors from `sums`: squared errors before, after, and the number of samples."""
     before, after, count = sums.tolist()
     if not count:
         return NOTHING
@@ -225,11 +200,10 @@ def rms(sums: Floats) -> BeforeAfter:
 
 
 def per_amount(sums: Floats, unit: float) -> BeforeAfter:
-    """Return the errors before and after the calibration, in proportion to the driven amount.
+    """Return `unit` times the errors before and after, per driven angle or distance.
 
-    `sums` contains the sum of errors before, the same sum after, and the angle or distance driven.
-    Each sum is divided by this angle or distance, and multiplied by `unit`. For example, 360 gives
-    the error in deg for a full turn.
+    `sums` contains the sum of errors before, the same sum after, and the driven angle or distance.
+    For example, a `unit` of 360 gives the error in deg for a full turn.
     """
     before, after, amount = sums.tolist()
     if not amount:
@@ -240,8 +214,7 @@ def per_amount(sums: Floats, unit: float) -> BeforeAfter:
 def _gain(kinds: Sequence[Floats]) -> tuple[float, float]:
     """Return `Improvement.gain` and `Improvement.chance`.
 
-    `kinds` contains one array for each kind of error. Each row of an array belongs to a drive: the
-    sum of squared errors before, the same sum after, and the number of samples.
+    `kinds` has an array for each kind of error. Each row is a drive, with the `sums` of `rms`.
     """
     drives = np.any([squares[:, 2] > 0.0 for squares in kinds], axis=0)
     if not np.any(drives):
@@ -257,8 +230,7 @@ def _gain(kinds: Sequence[Floats]) -> tuple[float, float]:
 def with_chance(gain: Callable[[Mask], float], drives: Mask) -> tuple[float, float]:
     """Return `gain(drives)` and its standard deviation, which is infinite for a single drive.
 
-    `gain` is a function of a mask of drives. The standard deviation is that of a jackknife: each
-    drive is left out in turn. It is widened to that of Student's t.
+    The deviation is that of a jackknife over the drives, widened to that of Student's t.
     """
     count = int(drives.sum())
     if count == 1:
@@ -273,8 +245,7 @@ def _by_group(
 ) -> Floats:
     """Return the sum of the groups' absolute errors before, the same sum after, and `amount`.
 
-    `before` and `after` contain the error of each interval, and `group` the index of its group. The
-    error of a group is the sum over its intervals, but only over those in the mask `among`.
+    The error of a group is the sum over its intervals in the mask `among`.
     """
     sums = (np.abs(np.bincount(group[among], errors[among])).sum() for errors in (before, after))
     return np.array([*sums, amount])
@@ -283,8 +254,7 @@ def _by_group(
 def _of_headings(held: Sequence[Fold], before: Floats, after: Floats, rows: Rows) -> Floats:
     """Return the sums of squared heading errors before and after, deg2, and the number of samples.
 
-    The result has a row for each fold. `before` and `after` contain the error of the turn in each
-    interval of `rows`, rad.
+    The result has a row for each fold. `before` and `after` contain the errors of turns, rad.
     """
     found = np.zeros((len(held), 3))
     for number, fold in enumerate(held):
@@ -300,10 +270,7 @@ def _of_positions(
     held: Sequence[Fold], configured: Floats, base: Base,
     places: Sequence[Sequence[Segment]], steps: Sequence[WheelSteps],
 ) -> Floats:  # fmt: skip
-    """Return the sums of squared position errors before and after, m2, and the number of samples.
-
-    The result has a row for each fold.
-    """
+    """Return per fold the squared position errors before and after, m2, and the sample count."""
     found = np.zeros((len(held), 3))
     present = [path(run, base, configured) for run in steps]
     for number, (fold, out) in enumerate(zip(held, places, strict=True)):

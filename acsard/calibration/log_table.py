@@ -4,8 +4,6 @@ The header names the columns in any order, and may give units, such as "t [ms]" 
 (deg/s)". A cell may be empty, so that sensors of different rates share a file. Rows that cannot be
 read and impossible values are left out, counted and reported. A file with more than a few such rows
 is refused.
-
-`row` makes a line of such a file from a bus message.
 """
 
 from __future__ import annotations
@@ -47,8 +45,7 @@ _NAME = re.compile(r"(?P<name>[^\[(]*)[\[(]?(?P<unit>[^\])]*)")
 def parted(cell: str) -> tuple[str, str]:
     """Return the name and the unit of a column from its header cell, such as "t [ms]".
 
-    The name is in lower case with "_" between words. The unit is the text in brackets, up to a
-    comma, or "" without brackets.
+    The name is in snake case. The unit is the text in brackets up to a comma; "" without brackets.
     """
     found = _NAME.match(cell.strip().lower())
     assert found is not None
@@ -57,10 +54,7 @@ def parted(cell: str) -> tuple[str, str]:
 
 
 def factor(name: str, unit: str) -> float | None:
-    """Return the factor from a unit of the column `name` to SI, or None for an unknown unit.
-
-    "" means that the column is in SI units.
-    """
+    """Return the factor from `unit` to SI, or None for an unknown unit. "" means SI."""
     known = UNITS.get(name, RATE)
     return known.get(unit.replace("degrees", "deg").replace("/sec", "/s"), None if unit else 1.0)
 
@@ -71,10 +65,9 @@ WHEELS = ("fr", "fl", "rl", "rr", "left", "right")
 
 BOUNDS = dict.fromkeys(WHEELS, 1e3) | {"t": 1e20, "yaw_rate": 1e4, "yaw": 1e7}
 PLACE_BOUND = 1e9
-"""Largest possible absolute value of a cell in any column that `BOUNDS` does not list, in SI units.
+"""Largest possible absolute value, in SI units, in a column that `BOUNDS` does not list.
 
-All limits are so large that values in degrees or nanoseconds stay below them. Later checks can
-therefore name the wrong unit.
+All limits allow values in degrees or nanoseconds, so that later checks can name the wrong unit.
 """
 
 RATES = frozenset((*WHEELS, "yaw_rate"))
@@ -83,17 +76,13 @@ RATES = frozenset((*WHEELS, "yaw_rate"))
 SPIKE, FEW_VALUES, SLOW = 10.0, 0.02, 0.02
 """Definition of a spike, which is a rate that was recorded wrongly.
 
-A spike is more than `SPIKE` times as large as the sample before it, as the sample after it, and as
-the usual rate. The usual rate is the quantile 1 - `FEW_VALUES` of all rates above `SLOW` rad/s. A
-true motion can exceed the usual rate as far, but never for a single sample.
+A spike is more than `SPIKE` times as large as both neighbouring samples, and as the usual rate. The
+usual rate is the quantile 1 - `FEW_VALUES` of all rates above `SLOW` rad/s.
 """
 
 
 def bounded(columns: dict[str, Floats]) -> Iterator[str]:
-    """Replace impossible values by NaN in place, and yield a sentence for each changed column.
-
-    `columns` contains the columns of the log by name, in SI units.
-    """
+    """Replace impossible values by NaN in place, and yield a sentence for each changed column."""
     order = np.argsort(columns["t"], kind="stable")
     for name, values in columns.items():
         with np.errstate(invalid="ignore"):
@@ -111,9 +100,8 @@ def bounded(columns: dict[str, Floats]) -> Iterator[str]:
 def spikes(values: Floats, order: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
     """Return a mask of the values that are spikes. `order` contains the indices sorted by time.
 
-    A spike stands out from its neighbours both in the order of the file and in the order of time.
-    In one of these orders alone, a true value may stand out as well, for example if the file is
-    shuffled.
+    A spike stands out both in the order of the file and in the order of time. In one order alone, a
+    true value may stand out as well, for example if the file is shuffled.
     """
     sizes = np.abs(values)
     moving = sizes[sizes > SLOW]
@@ -126,10 +114,7 @@ def spikes(values: Floats, order: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_
 
 
 def _alone(sizes: Floats, usual: float) -> npt.NDArray[np.bool_]:
-    """Return a mask of the values that are far above `usual` and far above both neighbours.
-
-    The neighbours of a value are the nearest values that are not NaN.
-    """
+    """Return a mask of values far above `usual` and above the nearest values that are not NaN."""
     held = np.flatnonzero(np.isfinite(sizes))
     seen = np.concatenate([[0.0], sizes[held], [0.0]])
     around = np.maximum(np.maximum(seen[:-2], seen[2:]), usual)
@@ -158,10 +143,7 @@ BEHIND = re.compile(r"(?:^|\s)#")
 """Pattern for the start of a comment after a number, but not for "1.#QNAN", which means NaN."""
 
 FEW, SHARE = 3, 0.01
-"""Limits for unreadable rows: a number of rows, and a fraction of the readable rows.
-
-The larger of the two limits applies. A file with more unreadable rows is refused.
-"""
+"""Limits for unreadable rows: number, and share of the readable rows. The larger one applies."""
 
 EXAMPLE = '"t,left,right,yaw_rate" or "t,fr,fl,rl,rr,x,y"'
 
@@ -173,10 +155,7 @@ class LogError(AcsardError):
 
 
 class RefusedError(AcsardError):
-    """The data is readable, but gives no plausible or useful calibration.
-
-    The text says why and what to do.
-    """
+    """The data is readable, but gives no useful calibration. The text says why and what to do."""
 
 
 def noted(error: Exception, notes: Iterable[str]) -> None:
@@ -186,23 +165,19 @@ def noted(error: Exception, notes: Iterable[str]) -> None:
 
 
 class Table(Struct, frozen=True):
-    """The contents of a log file."""
-
     columns: dict[str, Floats]
     """Columns by name, in SI units, with NaN for an empty cell."""
     runs: npt.NDArray[np.int64]
     """For each row, the index of its run in `names`."""
     names: tuple[str, ...]
-    """Names of the runs."""
     notes: tuple[str, ...]
     """Sentences about data that was left out."""
 
     @classmethod
     def joined(cls, sensors: Sequence[Mapping[str, Floats]]) -> Table:
-        """Return the table of one run. Each sample of each sensor is a row.
+        """Return the table of one run: a row for each sample of each sensor, sorted by time.
 
-        The rows are sorted by time. Each element of `sensors` maps names to columns: "t", and
-        columns that no other sensor has.
+        Each element of `sensors` maps names to columns: "t", and columns of no other sensor.
         """
         ends = np.cumsum([0, *(len(sensor["t"]) for sensor in sensors)])
         columns = {name: np.full(ends[-1], math.nan) for sensor in sensors for name in sensor}
@@ -239,8 +214,7 @@ def _text(data: bytes) -> str:
 def _header(lines: Sequence[str]) -> tuple[int, list[tuple[str, str]], str]:
     """Return the number of lines above the data, the names with their units, and the separator.
 
-    If the first line of the table contains numbers, the last comment line above it is the header,
-    because numpy and some other programs write the header as a comment.
+    The header may be the last comment above a table of numbers, as numpy writes it.
     """
     comment = ""
     for at, line in enumerate(lines):
@@ -268,7 +242,6 @@ def _separator(text: str) -> str:
 
 
 def _cut(line: str, separator: str) -> list[str]:
-    """Split a line into cells, some of which may be in quotes."""
     try:
         cells = next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
     except csv.Error:
@@ -289,10 +262,7 @@ def _is_number(cell: str) -> bool:
 
 
 def _columns(header: list[str], number: int) -> list[str]:
-    """Return the names of the columns, with "" for a column that is not used.
-
-    `number` is the line number of the header. Raises `LogError` if a necessary column is missing.
-    """
+    """Return the names of the columns, "" if unused. Raise `LogError` if a column is missing."""
     where = f"line {number} (the header)"
     twice = {name for name in header if name in COLUMNS and header.count(name) > 1}
     if twice:
@@ -320,7 +290,6 @@ def _columns(header: list[str], number: int) -> list[str]:
 
 
 def _near(names: Sequence[str], header: Sequence[str]) -> str:
-    """Return a hint at a column of `header` that may be one of the missing `names`, or ""."""
     others = [name for name in header if name and name not in COLUMNS]
     if "t" in names and (times := [name for name in others if "time" in name or "stamp" in name]):
         return f" (if {times[0][:40]} is the time, rename that column to t and write it in s)"
@@ -393,8 +362,7 @@ class _Reader:
     def _cells(self, line: str) -> list[str]:
         """Return the cells of a line that contains quotes or "#"; [] if the line is a comment.
 
-        A "#" after a number begins a comment. In the name of a run and in unused columns, it does
-        not.
+        A "#" after a number begins a comment, but not in the name of a run or in an unused column.
         """
         cells = _cut(line, self._separator)
         if line.lstrip().startswith("#") and not self._begins_with_its_run(cells):

@@ -1,8 +1,7 @@
-"""Computes the multipliers from the parameters of a fit, and corrects them by a tape measure.
+"""Computes the multipliers of wheel separation and radii, and corrects them by a tape measure.
 
-The multipliers scale the configured wheel separation and wheel radii. A log of turn rates alone
-shows only the ratios of the multipliers. A distance that was measured by tape shows how large the
-wheels are.
+A log of turn rates alone shows only the ratios of the multipliers. A distance that was measured by
+tape shows how large the wheels are.
 """
 
 from __future__ import annotations
@@ -92,7 +91,6 @@ def configured(base: Base) -> Multipliers:
 def multipliers(parameters: Floats, covariance: Floats, rate: Rates) -> Multipliers:
     """Return the multipliers that fit best at the turn rates of the log.
 
-    `parameters` and `covariance` are those of a fit, and `rate` gives the turn rates of the log.
     The multiplier of the separation describes a track that is the same for all turn rates. Its
     variance does not cover skidding that differs from turn to turn, which is noise of the odometry.
     """
@@ -107,16 +105,12 @@ def multipliers(parameters: Floats, covariance: Floats, rate: Rates) -> Multipli
 
 
 TAPE_M = 0.01
-"""Standard deviation of a distance by tape, m.
-
-It includes the error with which a person chooses the point on the robot.
-"""
+"""Standard deviation of a distance by tape, m, including the choice of the point on the robot."""
 
 CONTRADICTS, CONTRADICTS_STD = 0.02, 5.0
-"""Limits for the difference between a distance by tape and the same distance by positions.
+"""Limits for a distance by tape minus that by positions: a fraction, and standard deviations.
 
-The limits are a fraction of the distance, and a number of standard deviations. If the difference
-exceeds both limits, one of the distances is wrong.
+If the difference exceeds both limits, one of the distances is wrong.
 """
 
 UNKNOWN = 1.0
@@ -152,10 +146,7 @@ class Extent(Struct, frozen=True):
 
 
 Follow = Callable[[Floats, int], Extent]
-"""Function that computes the extent of a run's path.
-
-Its arguments are the multipliers, as in `Multipliers.values`, and the index of the run.
-"""
+"""Function that returns a run's extent for `Multipliers.values` and the index of the run."""
 
 
 def scaled(
@@ -164,13 +155,7 @@ def scaled(
     """Correct the multipliers with a distance that was measured by tape.
 
     The correction is the update step of a Kalman filter on the logarithms of the multipliers.
-
-    Args:
-        found: the multipliers before the correction.
-        tape: the distance.
-        names: the names of the runs.
-        follow: the function that computes the extent of a run's path.
-        known: whether positions have already shown the size of the wheels.
+    `known` tells whether positions have already shown the size of the wheels.
 
     Returns:
         The corrected multipliers, and the name of the run that the distance belongs to.

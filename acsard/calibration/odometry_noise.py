@@ -79,10 +79,7 @@ MOST_WINDOWS = 80
 """Largest number of windows that are used. From a longer log, only every n-th window is used."""
 
 FINE_S = 0.5
-"""Length of the steps into which the motion of a window is divided, s.
-
-The errors of different steps are independent, except those of `SLIP`, `RATIO` and `TRACK`.
-"""
+"""Length of a window's steps, s. Only `SLIP`, `RATIO` and `TRACK` correlate errors of steps."""
 
 MOST_FOLDS = 10
 """Largest number of groups of drives. Each group is left out once, which costs two searches."""
@@ -94,23 +91,20 @@ OUTLIER = 9.0
 """Mean square of a window's normalized residuals above which the window weighs less."""
 
 ROUNDING = 1e-12
-"""Variance that is added to each residual, so that the covariance can be inverted even for a
-perfect sensor."""
+"""Variance added to each residual, so that even a perfect sensor's covariance can be inverted."""
 
 FLOOR = 0.25
 """Minimum of the noise `DISTANCE`, `YAW` and `SKID`, as a fraction of its standard deviation.
 
-In a log of a minute, the geometry often explains all errors, and the fit finds a noise of 0. The
-covariance of the pose would then claim that some directions have no error at all.
+In a short log, the fit often finds a noise of 0, which would make the pose exact.
 """
 
 CHANGES = 0.1
-"""Minimum of the noise `DISTANCE`, as a fraction of the noise `SLIP`.
+"""Minimum of the noise `DISTANCE`, as a fraction of `SLIP` converted by `Windows.lasting`.
 
-`Windows.lasting` first converts `SLIP` to the unit of `DISTANCE`. In the same way, `RATIO` gives
-the minimum of `YAW`, and `TRACK` that of `SKID`. A window does not show how long an error lasts
-beyond the window's end. Without this minimum, the pose covariance of one robot in eight had no
-width in some direction.
+In the same way, `RATIO` gives the minimum of `YAW`, and `TRACK` that of `SKID`. A window does not
+show how long an error lasts beyond the window's end. Without this minimum, the pose covariance of
+one robot in eight had no width in some direction.
 """
 
 TWICE = math.log(2.0) - 3 / 8
@@ -127,10 +121,7 @@ METRES = 10.0
 
 
 class Windows(Struct, frozen=True):
-    """The windows of a log (half a minute each). All are padded to the same number n of residuals.
-
-    The padding has no effect.
-    """
+    """The windows of a log (half a minute each), padded to the same number n of residuals."""
 
     drive: npt.NDArray[np.int64]
     """Index of the drive of each window."""
@@ -145,12 +136,11 @@ class Windows(Struct, frozen=True):
     lasting: Floats
     """Factors that convert the noise of one source to equivalent noise of another source.
 
-    Both have the same effect in a window of average motion. The factors convert `SLIP` to
-    `DISTANCE` (m), `RATIO` to `YAW` (1/m) and `TRACK` to `SKID` (rad).
+    They convert `SLIP` to `DISTANCE` (m), `RATIO` to `YAW` (1/m) and `TRACK` to `SKID` (rad), with
+    the same effect in a window of average motion.
     """
 
     def of(self, chosen: Mask | npt.NDArray[np.int64]) -> Windows:
-        """Return the windows that `chosen`, a mask or an array of indices, selects."""
         return Windows(
             self.drive[chosen], self.size[chosen], self.residual[chosen], self.effects[chosen],
             self.known[chosen], self.lasting,
@@ -163,8 +153,7 @@ class Windows(Struct, frozen=True):
     def search(self, start: Floats, free: Mask, steps: int = STEPS) -> Floats:
         """Return the noise with the greatest likelihood, found in `steps` steps from `start`.
 
-        `start` and the result contain a number for each `Source`. Sources outside the mask `free`
-        keep their number.
+        Sources outside the mask `free` keep their number.
         """
         noise, flat = start.copy(), np.moveaxis(self.effects, 1, 0).reshape(COUNT, -1)
         for _ in range(steps):
@@ -179,11 +168,11 @@ class Windows(Struct, frozen=True):
         return noise
 
     def at_least(self, noise: Floats) -> Floats:
-        """Return the noise to state for other drives: `noise`, with a minimum for some sources.
+        """Return the noise to state for other drives, with the minima of `FLOOR` and `CHANGES`.
 
-        `FLOOR` and `CHANGES` define the minimum of `DISTANCE`, `YAW` and `SKID`. If few residuals
-        show one of these three, it is widened like the variance of Student's t. Windows overlap by
-        half, so each residual counts as half a degree of freedom.
+        If few residuals show `DISTANCE`, `YAW` or `SKID`, this noise is widened like the variance
+        of Student's t. Windows overlap by half, so each residual counts as half a degree of
+        freedom.
         """
         shares = np.linalg.inv(self.covariance(noise))[:, None] @ self.effects
         free = noise * np.einsum("wkii->k", shares) / 2
@@ -217,10 +206,7 @@ class Noise(Struct, frozen=True):
     It is measured on drives that the fit did not use.
     """
     chance: float
-    """Standard deviation of `gain`, from the differences between drives.
-
-    If there are few groups of drives, it is widened to that of Student's t.
-    """
+    """Standard deviation of `gain`, from the differences between drives."""
     places: bool
     """Whether the log has positions. Without them, it does not show the noise of the distance."""
     turning: float
@@ -234,17 +220,11 @@ class Noise(Struct, frozen=True):
         return self.gain > min(SURE * self.chance, TWICE)
 
     def heading(self) -> tuple[float, float]:
-        """Return the standard deviations of the heading after `METRES` m, rad.
-
-        The first one is for the configured noise, the second one for the noise that the log shows.
-        """
+        """Return the std of the heading after `METRES`, rad, for configured and for found noise."""
         return self._after(Source.YAW, Source.RATIO, Source.SKID)
 
     def distance(self) -> tuple[float, float]:
-        """Return the standard deviations of the distance after `METRES` m, m.
-
-        The first one is for the configured noise, the second one for the noise that the log shows.
-        """
+        """Return the std of the distance after `METRES`, m, for configured and for found noise."""
         return self._after(Source.DISTANCE, Source.SLIP, None)
 
     def _after(self, rate: Source, lasting: Source, skid: Source | None) -> tuple[float, float]:
@@ -268,7 +248,6 @@ def settings(
         known: the standard deviations of the new geometry.
         track: the new multiplier of the wheel separation.
         kept: the quantities that stay as configured, `TRACK` or `RATIO` of `plausibility`.
-        odometry: the configured settings.
         shown: the noise that the log shows, or None if the noise stays as configured.
         scaled: whether the size of the wheels was measured.
     """
@@ -302,7 +281,6 @@ class Reference(Struct, frozen=True):
     places: bool
     """Whether the log has positions."""
     steps: Sequence[WheelSteps]
-    """The wheel steps of each run."""
     base: Base
     parameters: Floats
     """The fitted parameters. Those with an index of at least `P.DELAY` describe the sensors."""
@@ -313,11 +291,7 @@ def noise(
 ) -> Noise | None:
     """Return the noise that a log shows, or None if fewer than two drives show it.
 
-    Args:
-        held: the drives, each with the parameters that were fitted without it.
-        seen: the sensors of the log.
-        known: the standard deviations of the geometry in these parameters.
-        odometry: the configured settings.
+    `known` contains the standard deviations of the geometry in the parameters of `held`.
     """
     motions: list[_Motion] = []
     windows = _windows(held, seen, known, motions)
@@ -352,8 +326,6 @@ def noise(
 
 
 class _Motion(Struct, frozen=True):
-    """The motion of a window according to the wheels, in short steps."""
-
     middle: Floats
     """Times in the middle of the steps, s."""
     distance: Floats
@@ -365,17 +337,14 @@ class _Motion(Struct, frozen=True):
 
     @property
     def metres(self) -> float:
-        """Total distance driven, forwards and backwards, m."""
         return float(np.abs(self.distance).sum())
 
     @property
     def turned(self) -> float:
-        """Total turning to the left and to the right, rad."""
         return float(np.abs(self.turn).sum())
 
     @classmethod
     def of(cls, t: Floats, way: Path, track: float) -> _Motion:
-        """Return the motion along the path `way` from the first to the last of the times `t`."""
         count = max(1, round((t[-1] - t[0]) / FINE_S))
         edges = np.linspace(t[0], t[-1], count + 1)
         heading, place = np.interp(edges, way.t, way.heading), np.interp(edges, way.t, way.place)
@@ -403,8 +372,7 @@ class _Window(Struct, frozen=True):
     def projected(self, known: Deviations) -> tuple[Floats, Floats, Floats]:
         """Return the residuals, their covariance by source of noise, and their known covariance.
 
-        The unknown start pose is projected out of all three. The known covariance comes from the
-        standard deviations `known` of the geometry, and from the gyro's bias.
+        The unknown start pose is projected out of all three. `known` describes the geometry.
         """
         distance, turn, track = self.motion.distance, self.motion.turn, self.motion.track
         sides = np.maximum(np.abs(distance), track / 2 * np.abs(turn))
@@ -479,10 +447,7 @@ def _of_drive(fold: Fold, seen: Reference) -> Iterator[_Window]:
 
 
 def _times(begin: float, end: float) -> Iterator[Floats]:
-    """Yield the times, s, of the residuals of each window between `begin` and `end`.
-
-    Neighbouring windows overlap by half.
-    """
+    """Yield the times, s, of the residuals of each window. Neighbouring windows overlap by half."""
     whole = min(end - begin, WINDOW_S)
     if whole > 0.0:
         count = max(1, round(2 * (end - begin) / WINDOW_S) - 1)
@@ -496,8 +461,7 @@ def _by_headings(
 ) -> _Window:  # fmt: skip
     """Return the window with the residuals of the heading at the times `t`, s.
 
-    `t` are times of the wheels' clock, and `at` the same moments on the heading sensor's clock, s.
-    `way` is the path of the wheels.
+    `t` are times on the wheels' clock, and `at` the same moments on the sensor's clock.
     """
     motion, since = _Motion.of(t, way, track), t - t[0]
     turned = np.interp(at, heading.t, heading.angle) - parameters[P.BIAS_ERROR] * since
@@ -518,7 +482,7 @@ def _by_places(
     """Yield the window of the positions `place` (x + iy, m), measured at the times `at`, s.
 
     Each residual is the median over the positions that are nearest to one of the times `t`. If one
-    of these times has no position, no window is yielded. `way` is the path of the wheels.
+    of these times has no position, no window is yielded.
     """
     group = np.searchsorted((t[1:] + t[:-1]) / 2, at)
     numbers = range(len(t))

@@ -1,9 +1,8 @@
 """Checks whether a log and its calibration are plausible, and whether the robot moved enough.
 
 A log is refused if an error in it would spoil the calibration: a wrong sign, side, unit or time, or
-sensors that contradict the wheels. The message names the probable cause. If a log does not
-contain enough movement, the message says what to drive. Unusual facts that the calibration corrects
-or tolerates are reported as remarks.
+sensors that contradict the wheels. Unusual facts that the calibration corrects or tolerates are
+reported as remarks.
 """
 
 from __future__ import annotations
@@ -24,10 +23,7 @@ LEAST_ANGLE = 2 * np.pi
 """Minimum turn of the robot in a whole log, rad. Turns to both sides add up."""
 
 LEAST_ROLL = 3.0
-"""Minimum angle that the wheels roll in a whole log, rad.
-
-Both sides must roll this angle in the same direction, and this angle in opposite directions.
-"""
+"""Minimum angle, rad, that the wheels of a log roll ahead or back, and against each other."""
 
 ALIKE = 0.98
 """Largest squared correlation between the mean and the difference of both sides' motion.
@@ -47,20 +43,15 @@ DRIVE = (
 )
 
 UNLIKE = 0.5
-"""Fraction of a sensor's motion (sum of squares) that the wheels do not explain, above which the
-log is refused."""
+"""Largest fraction of a sensor's motion (sum of squares) that may be unexplained by the wheels."""
 
 UNITS = 8.0
-"""Largest factor by which a result may differ from the configuration.
-
-If it differs by more, a unit must be wrong.
-"""
+"""Largest factor between a result and the configuration. Beyond it, a unit must be wrong."""
 
 LEAST_TURN = 0.2
 """Smallest credible ratio of the measured turn to the turn that the configured wheels predict.
 
-Even a robot that skids turns further. If the ratio is smaller, the wheel speeds are probably in
-rpm.
+Skidding does not explain a smaller ratio. The wheel speeds are then probably in rpm.
 """
 
 FAR_SIZE = 2e-3
@@ -70,25 +61,16 @@ If the ratio is between `FAR_SIZE` and 1 / `UNITS`, the wheel speeds have a wron
 """
 
 FASTEST_TURN = 12.0
-"""Fastest credible turn rate, rad/s. No robot turns twice in a second.
-
-A higher rate is in fact in deg/s.
-"""
+"""Fastest credible turn rate, rad/s: two turns in a second. A higher rate is in fact in deg/s."""
 
 LEAST_CHI = 0.4
-"""Smallest credible ratio of effective track to wheel separation.
-
-Wheels that skid make the effective track larger, and nothing makes it this much smaller.
-"""
+"""Smallest credible ratio of effective track to wheel separation. Skidding only makes it larger."""
 
 LEAST_FACTOR, MOST_FACTOR = 0.1, 10.0
 """Range of multipliers that the configuration accepts."""
 
 NOTABLE_S, FAR_S = 0.005, 0.5
-"""Limits for the delay of a sensor, s.
-
-A delay of at least `NOTABLE_S` is reported. Above `FAR_S` the report advises to set the clocks.
-"""
+"""Delays of a sensor, s: reported from `NOTABLE_S` on, with advice on the clocks above `FAR_S`."""
 
 LARGE_BIAS = 0.05
 """Gyro bias, rad/s, above which the bias is reported."""
@@ -103,10 +85,7 @@ ODD_RATIO = 1.1
 """Smallest ratio of the larger to the smaller radius that is reported as unusual."""
 
 LEAST_TRACK, MOST_TRACK = 0.85, 3.0
-"""Usual range of the ratio of effective track to wheel separation.
-
-A ratio outside this range is reported.
-"""
+"""Usual range of the ratio of effective track to wheel separation. Other ratios are reported."""
 
 
 def drives_enough(parts: Sequence[Block]) -> None:
@@ -119,8 +98,7 @@ def drives_enough(parts: Sequence[Block]) -> None:
 def rolls_enough(rows: Rows, *, spins: bool = False) -> None:
     """Raise `RefusedError` if the log lacks a movement of the wheels that the fit needs.
 
-    The sides must roll in the same direction and in opposite directions, in varying proportions. If
-    `spins` is true, turns on the spot alone are enough. `rows` contains the motion of the log.
+    The sides must roll together and against each other. With `spins`, turns on the spot are enough.
     """
     together, against = (rows.right + rows.left) / 2, (rows.right - rows.left) / 2
     for rolled, what in ((together, "ahead or back"), (against, "against each other")):
@@ -155,11 +133,9 @@ TRACK, RATIO = "the effective track", "the ratio of left to right"
 def unsure(
     found: Multipliers, track_std: float, worst: tuple[float, float] = WORST
 ) -> dict[str, float]:
-    """Return the relative standard deviations that are too large to be useful, by quantity.
+    """Return the relative standard deviations, by quantity, that exceed their limit in `worst`.
 
-    The quantities are `TRACK` and `RATIO`, and `worst` contains their limits in this order.
-    `track_std` is the relative standard deviation of the mean track. The track itself varies more,
-    with the turn rate and from turn to turn.
+    `track_std` is that of the mean track. The track itself varies more, from turn to turn.
     """
     deviations = {TRACK: track_std, RATIO: found.ratio_std}
     return {
@@ -177,8 +153,7 @@ def separates_track(fitted: Fit) -> bool:
 def heading_follows(source: str, rows: Rows, base: Base, sides: Floats) -> None:
     """Raise `RefusedError` if the heading sensor's turns differ much from those of the wheels.
 
-    `source` names the sensor. `sides` is the result of `heading.first`, which fits the wheels to
-    the sensor.
+    `sides` is the result of `heading.first`.
     """
     spread = float(rows.turned @ rows.turned)
     off = rows.turned - heading.by_sides(rows, base, sides)
@@ -191,10 +166,7 @@ def heading_follows(source: str, rows: Rows, base: Base, sides: Floats) -> None:
 
 
 def positions_follow(begun: StartingPoint) -> None:
-    """Raise `RefusedError` if the positions do not follow the path of the wheels.
-
-    `begun` is the result of `positions.search`.
-    """
+    """Raise `RefusedError` if the positions do not follow the path of the wheels."""
     if begun.unexplained > UNLIKE:
         raise RefusedError(
             "the positions do not follow the wheels: are they x ahead and y to the left in m (not "
@@ -205,10 +177,8 @@ def positions_follow(begun: StartingPoint) -> None:
 def turns_the_right_way(source: str, sides: Floats | None, begun: StartingPoint | None) -> None:
     """Raise `RefusedError`, naming the wrong sign, if wheels and sensors turn to different sides.
 
-    Args:
-        source: the name of the heading sensor, or "" without one.
-        sides: the result of `heading.first`, or None without a heading sensor.
-        begun: the result of `positions.search`, or None without positions.
+    `sides` is the result of `heading.first`, or None without the heading sensor `source`. `begun`
+    is the result of `positions.search`, or None without positions.
     """
     by_places = by_heading = ""
     if begun is not None:
@@ -250,8 +220,7 @@ def turns_the_right_way(source: str, sides: Floats | None, begun: StartingPoint 
 def _wrong_sign(sides: Floats) -> str:
     """Return which sign is wrong: "left", "right", "turn" for both sides, or "" for none.
 
-    `sides` contains a factor for the left and one for the right wheels. A negative factor means a
-    wrong sign.
+    A negative factor in `sides` (left, right) means a wrong sign.
     """
     left, right = (sides > 0.0).tolist()
     if left:
@@ -276,8 +245,7 @@ def turns_like_the_wheels(source: str, rows: Rows, base: Base) -> None:
 def turn_rates(source: str, rows: Rows) -> None:
     """Raise `RefusedError` if the heading sensor turns so fast that its unit must be degrees.
 
-    `source` names the sensor. The turns are not compared with those of the wheels, because the
-    wheel speeds may be in degrees as well.
+    The wheels' turns are no reference, because the wheel speeds may be in degrees as well.
     """
     rate = float(np.percentile(np.abs(rows.turned) / rows.seconds, 90))
     if rate > FASTEST_TURN:
@@ -294,9 +262,7 @@ def turn_units(source: str, turn: float, bare: float, base: Base) -> None:
     Args:
         source: the name of the heading sensor, or "" if positions show the turns.
         turn: the ratio of the measured turn to the turn that the configured multipliers predict.
-        bare: the ratio of the measured turn to the turn that wheel radius and separation alone
-            predict.
-        base: the configured geometry.
+        bare: the ratio of the measured turn to the turn that multipliers of 1 predict.
     """
     if LEAST_TURN < turn < UNITS and bare < 1 / LEAST_CHI:
         return
@@ -315,10 +281,7 @@ def turn_units(source: str, turn: float, bare: float, base: Base) -> None:
 
 
 def distance_units(size: float, base: Base) -> None:
-    """Raise `RefusedError` if positions and wheels differ so much that a unit must be wrong.
-
-    `size` is the ratio of the measured radius to the configured one.
-    """
+    """Raise `RefusedError` if the ratio of measured to configured radius shows a wrong unit."""
     if 1 / UNITS < size < UNITS:
         return
     may = (
@@ -363,7 +326,6 @@ def remarks(
         bias: the gyro bias, rad/s.
         turned: the turn in each interval of the log, rad, positive to the left.
         values: the multipliers, as in `Multipliers.values`.
-        base: the configured geometry.
         sized: whether the size of the wheels was measured.
     """
     for source, seconds in delays.items():

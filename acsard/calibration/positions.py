@@ -9,10 +9,9 @@ that is nearly right. The search tries tracks from a tenth to thirty times the c
 turns to either side and with one side of the wheels reversed. For each of them, the size of the
 path gives the wheel radius.
 
-A turn on the spot does not change the position. Positions therefore often determine such a turn
-only up to whole turns: the robot faces the same way after 90 deg to the left as after 270 deg to
-the right. If several starting points explain the positions about equally well, the search chooses
-the one that describes the more usual robot.
+Positions often determine a turn on the spot only up to whole turns: the robot faces the same way
+after 90 deg to the left as after 270 deg to the right. If several starting points explain the
+positions about equally well, the search chooses the one that describes the more usual robot.
 """
 
 from __future__ import annotations
@@ -29,19 +28,15 @@ from acsard.calibration.log_table import Floats
 from acsard.calibration.runs import Block, Complexes, Run, cumulative
 
 LEAST_POINTS = 5
-"""Minimum number of positions in a segment (the positions between two jumps).
-
-The number must exceed the three unknowns of the alignment: a shift along two axes, and a rotation.
-"""
+"""Minimum number of positions in a segment. The alignment has three unknowns (shift, rotation)."""
 
 FINE_S = 0.02
 """Time step for integrating the path, s. Finer steps cost time and add no accuracy."""
 
 JUMP, JUMP_M = 6.0, 0.05
-"""Limit above which the step from one position to the next is a jump of the source.
+"""Limits of a step between two positions. Beyond them, the source erred or has relocalized.
 
-A step is a jump if it exceeds the distance that the wheels rolled by more than `JUMP` standard
-deviations plus `JUMP_M` m. The next position is then an outlier, or the source has relocalized.
+A step may exceed the rolled distance by `JUMP` standard deviations plus `JUMP_M` m.
 """
 
 SPEED_S = 0.05
@@ -57,9 +52,7 @@ class Segment(Struct, frozen=True):
     """The positions of a block between two jumps of their source."""
 
     block: int
-    """Index of the block."""
     run: int
-    """Index of the run."""
     t: Floats
     """Times of the positions, s."""
     place: Complexes
@@ -96,8 +89,7 @@ class Path(Struct, frozen=True):
     def at(self, t: Floats, parameters: Floats) -> tuple[Complexes, Complexes]:
         """Return the places of the position sensor, m, and their derivatives by the parameters.
 
-        `t` contains the recorded times of positions, s, which are late by the parameter `P.DELAY`.
-        The derivatives have the shape (times, COUNT).
+        `t` are recorded times, s, late by `P.DELAY`. The derivatives have the shape (times, COUNT).
         """
         t = t - parameters[P.DELAY]
         derivatives = np.zeros((len(t), COUNT), dtype=np.complex128)
@@ -119,10 +111,7 @@ class Path(Struct, frozen=True):
 
 
 def segments(driven: Sequence[Run], parts: Sequence[Block]) -> list[Segment]:
-    """Return the positions of each block of `parts`, split at jumps.
-
-    A segment with fewer than `LEAST_POINTS` positions is left out.
-    """
+    """Return the segments of each block between jumps that have at least `LEAST_POINTS`."""
     edges = [jumps(run) for run in driven]
     found = []
     for number, part in enumerate(parts):
@@ -150,10 +139,7 @@ def jumps(run: Run) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
 
 
 def wheel_steps(run: Run, fine_s: float = FINE_S) -> WheelSteps:
-    """Return the motion of the wheels in steps of about `fine_s` s.
-
-    If the samples are further apart than this, each step is the interval between two samples.
-    """
+    """Return the motion of the wheels in steps of about `fine_s` s, or of one sample if longer."""
     usual = float(np.median(np.diff(run.t)))
     every = max(1, int(fine_s / usual))
     kept = np.unique(np.append(np.arange(0, len(run.t), every), len(run.t) - 1))
@@ -163,10 +149,7 @@ def wheel_steps(run: Run, fine_s: float = FINE_S) -> WheelSteps:
 
 
 def path(steps: WheelSteps, base: Base, parameters: Floats) -> Path:
-    """Return the path of the robot, which starts at the origin with heading 0.
-
-    Each step is an exact arc.
-    """
+    """Return the path of the robot from the origin with heading 0. Each step is an exact arc."""
     left, right, turn, rate = parameters[[P.LEFT, P.RIGHT, P.INVERSE_TRACK, P.TRACK_GROWTH]]
     gain = base.gain * turn
     mean = gain * (left + right) / 2
@@ -196,11 +179,7 @@ def place(steps: WheelSteps, base: Base, parameters: Floats) -> Complexes:
 
 
 def _directions(turns: Floats) -> tuple[Floats, Complexes]:
-    """Return the headings between the steps, rad, and the chord of each step's arc.
-
-    `turns` contains the turn of each step, rad. A chord is the complex number that joins the ends
-    of an arc of length 1.
-    """
+    """Return the headings between steps, rad, and the complex chord of each arc of length 1."""
     heading = cumulative(turns)
     return heading, np.exp(1j * (heading[:-1] + turns / 2)) * np.sinc(turns / (2 * np.pi))
 
@@ -217,7 +196,6 @@ class Aligned(Struct, frozen=True):
     """The positions of a segment, compared with the path that was aligned with them."""
 
     block: int
-    """Index of the block."""
     residual: Complexes
     """Position minus aligned path, m, times the root of the position's weight."""
     derivatives: Complexes
@@ -228,10 +206,7 @@ class Aligned(Struct, frozen=True):
 
 
 def aligned(segments: Sequence[Segment], paths: Paths, parameters: Floats) -> Iterator[Aligned]:
-    """Shift and rotate the path of the wheels so that it fits the positions of each segment best.
-
-    Outliers among the positions have a smaller weight.
-    """
+    """Shift and rotate each path so that it fits its positions best. Outliers weigh less."""
     for segment in segments:
         place, derivatives = paths[segment.run].at(segment.t, parameters)
         weight = np.ones(len(place))
@@ -255,10 +230,7 @@ def aligned(segments: Sequence[Segment], paths: Paths, parameters: Floats) -> It
 def evidence(
     segments: Sequence[Segment], paths: Paths, parameters: Floats, blocks: int
 ) -> Evidence:
-    """Return the evidence of the positions: how they contribute to the fit at these parameters.
-
-    `paths` must be computed with the same parameters. `blocks` is the number of blocks of the log.
-    """
+    """Return the evidence of the positions at `parameters`, with which `paths` were computed."""
     normal, score = np.zeros((blocks, COUNT, COUNT)), np.zeros((blocks, COUNT))
     squares, counts = np.zeros(blocks), np.zeros(blocks)
     for part in aligned(segments, paths, parameters):
@@ -298,8 +270,7 @@ MOST_POINTS = 80
 MOST_REFINED, FAR_WORSE = 4, 20.0
 """Limits for the starting points that are refined.
 
-At most `MOST_REFINED` points are refined. A point that is more than `FAR_WORSE` times worse than
-the best one is not refined.
+At most `MOST_REFINED` points are refined, and none that is `FAR_WORSE` times worse than the best.
 """
 
 USUAL_TURN = 0.31, 1.25
@@ -312,17 +283,10 @@ NEAR_HEADING = 0.8, 1.25
 """Usual range of the turn that positions show, divided by the turn that a heading sensor shows."""
 
 WRONG_WAY = 4.0
-"""Factor by which a starting point counts as worse if it describes a robot with a wrong sign.
-
-Such a robot has one side reversed, or turns in the opposite direction to its wheels.
-"""
+"""Penalty factor if one side is reversed, or if the robot turns opposite to its wheels."""
 
 NOTHING = 1e-3
-"""Constant that is added to `StartingPoint.unexplained` before starting points are compared.
-
-It stands for the noise of the positions, which no starting point explains. Differences that are
-much smaller therefore hardly matter.
-"""
+"""Noise of the positions, added to `unexplained` so that much smaller differences hardly matter."""
 
 STRAYED = 1.3
 """Factor by which a refinement may change the robot's turn. Beyond it, the result is discarded."""
@@ -342,10 +306,7 @@ class StartingPoint(Struct, frozen=True):
 def search(
     segments: Sequence[Segment], driven: Sequence[Run], base: Base, sides: Floats | None = None
 ) -> StartingPoint:
-    """Return the best starting point for the fit to positions.
-
-    `sides` is the result of `heading.first`, or None without a heading sensor.
-    """
+    """Return the best starting point for the fit. `sides` is from `heading.first`, or None."""
     kept = _furthest(segments, MOST_SEGMENTS)
     needed = sorted({segment.run for segment in kept})
     steps = {run: wheel_steps(driven[run], COARSE_S) for run in needed}
@@ -388,10 +349,7 @@ def _local_minima(tried: Sequence[StartingPoint]) -> list[StartingPoint]:
 
 
 def _penalty(point: StartingPoint, sides: Floats | None) -> float:
-    """Return a factor of at least 1, which is larger if the parameters describe an unusual robot.
-
-    `sides` is the result of `heading.first`, or None without a heading sensor.
-    """
+    """Return a factor of at least 1, larger for an unusual robot. `sides` is as in `search`."""
     signed = point.parameters[[P.LEFT, P.RIGHT]] * point.parameters[P.INVERSE_TRACK]
     turn, (least, most) = float(np.abs(signed).mean()), USUAL_TURN
     like = np.ones(2)
@@ -425,9 +383,8 @@ def _tried(
 ) -> StartingPoint:
     """Return the starting point for a shape of the path, with the size that fits best.
 
-    `shape` contains the sign of the left side (1 or -1), the ratio of configured to true track
-    (negative if the robot turns in the opposite direction to its wheels), and the delay of the
-    positions, s.
+    `shape` contains the sign of the left side, the ratio of configured to true track (negative if
+    the robot turns opposite to its wheels), and the delay of the positions, s.
     """
     parameters = base.start()
     parameters[[P.LEFT, P.RIGHT, P.INVERSE_TRACK, P.DELAY]] = shape[0], 1.0, shape[1], shape[2]
@@ -451,10 +408,7 @@ def _tried(
 def _refined(
     point: StartingPoint, few: Sequence[Segment], steps: dict[int, WheelSteps], base: Base
 ) -> StartingPoint:
-    """Return the starting point after a fit to a few segments, if this fit explains more.
-
-    The fit also finds where on the robot the position sensor is. Outliers have less weight.
-    """
+    """Return the point refined by a fit to a few segments, if this fit explains more."""
     segments = [replace(segment, block=number) for number, segment in enumerate(few)]
 
     def source(parameters: Floats) -> Evidence:

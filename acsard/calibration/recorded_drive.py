@@ -1,7 +1,6 @@
-"""Reads the recorded drive that `acsard calibrate --log` names, and calibrates from it.
+"""Calibrates from the recorded drive that `acsard calibrate --log` names.
 
-The drive is a CSV file, a black-box recording of acsard, or a ROS 2 bag in MCAP. `--log` may also
-name the directory of a bag.
+The drive is a CSV file, a black-box recording of acsard, or a ROS 2 bag in MCAP.
 """
 
 from __future__ import annotations
@@ -34,31 +33,20 @@ MOST_RECORD_BYTES = 1 << 28
 """Maximum size of a record in a bag, bytes. It is ample: chunks of rosbag2 are below 1 MiB."""
 
 BAG_DAMAGE = (*DAMAGE, RuntimeError, KeyError)
-"""Exceptions that the MCAP reader and LZ4 raise for a damaged bag.
-
-A channel whose schema is missing causes a `KeyError`.
-"""
+"""Exceptions of the MCAP reader and of LZ4 for a damaged bag. `KeyError` means a missing schema."""
 
 OTHER_BAGS = {
     ".db3": (b"SQLite format 3\0", "in SQLite: convert it to MCAP with `ros2 bag convert`"),
     ".bag": (b"#ROSBAG V", "of ROS 1: convert it to ROS 2 in MCAP with `rosbags-convert`"),
     ".zstd": (b"\x28\xb5\x2f\xfd", "compressed as a whole file: unpack it with `zstd -d`"),
 }
-"""Kinds of bags that this module cannot read, by the suffix of their files.
-
-Each value contains the first bytes of such a file, and the part of the error message that says how
-to convert it.
-"""
+"""Bags that this module cannot read, by file suffix: their first bytes, and words for the error."""
 
 
 def calibrated(log: Path, config: Config, tape: Tape | None, choice: Choice) -> Calibration:
-    """Return the calibration from a recorded drive.
+    """Return the calibration from a recorded drive: a file, or the directory of a bag.
 
-    Args:
-        log: the file of the drive, or the directory of a bag.
-        config: the configuration of the robot.
-        tape: a distance that was measured by tape, or None.
-        choice: the topics and the axis to use in a bag.
+    `choice` applies only to a bag. `tape` is a distance that was measured by tape.
 
     Raises:
         LogError: the content of the log is unreadable, incomplete or wrong.
@@ -98,7 +86,6 @@ def _table(log: Path, config: Config, choice: Choice) -> Table:
 
 
 def _files_of(directory: Path) -> list[Path]:
-    """Return the MCAP files in the directory of a bag, sorted by the numbers in their names."""
     files = [path for path in directory.iterdir() if path.suffix == ".mcap"]
     if not files:
         for suffix, (_, what) in OTHER_BAGS.items():
@@ -116,10 +103,6 @@ def _other_bag(what: str) -> str:
 
 
 def _is_ours(log: Path) -> bool:
-    """Return whether acsard recorded this MCAP file, according to its header.
-
-    A file with a damaged header also counts, because the reader of recordings reports the damage.
-    """
     with log.open("rb") as stream:
         try:
             return _reader(stream).get_header().profile == "acsard"
@@ -143,11 +126,7 @@ def _bag(files: list[Path], config: Config, choice: Choice) -> Table:
 
 
 def _messages(file: Path, notes: list[str]) -> Iterator[RosMessage]:
-    """Yield the messages of a bag in their order in the file.
-
-    If the file is cut off or damaged, yield the messages before the damage, and add a sentence to
-    `notes`.
-    """
+    """Yield the messages in file order. If the file is cut off or damaged, stop and add a note."""
     with file.open("rb") as stream:
         try:
             for schema, channel, one in _reader(stream).iter_messages(log_time_order=False):
@@ -164,10 +143,7 @@ def _messages(file: Path, notes: list[str]) -> Iterator[RosMessage]:
 
 
 def _measured(log: Path) -> bytes:
-    """Return the measurements of a black-box recording as a CSV table.
-
-    Raises `LogError` if the file is not a recording or if the recording has no gyro.
-    """
+    """Return a black-box recording as a CSV table. Raises `LogError`, also if it has no gyro."""
     try:
         recording = Recording(log)
     except RecordingError as error:

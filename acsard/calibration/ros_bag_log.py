@@ -36,7 +36,6 @@ TYPES: dict[str, type[JointState | Imu | Odometry | PoseStamped]] = {
     "nav_msgs/msg/Odometry": Odometry,
     "geometry_msgs/msg/PoseStamped": PoseStamped,
 }
-"""Message types that this module reads, by ROS name."""
 
 REFERENCES = "a gyro (sensor_msgs/msg/Imu) or positions (geometry_msgs/msg/PoseStamped)"
 
@@ -46,45 +45,35 @@ AXES = ("z", "-z", "x", "-x", "y", "-y")
 """Axes of an IMU that may point up. `-x` means that x points down."""
 
 LEAST_MESSAGES = 20
-"""Minimum number of messages in a topic that is used. Messages without a value do not count."""
+"""Minimum number of messages with a value in a topic that is used."""
 
 CLOCKS_APART_S = 1.0
-"""Largest difference between the delays of two topics whose stamps are of the same clock, s.
-
-The delay of a topic is the median time from the stamp of a message to its recording.
-"""
+"""Largest difference between the median delays of two topics from stamp to recording, s. If it is
+larger, their stamps come from different clocks."""
 
 STEP_S = 1.0
 """Length of the intervals in which turns measured by a sensor and the wheels are compared, s."""
 
 UPRIGHT, LYING = 0.5, 0.8
-"""Limits for the correlation of the turns about an IMU axis with those measured by the wheels.
-
-If the correlation is below `UPRIGHT` for the chosen axis and above `LYING` for another axis, the
-other axis points up or down, and the log is refused.
-"""
+"""Limits for the correlation of the turns about an IMU axis with the turns of the wheels. If the
+chosen axis is below `UPRIGHT` and another axis is above `LYING`, the log is refused."""
 
 OWN = 3e-3
-"""Smallest credible difference between the turns of an `Odometry` and those measured by the wheels.
-
-The number is the RMS difference divided by the RMS turn. If the difference is not larger, the
-`Odometry` was computed from the wheels.
-"""
+"""Smallest credible RMS difference between the turns of an `Odometry` and of the wheels, divided by
+the RMS turn. If it is not larger, the `Odometry` was computed from the wheels."""
 
 DELAYS_S = np.arange(-0.1, 0.101, 0.01)
 """Delays of an `Odometry` relative to the wheels, s. `_computed_from` tries each of them."""
 
 
 class RosMessage(NamedTuple):
-    """A message as it was recorded in a bag."""
-
     topic: str
     type: str
-    """ROS name of the type, such as `nav_msgs/msg/Odometry`."""
+    """ROS name, such as `nav_msgs/msg/Odometry`."""
     encoding: str
-    """Encoding of the data; ROS 2 uses `cdr`."""
+    """ROS 2 uses `cdr`."""
     wall_ns: int
-    """Time at which the message was recorded, ns since 1970."""
+    """Time of the recording, ns since 1970."""
     data: bytes
 
 
@@ -92,14 +81,12 @@ class Choice(Struct, frozen=True):
     """The topics and the axis that the user chose."""
 
     topics: tuple[str, ...] = ()
-    """The topics to use. () means that the tool chooses them by their message types."""
+    """() means that the tool chooses the topics by their message types."""
     axis: str = ""
-    """The axis of the IMU that points up, one of `AXES`; "" means z."""
+    """The IMU axis that points up, one of `AXES`; "" means z."""
 
 
 class _Topic:
-    """The samples of one topic."""
-
     def __init__(self, name: str, type_: str) -> None:
         self.name, self.type = name, type_
         self.kind = TYPES[type_]
@@ -116,10 +103,6 @@ class _Topic:
         return f"{printable(self.name)} ({self.kind.__name__})"
 
     def take(self, message: RosMessage, joints: Sequence[str]) -> None:
-        """Add the values of a message, or count the message as unreadable.
-
-        `joints` contains the configured names of the wheel joints, in the order of `FOUR`.
-        """
         if message.encoding != "cdr":
             self._refuse(f"it is encoded as {message.encoding or 'nothing'}, not as cdr")
             return
@@ -173,7 +156,6 @@ class _Topic:
         ]
 
     def columns(self) -> Floats:
-        """Return the values, one row for each message."""
         return np.frombuffer(self.values).reshape(len(self), -1)
 
     def seconds(self, times: array[int], since_ns: int) -> Floats:
@@ -221,11 +203,7 @@ def wheel_joints(names: tuple[str, ...], joints: tuple[str, ...]) -> dict[str, l
     """Return the indices of the wheel joints in `names`, by their columns in a log.
 
     The columns are "fr", "fl", "rl" and "rr", or "left" and "right". The result is empty unless
-    both sides have a wheel joint.
-
-    Args:
-        names: the names of the joints in a message.
-        joints: the configured names of the wheel joints, in the order of `FOUR`.
+    both sides have a wheel joint. `joints` contains the configured names, in the order of `FOUR`.
     """
     if set(joints) <= set(names):
         return {column: [names.index(joint)] for column, joint in zip(FOUR, joints, strict=True)}
@@ -261,8 +239,6 @@ def table(messages: Iterable[RosMessage], joints: Sequence[str], choice: Choice)
 
 
 class _Log:
-    """The topics of a bag, and the table that is built from the chosen topics."""
-
     def __init__(
         self, topics: list[_Topic], others: dict[str, str], joints: Sequence[str], choice: Choice
     ) -> None:
@@ -297,10 +273,7 @@ class _Log:
     # Choice of the topics
 
     def _chosen(self) -> tuple[_Topic, _Topic | None, _Topic | None]:
-        """Return the topics of the wheels, of the gyro and of the positions.
-
-        Raises `LogError` if the bag lacks the wheels, or has nothing to compare them with.
-        """
+        """Return the topics of the wheels, the gyro and the positions. Raises `LogError`."""
         names = self._choice.topics
         known = {topic.name: topic for topic in self._topics}
         for name in names:
@@ -477,10 +450,7 @@ def speeds_of(t: Floats, angles: Floats) -> tuple[Floats, Floats]:
     Each speed is the mean over one sample period. The integral of the speeds is therefore exactly
     the angle that the wheel turned, even if the sample times are uneven. No speed is computed
     across a gap in the samples, or across a jump of an angle (a driver that restarts begins at 0).
-
-    Args:
-        t: the times of the angles, s.
-        angles: the angles, one column for each wheel, rad.
+    `angles` has one column for each wheel, rad, and `t` contains their times, s.
     """
     whole = np.isfinite(angles).all(axis=1)
     times, first = np.unique(t[whole], return_index=True)
@@ -505,20 +475,14 @@ def speeds_of(t: Floats, angles: Floats) -> tuple[Floats, Floats]:
 
 
 def _unwrapped(angles: Floats) -> Floats:
-    """Remove the jumps by a whole turn from the angles of a wheel, rad.
-
-    Angles that span more than one turn are returned unchanged: they do not wrap.
-    """
+    """Remove jumps by a whole turn, rad, but none from angles that span more than one turn."""
     jumps = np.abs(np.diff(angles)).max(initial=0.0) > np.pi
     within = float(np.ptp(angles)) <= 2 * np.pi + 1e-3 if len(angles) else False
     return np.unwrap(angles) if jumps and within else angles
 
 
 def _sides(wheels: dict[str, Floats]) -> tuple[Floats, Floats, Floats]:
-    """Return the times of the wheel samples, s, and the angles of the left and right wheels, rad.
-
-    `wheels` contains the columns of the log by name.
-    """
+    """Return the sample times, s, and the mean angles of the left and the right wheels, rad."""
     t = wheels["t"]
     left, right = (
         np.mean([wheels[name] for name in wheels if name in names], axis=0)
@@ -539,11 +503,7 @@ def _edges(t: Floats, sides: tuple[Floats, Floats, Floats]) -> Floats:
 
 
 def _follows(t: Floats, rates: Floats, sides: tuple[Floats, Floats, Floats]) -> float:
-    """Return the correlation of turns measured by a sensor and by the wheels; NaN if unknown.
-
-    `rates` contains the sensor's turn rates, rad/s, at the times `t`, s. `sides` is the result of
-    `_sides`.
-    """
+    """Return the correlation of turns measured by a sensor and by the wheels; NaN if unknown."""
     order = np.argsort(t, kind="stable")
     edges = _edges(t, sides)
     if len(edges) < 4:
@@ -557,10 +517,7 @@ def _follows(t: Floats, rates: Floats, sides: tuple[Floats, Floats, Floats]) -> 
 
 
 def _computed_from(t: Floats, yaw: Floats, sides: tuple[Floats, Floats, Floats]) -> bool:
-    """Return whether the yaw follows the wheels so exactly that it was computed from them.
-
-    `yaw` contains the yaw, rad, at the times `t`, s. `sides` is the result of `_sides`.
-    """
+    """Return whether the yaw, rad, follows the wheels so exactly that it was computed from them."""
     held = np.isfinite(yaw)
     order = np.argsort(t[held], kind="stable")
     times, angle = t[held][order], np.unwrap(yaw[held][order])

@@ -42,19 +42,13 @@ PAUSE_S = 60.0
 """Time without a wheel sample after which a new run begins, s."""
 
 ROUNDED_S, REPEATED = 0.2, 4.0
-"""If both of these limits are exceeded, the times in the column `t` were rounded.
-
-`ROUNDED_S` is for the median interval between different times, s. `REPEATED` is for the mean number
-of rows that share a time.
-"""
+"""The times in the column `t` were rounded if the median interval between different times exceeds
+`ROUNDED_S`, s, and if on average more than `REPEATED` rows share a time."""
 
 ROLLING, AGAIN = 0.2, 0.4
-"""Criterion for a logger that repeats a position or a yaw until the next one arrives.
-
-Only rows count in which the absolute speeds of both sides add up to more than `ROLLING` rad/s. If
-more than the fraction `AGAIN` of these rows have the value of the row before, the logger repeats
-values. For example, rows at 20 Hz repeat each position of a 10 Hz source once.
-"""
+"""A logger repeats old positions or yaws if more than the fraction `AGAIN` of the rows equal the
+row before. Only rows count in which the absolute speeds of both sides add up to more than `ROLLING`
+rad/s. For example, rows at 20 Hz repeat each position of a 10 Hz source once."""
 
 WHEELS = "left right"
 COMMANDS = " ".join(APPLIED)
@@ -65,24 +59,17 @@ Streams = dict[str, tuple[Floats, ...]]
 """The times and the values of each sensor, by the sensor's name in `STREAMS`."""
 
 MOST_RUNS = 1000
-"""Largest number of different values in the column `run`. If there are more, the column does
-not name runs."""
+"""Largest number of values in the column `run`. If there are more, it does not name runs."""
 
 TOGETHER = 50
 """Number of rows whose speeds are summed before the two wheels of a side are compared."""
 
 NOTED, APART = 0.15, 0.8
-"""Limits for the difference between the front and the rear wheel of a side.
-
-The difference is a fraction of the distance that the wheels rolled. The report mentions a
-difference above `NOTED`. A log with a difference above `APART` is refused.
-"""
+"""Limits for the difference between the front and the rear wheel of a side, as a fraction of the
+distance rolled. The report mentions a difference above `NOTED`. Above `APART` a log is refused."""
 
 GAP_S, GAP_PERIODS = 0.3, 5.0
-"""Limits for the interval between two samples: in s, and in median sample periods.
-
-An interval that exceeds both is a gap. The motion within a gap is unknown.
-"""
+"""An interval between samples is a gap if it exceeds `GAP_S` s and `GAP_PERIODS` median periods."""
 
 STILL = 0.02
 """Largest speed at which a wheel is considered to stand still, rad/s."""
@@ -94,20 +81,14 @@ LONGEST_S = 12.0
 """Greatest length of a block, s, unless the caller of `blocks` asks for longer blocks."""
 
 SMOOTH_S = 0.3
-"""Time over which a wheel speed is averaged before it is squared, s.
-
-Without the average, the speeds of a coarse encoder would be 0 in some samples and far too large in
-others.
-"""
+"""Time over which a wheel speed is averaged before it is squared, s. Otherwise the speeds of a
+coarse encoder would be 0 in some samples and far too large in others."""
 
 LEAST_TURN = 0.2
 """Blocks in which the wheels of each side turn by less than this angle, rad, are left out."""
 
 MOST_JITTER_S = 5.0
-"""Largest variation of the delay from stamp to arrival, s.
-
-If the delay varies more, the times of arrival are used instead of the stamps.
-"""
+"""Largest variation of the delay from stamp to arrival, s, up to which the stamps are used."""
 
 
 class Run(Struct, frozen=True, dict=True):
@@ -264,8 +245,7 @@ def _sides(columns: dict[str, Floats], notes: Notes) -> tuple[Floats, Floats]:
 def _apart(columns: dict[str, Floats], front: str, rear: str) -> float:
     """Return the difference between two wheels of a side, as a fraction of the rolled distance.
 
-    `front` and `rear` name the columns of the wheels. Both roll over the same floor, so a large
-    difference means an error in the log. Raises `LogError` if the difference exceeds `APART`.
+    Both roll over the same floor, so a difference above `APART` raises `LogError`.
     """
     seen = np.isfinite(columns[front]) & np.isfinite(columns[rear])
     starts = np.arange(0, int(seen.sum()), TOGETHER)
@@ -304,16 +284,12 @@ def _restarts(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
 
 
 def _wheel_times(t: Floats, rows: Rows, columns: dict[str, Floats]) -> Floats:
-    """Return the sorted times, s, of those `rows` that have wheel speeds. Times may repeat."""
     held = np.isfinite(columns["left"][rows]) & np.isfinite(columns["right"][rows])
     return np.sort(t[rows[held]])
 
 
 def _in_seconds(name: str, t: Floats, parts: list[Rows], columns: dict[str, Floats]) -> None:
-    """Raise `LogError` if the times `t` are not in seconds or are too coarse.
-
-    `name` is a name in the column `run`. `parts` contains the rows of each drive with this name.
-    """
+    """Raise `LogError` if the times of run `name` are not in seconds or are too coarse."""
     for rows in parts:
         times = _wheel_times(t, rows, columns)
         if len(times) < LEAST_ROWS:
@@ -349,7 +325,6 @@ def _pauses(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
 
 
 def _streams(columns: dict[str, Floats], rows: Rows, notes: Notes) -> Streams | None:
-    """Return the samples of each sensor of a drive, or None if there are too few wheel samples."""
     streams = {name: _stream(columns, rows, name.split(), notes) for name in STREAMS}
     if len(streams[WHEELS][0]) >= LEAST_ROWS:
         return streams
@@ -374,8 +349,7 @@ def _run(name: str, streams: Streams) -> Run:
 def _remove_repeats(drives: Iterable[tuple[str, Streams]], notes: Notes) -> None:
     """Remove from `drives`, in place, the yaws and positions that the logger repeated.
 
-    A short drive may not show whether the logger repeats values, so all drives are evaluated
-    together.
+    A short drive may not show the repetition, so all drives are evaluated together.
     """
     for what in ("yaw", "x y"):
         found = [(streams, *_repeats(streams, what)) for _, streams in drives]
@@ -394,11 +368,7 @@ def _remove_repeats(drives: Iterable[tuple[str, Streams]], notes: Notes) -> None
 
 
 def _repeats(streams: Streams, what: str) -> tuple[Mask, Mask]:
-    """Return two masks of the rows of the sensor `what`.
-
-    The first mask marks the rows that repeat the value of the row before. The second mask marks the
-    rows at which the wheels turn.
-    """
+    """Return two masks of rows: the value repeats the one before, and the wheels turn."""
     t, *values = streams[what]
     if not len(t):
         return np.zeros(0, dtype=bool), np.zeros(0, dtype=bool)
@@ -423,10 +393,7 @@ def _stream(
 
 
 def _ordered(stream: list[Floats], what: str, notes: Notes) -> Iterator[Floats]:
-    """Yield the columns of `stream`, sorted by time. The first column contains the times.
-
-    Of several samples with the same time, only the first one is kept. `what` names the sensor.
-    """
+    """Yield the columns sorted by time, the first column. Of equal times, keep the first row."""
     t = stream[0]
     notes.add(f"{{}} rows of {what} are out of order and were sorted", int((np.diff(t) < 0).sum()))
     order = np.argsort(t, kind="stable")
@@ -444,7 +411,6 @@ class Block(Struct, frozen=True):
     """A few seconds of a run. To find uncertainties, the fit leaves out one block at a time."""
 
     run: int
-    """Number of the run."""
     begin: float
     """Start of the block, s since the start of the run."""
     end: float
@@ -509,11 +475,7 @@ def blocks(driven: Sequence[Run], shortest_s: float) -> list[Block]:
 
 
 def _turned(run: Run, begin: float, end: float, left: Floats, right: Floats) -> bool:
-    """Return whether the wheels of at least one side rolled by `LEAST_TURN` from `begin` to `end`.
-
-    These times are in s. Rolling back adds to the angle, as rolling ahead does. `left` and `right`
-    contain the angles of each side at `begin` and at `end`, rad.
-    """
+    """Return whether a side rolled by `LEAST_TURN`, back or ahead, from `begin` to `end`, s."""
     if max(abs(left[1] - left[0]), abs(right[1] - right[0])) >= LEAST_TURN:
         return True
     a, b = np.searchsorted(run.t, (begin, end))

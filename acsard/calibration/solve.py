@@ -1,9 +1,4 @@
-"""Computes the calibration from a log.
-
-First it cuts the log into blocks, checks it, and finds parameters from which the fit can start.
-Then it fits the parameters, checks them, and measures the improvement. If a log gives no
-calibration, an error says why and what to do.
-"""
+"""Computes the calibration from a log. If the log gives none, an error says why and what to do."""
 
 from __future__ import annotations
 
@@ -48,30 +43,21 @@ from acsard.core.config.settings import DriveConfig, FeedbackConfig, OdometryCon
 from acsard.core.values import AcsardError
 
 LENGTHS_S = (4.0, 8.0, 16.0, 32.0, 64.0)
-"""Lengths of blocks, s, that are tried. The tool uses the one that improves the odometry most.
-
-Many short blocks are better for accurate positions. Long blocks are better for coarse positions,
-and for wheels whose errors hide the small turns within a short block. If the log has no positions,
-only the shortest length is tried. If it has no heading sensor, the shortest length is not tried.
-"""
+"""Block lengths that are tried, s. The tool uses the one that improves the odometry most. Short
+blocks suit accurate positions. Long blocks suit coarse positions, and wheels whose errors hide
+small turns. Without positions, only the shortest length is tried. With positions but no heading
+sensor, the shortest length is not tried."""
 
 ENOUGH_BLOCKS = 8
-"""Minimum number of blocks for a block length, if a shorter length has already given a fit.
-
-With six blocks, the standard deviation of the ratio of left to right radius was up to three times
-too small.
-"""
+"""Minimum number of blocks for a block length, if a shorter length has already given a fit. With
+six blocks, the standard deviation of the ratio of the radii was up to three times too small."""
 
 PERFECT = 1e-4
-"""Smallest credible difference between a sensor and the wheels, as a fraction of the motion.
-
-For comparison: motion capture on a good floor differs by less than 1e-3.
-"""
+"""Smallest credible difference between a sensor and the wheels, as a fraction of the motion. For
+comparison: motion capture on a good floor differs by less than 1e-3."""
 
 
 class Drives(Struct, frozen=True):
-    """Totals of the runs of a log."""
-
     runs: int
     seconds: float
     metres: float
@@ -88,7 +74,7 @@ class Drives(Struct, frozen=True):
         """Return the totals of these runs.
 
         `by_wheels` contains the robot's turn in each interval of `rows` according to the calibrated
-        wheels, rad. `found` contains the new multipliers, and `rate` the turn rates of the log.
+        wheels, rad.
         """
         size = base.radius * float(found.values[[LEFT_RADIUS, RIGHT_RADIUS]].mean())
         return cls(
@@ -119,21 +105,14 @@ class Calibration(Struct, frozen=True):
     gyro_bias: float
     """Gyro bias, rad/s; 0 without a gyro."""
     notes: tuple[str, ...]
-    """Sentences about the log that the user should know."""
     odometry: dict[str, float]
-    """New settings of `[odometry]` by name.
-
-    They state the uncertainty of the geometry and, if `Noise.better` is true, the noise.
-    """
+    """New settings of `[odometry]`: the geometry's uncertainty, and the noise if `Noise.better`."""
     kept: tuple[str, ...] = ()
     """Names of the quantities that stay as configured: `plausibility.TRACK`, `RATIO` or both."""
     feedback: dict[str, float] = {}
-    """New settings of `[feedback]` by name.
-
-    It is empty unless the configured settings make healthy wheels look faulty to the daemon.
-    """
+    """New settings of `[feedback]`; empty unless the present ones cause false wheel faults."""
     noise: Noise | None = None
-    """The noise of the odometry, or None if the log does not show it."""
+    """None if the log does not show the noise of the odometry."""
 
 
 def calibrate(
@@ -143,9 +122,8 @@ def calibrate(
     """Return the calibration of the robot that recorded this log.
 
     Args:
-        log: the log.
         drive: the configured geometry, and the configured multipliers that scale it.
-        tape: a distance that was measured by tape, or None.
+        tape: a distance that was measured by tape.
         odometry: the configured noise. None means the default settings.
         feedback: the configured response time. None means the default settings.
 
@@ -169,15 +147,11 @@ class Prepared(Struct, frozen=True):
 
     runs: Sequence[Run]
     headings: Headings | None
-    """The headings that a sensor measured, or None if the log has none."""
+    """None if the log has no heading sensor."""
     base: Base
-    """The configured geometry."""
     parts: list[Block]
     rows: Rows
-    """The motion in intervals of about a second.
-
-    If the robot never rested, the turns of the gyro still contain the gyro's bias.
-    """
+    """Motion in intervals of about 1 s. The gyro's bias remains if the robot never rested."""
     segments: list[Segment]
     """The measured positions; empty if the log has none."""
     steps: list[WheelSteps]
@@ -185,7 +159,6 @@ class Prepared(Struct, frozen=True):
     sources: list[Source]
     """One function for each sensor, which returns the sensor's evidence for given parameters."""
     start: Floats
-    """The parameters from which the fit starts."""
 
 
 def prepared(
@@ -193,8 +166,7 @@ def prepared(
 ) -> Prepared:
     """Cut the runs into blocks of about `length` s, check the log, and find starting parameters.
 
-    `headings` contains the headings that a sensor measured, or is None if the log has none. Raises
-    `RefusedError` if a check fails.
+    Raises `RefusedError` if a check fails.
     """
     parts = blocks(driven, length)
     plausibility.drives_enough(parts)
@@ -267,11 +239,8 @@ class Candidate(Struct, frozen=True):
     result: Multipliers
     improvement: Improvement
     kept: dict[str, float]
-    """The quantities that stay as configured, by name: `plausibility.TRACK`, `RATIO` or both.
-
-    Each value is the relative standard deviation with which the log determines the quantity, or inf
-    if this is unknown.
-    """
+    """Maps each quantity that stays as configured, `plausibility.TRACK` or `RATIO`, to the relative
+    standard deviation with which the log determines it; inf if this is unknown."""
 
 
 def _calibrated(
@@ -308,10 +277,6 @@ def _calibrated(
 
 
 def _known(best: Candidate, odometry: OdometryConfig) -> Deviations:
-    """Return the standard deviations of the geometry that the calibration proposes.
-
-    A quantity that stays as configured also keeps its configured standard deviation.
-    """
     base, own = best.made.base, best.result.own()
     now = Deviations.of(odometry, base)
     return Deviations(
@@ -324,11 +289,7 @@ def _known(best: Candidate, odometry: OdometryConfig) -> Deviations:
 def _noise(
     best: Candidate, known: Deviations, odometry: OdometryConfig, *, present: bool
 ) -> Noise | None:
-    """Return the noise that the log shows with the fitted geometry; None if it shows none.
-
-    `known` contains the standard deviations of the geometry. If `present` is true, the configured
-    geometry is used instead of the fitted one.
-    """
+    """Return the noise that the log shows, or None. If `present`, use the configured geometry."""
     made, fitted = best.made, best.fitted
     held = folds(fitted, made.parts, drives(made.runs), best.rate)
     if present:
@@ -384,10 +345,7 @@ def _candidates(made: Prepared) -> list[Candidate]:
 
 
 def _held(base: Base) -> dict[str, list[Held]]:
-    """Return the constraints of each fit to try, by the quantity that they keep as configured.
-
-    The key "" is for the fit without constraints.
-    """
+    """Return the constraints by the quantity that stays as configured; "" is for a free fit."""
     ratio, track, growth = np.zeros((3, COUNT))
     ratio[[P.LEFT, P.RIGHT]] = base.right, -base.left
     track[P.INVERSE_TRACK] = growth[P.TRACK_GROWTH] = 1.0
@@ -421,7 +379,6 @@ def _candidate(made: Prepared, fitted: Fit) -> Candidate:
 def _calibration(
     log: Log, tape: Tape | None, best: Candidate, odometry: OdometryConfig, shown: Noise | None
 ) -> Calibration:
-    """Check the result of the best fit, and return the calibration."""
     made, fitted, rows, rate = best.made, best.fitted, best.rows, best.rate
     headings, base = made.headings, made.base
     by_wheels, result = heading.turned(rows, base, fitted.parameters), best.result
@@ -469,7 +426,6 @@ def _stays(name: str, deviation: float) -> str:
 
 
 def _of_noise(shown: Noise | None) -> Iterator[str]:
-    """Yield a sentence if some noise stays as configured. `shown` is the result of `_noise`."""
     if shown is None or not shown.better:
         yield (
             "the variances per metre and per radian stay as configured, because the errors of "
@@ -483,7 +439,6 @@ def _of_noise(shown: Noise | None) -> Iterator[str]:
 
 
 def _cuts(driven: Sequence[Run]) -> Iterator[str]:
-    """Yield a sentence for gaps in the wheel speeds, and one for jumps of the positions, if any."""
     if gaps := sum(len(run.gaps) for run in driven):
         yield f"the wheel speeds have {gaps} gaps: the tool uses no data across them"
     if jumps := sum(len(positions.jumps(run)) for run in driven):
@@ -494,10 +449,7 @@ def _cuts(driven: Sequence[Run]) -> Iterator[str]:
 
 
 def _too_good(made: Prepared, fitted: Fit) -> Iterator[str]:
-    """Yield a sentence for each sensor that agrees with the wheels better than is credible.
-
-    The values of such a sensor were probably computed from the wheels.
-    """
+    """Yield a sentence for each sensor that was probably computed from the wheels."""
     rows, headings, base = made.rows, made.headings, made.base
     if headings is not None:
         off = rows.turned - heading.turned(rows, base, fitted.parameters)
@@ -520,10 +472,7 @@ def _own(what: str) -> str:
 
 
 def _follow(made: Prepared, fitted: Fit, rate: Rates) -> Follow:
-    """Return the function that computes the extent of a run's path for given multipliers.
-
-    As in the fit, the track changes with the turn rate.
-    """
+    """Return a function that computes the extent of a run's path for given multipliers."""
 
     def follow(values: Floats, number: int) -> Extent:
         parameters = fitted.parameters.copy()

@@ -33,39 +33,29 @@ TRIED = np.geomspace(0.01, 5.0, 60)
 """Response times that are tried, s. They cover the range of `feedback.response_time`."""
 
 LEAST_ROWS, MOST_ROWS = 200, 30_000
-"""Minimum number of wheel samples in a log, and maximum number that the module uses.
-
-The maximum is five minutes at 100 Hz. More samples would only take memory.
-"""
+"""Minimum number of wheel samples in a log, and the most that are used: 5 minutes at 100 Hz."""
 
 FOLLOWS = 0.5
 """Largest fraction of the sum of squared wheel speeds that the model may leave unexplained."""
 
 SPARE = 0.5
-"""Longest time for which a wheel may look faulty with the proposed response time.
-
-It is given as a fraction of `feedback.fault_time`.
-"""
+"""Longest time for which a wheel may look faulty with the proposed response time, as a fraction of
+`feedback.fault_time`."""
 
 STEADY_S, REACHED, CONSTANT = 1.0, 0.9, 0.03
-"""Criterion for a wheel that turns as fast as it can.
-
-Its speed stays below `REACHED` times its command for at least 2 * `STEADY_S` s. In the last
-`STEADY_S` s of this time, the speed changes by less than the fraction `CONSTANT`.
-"""
+"""A wheel turns as fast as it can if its speed stays below `REACHED` times its command for at least
+2 * `STEADY_S` s, and changes by less than the fraction `CONSTANT` in the last `STEADY_S` s."""
 
 SAME = 1.5
 """The fitted and the configured response time count as equal up to this factor."""
 
 
 class WheelResponse(Struct, frozen=True):
-    """The response time and the highest speed of the wheels of a log."""
-
     seconds: float
     """Response time that fits best, s."""
     proposed: float | None
-    """Response time to configure if `false_fault` is true, s. It causes no fault in this log. It is
-    None if every tried time from `seconds` on leaves less reserve than `SPARE`."""
+    """Response time to configure if `false_fault` is true, s. It causes no fault in this log. None
+    if no tried time from `seconds` on satisfies `SPARE`."""
     present: float
     """Configured response time, s."""
     false_fault: bool
@@ -162,11 +152,7 @@ def _commanded(run: Run, drive: DriveConfig) -> tuple[Floats, Floats, Floats]:
 
 
 def _expected(steps: Floats, wanted: Floats, seen: Floats) -> Floats:
-    """Return the speeds, rad/s, that the model expects for each response time in `TRIED`.
-
-    The arguments are the results of `_commanded`. The result has the shape (samples, 2, response
-    times).
-    """
+    """Return the speeds, rad/s, that the model expects; shape (samples, 2, response times)."""
     expected = np.empty((*wanted.shape, len(TRIED)))
     last = np.zeros((2, len(TRIED)))
     for number, step in enumerate(steps):
@@ -181,11 +167,7 @@ def _expected(steps: Floats, wanted: Floats, seen: Floats) -> Floats:
 def _evidence(
     parts: Sequence[tuple[Floats, Floats, Floats]], response_time: float, fault_time: float
 ) -> float:
-    """Return the longest time, s, for which a wheel looks faulty to the daemon's fault detection.
-
-    `parts` contains the results of `_commanded` for each run. `response_time` and `fault_time` are
-    the settings of these names, s.
-    """
+    """Return the longest time, s, for which a wheel looks faulty to the daemon's detection."""
     longest, most = 0.0, fault_time / LINES_OF_EVIDENCE
     for steps, wanted, seen in parts:
         sides = [(Expected(), Witness()) for _ in range(2)]
@@ -203,11 +185,7 @@ def _evidence(
 
 
 def _fastest(parts: Sequence[tuple[Floats, Floats, Floats]]) -> float:
-    """Return the highest steady speed of a wheel that stays below its command, rad/s.
-
-    The result is infinite if there is no such wheel. `parts` contains the results of `_commanded`
-    for each run.
-    """
+    """Return the highest steady speed of a wheel below its command, rad/s; inf if there is none."""
     found: list[float] = []
     for steps, wanted, seen in parts:
         for told, speed in zip(wanted.T, np.abs(seen.T), strict=True):

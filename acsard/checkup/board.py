@@ -97,8 +97,7 @@ class Board:
         self.longest_reply_s = longest_reply
         """Largest permitted value of mcu.reply_period, s."""
         self.armed = False
-        """Whether the motors have stood once. From then on, a motor that runs away ends the check.
-        """
+        """Whether all motors have stood still once. Then a runaway motor ends the check."""
         # Results of the steps
         self.baud_rate: int = mcu.baud_rate
         self.comma = mcu.trailing_comma
@@ -106,8 +105,7 @@ class Board:
         self.latched = False
         """Whether zeros stop motor d only with the line ending that `comma` selects."""
         self.sealed = self.sampled = False
-        """`sealed`: lines have a checksum. `sampled`: lines request the board's clock and counts.
-        """
+        """`sealed`: lines have a checksum. `sampled`: they request the board's clock and counts."""
         self.identity: dict[str, str] = {}
         self.own_clock = False
         """Whether the board sends reports by its own clock, and not in reply to lines."""
@@ -122,10 +120,8 @@ class Board:
         self.others: list[bytes] = []
         """Lines that are not good replies."""
         self.inputs: dict[int, bool] = {}
-        """Maps an input to whether it was pressed in the last status line that reported it.
-
-        Key 0 is the emergency stop. The keys from 1 on are the bumpers.
-        """
+        """Whether each input was pressed in the last status line that reported it. Input 0 is the
+        emergency stop, and inputs from 1 on are the bumpers."""
         self.heard = Heard()
         """Statistics of all bytes and lines received since the port was opened."""
         self.sent_lines = 0
@@ -133,10 +129,8 @@ class Board:
         self.lateness = Lateness()
         """The delays of this computer, including those of a simulated board that runs on it."""
         self.fled = False
-        """Whether a motor runs away, or keeps turning although zeros are sent.
-
-        The host then sends nothing more, so that the board's watchdog can stop the motor.
-        """
+        """Whether a motor runs away, or keeps turning although zeros are sent. The host then sends
+        nothing more, so that the board's watchdog can stop the motor."""
 
         self._commanded = ZERO
         self._unanswered_s = 0.0
@@ -155,7 +149,7 @@ class Board:
         self.forget()
 
     def forget(self) -> None:
-        """Discard all received lines, but keep the results of the steps. Called after a restart."""
+        """Discard all received lines, but keep the results of the steps."""
         self.restarts, self._unanswered_s = Restarts(), 0.0
         for heard in (self._lines, self.replies, self.others):
             heard.clear()
@@ -176,8 +170,8 @@ class Board:
     def _farewell(self) -> None:
         """Send zeros several times, but send no more once a motor runs away.
 
-        If an encoder is reversed, the firmware's speed control makes its motor run away even on
-        zeros. Each further line would then keep the watchdog from stopping the motor.
+        With a reversed encoder, the firmware's speed control makes the motor run away even on
+        zeros. Each further line would keep the watchdog from stopping it.
         """
         self.armed, self.restarts.watched = False, False
         try:
@@ -257,10 +251,7 @@ class Board:
         return True
 
     def ask(self, wait_s: float = 0.0, comma: bool | None = None) -> None:
-        """Send one line of zeros, then listen for `wait_s` s, but at least for one period.
-
-        `comma` says whether the line ends with a comma; None means `self.comma`.
-        """
+        """Send one line of zeros, then listen for `wait_s` s, but at least for one period."""
         self.send(ZERO, comma)
         self.listen(max(wait_s, self.period_s))
 
@@ -270,8 +261,7 @@ class Board:
         """Send zeros `lines` times, and return the first reply to each line with its delay, s.
 
         Wait `wait_s` s for each reply, but at least 1.5 periods. A line without a reply has no
-        entry in the result. `comma` says whether the lines end with a comma; None means
-        `self.comma`.
+        entry in the result.
         """
         # Replies to earlier lines must not be taken for replies to these lines.
         self.listen(max(motion.GLANCE_S / 4, wait_s))
@@ -305,10 +295,7 @@ class Board:
         return got
 
     def let_go(self, silent_s: float) -> None:
-        """Send zeros once, then nothing for `silent_s` s.
-
-        If zeros do not stop a motor, the board's watchdog stops it in this silence.
-        """
+        """Send zeros once, then nothing for `silent_s` s, so that the watchdog stops any motor."""
         self.zeros()
         self.listen(silent_s)
 
@@ -317,7 +304,7 @@ class Board:
     def listen(self, seconds: float) -> list[Reply]:
         """Receive for `seconds`, and return the replies of that time.
 
-        Raises `StoppedError` if a motor runs away while `armed`, and `RestartedError` if the board
+        Raises `StoppedError` if a motor runs away while `armed`; `RestartedError` if the board
         restarts.
         """
         end_ns = self.wire.now_ns() + ceil(seconds * NS_PER_S)
@@ -403,7 +390,6 @@ class Board:
     # Standing still
 
     def turning(self) -> list[int]:
-        """Return the motors that turn according to the last reply."""
         last = self.replies[-1].motors if self.replies else ZERO
         return motion.moving(last, motion.STANDING)
 
@@ -430,8 +416,8 @@ class Board:
     def settles(self, comma: bool) -> bool:
         """Send zeros until at least two replies show that every motor stands.
 
-        `comma` says whether the lines end with a comma. Returns False if this takes longer than
-        `MOTOR_S`, or longer than `PATIENCE_S` while a motor still slows down.
+        Returns False if this takes longer than `MOTOR_S`, or longer than `PATIENCE_S` while a motor
+        still slows down.
         """
         began_s = self.now_s
         while True:

@@ -20,10 +20,8 @@ Changes = dict[str, object]
 """New configuration values by dotted key, such as `mcu.port`."""
 
 OPTIONAL = ("mcu.encoder_counts", "mcu.link_check")
-"""Keys that improve the link but make its lines longer.
-
-If the wire is too slow for longer lines, the advice leaves out the first key, then also the second.
-"""
+"""Keys that improve the link but make its lines longer. If the wire is too slow, the advice leaves
+out the first key, and then the second one."""
 
 
 def answered(findings: Iterable[Finding]) -> bool:
@@ -32,7 +30,7 @@ def answered(findings: Iterable[Finding]) -> bool:
 
 
 def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Changes:
-    """Return the changes of the configuration that the findings suggest.
+    """Return the suggested changes of the configuration.
 
     They include `mcu.port` with the value `port`, unless that is "" or no board answered there.
     """
@@ -59,7 +57,7 @@ def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Chan
 def withheld(simulated: bool, config: Config) -> str:
     """Return why the findings do not apply to the robot of this configuration, or "" if they do.
 
-    `simulated` says whether the check tested the simulator, whose findings apply to no robot.
+    `simulated` means that the check tested the simulator.
     """
     if not simulated or config.mcu.simulated:
         return ""
@@ -85,8 +83,8 @@ class Report(Struct, frozen=True):
     """The result of a check.
 
     `changes` are the suggested configuration values, and `toml` contains them as lines of TOML.
-    `written` is the file that now contains the changes, or None. `error` is a failure that is not
-    the board's fault, or None.
+    `written` is the file that now contains the changes. `error` is a failure of another part than
+    the board.
     """
 
     port: str
@@ -122,11 +120,7 @@ def report(
 
 
 def summary(found: Report, where: str) -> str:
-    """Return the last lines that the check prints.
-
-    They give the number of findings with each verdict, the number of steps that were not judged,
-    and the lines of TOML for the configuration file, whose name is `where`.
-    """
+    """Return the last lines that the check prints, for a configuration file named `where`."""
     verdicts = [finding.verdict for finding in found.findings]
     counts = ", ".join(f"{verdicts.count(v)} {v}" for v in get_args(Verdict) if v in verdicts)
     if late := lateness.unjudged(found.findings):

@@ -64,7 +64,6 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
 
 
 def _moves(board: Board, line: bytes) -> bool:
-    """Return whether this line makes a standing motor turn, and stop the motor again."""
     for _ in range(3):  # a motor needs a moment to show that it obeyed
         board.wire.send(line)
         board.listen(max(GLANCE_S / 6, len(line) * 12 / board.baud_rate))

@@ -1,8 +1,6 @@
 """Steps of the check that find out how the board communicates.
 
-They determine the baud rate, the board's identification, the form of its lines, whether it supports
-the checked link, how often and how soon it replies, and whether it reports by its own clock. They
-send only zeros and questions. Later steps use the results.
+They send only zeros and questions. Later steps use the results.
 """
 
 from __future__ import annotations
@@ -41,10 +39,7 @@ def baud(board: Board) -> Finding:
 
 
 def _knock(board: Board, seconds: float) -> bool:
-    """Send zeros, with and without a checksum, until three good replies have arrived.
-
-    Returns False if they do not arrive within `seconds`.
-    """
+    """Send zeros until three good replies have arrived. Return False after `seconds` s."""
     end_s = board.now_s + seconds
     while board.now_s < end_s:
         board.zeros()
@@ -78,10 +73,9 @@ def identity(board: Board) -> Finding:
 
 
 def form(board: Board) -> Finding | None:
-    """Check whether the board answers lines with the configured ending: with or without a comma.
+    """Return a finding if the board answers only the ending that is not configured, else None.
 
-    If the board answers only lines with the other ending, later lines have that ending, and the
-    returned finding says so. Returns None in all other cases.
+    The endings are with a comma and without one. Later lines have the ending that works.
     """
     if board.own_clock or _answers(board, board.comma) or not _answers(board, not board.comma):
         return None
@@ -109,10 +103,7 @@ def comma(board: Board, dead: bool) -> Finding:
 
 
 def _comma_wrong(board: Board, how: str) -> Finding:
-    """Return the finding that `mcu.trailing_comma` is wrong. `board.comma` is the right value.
-
-    `how` is the part after the colon in the name of the outcome.
-    """
+    """Return the finding that `mcu.trailing_comma` is wrong. `how` ends the outcome's name."""
     return outcomes.find(
         f"trailing comma: {how}",
         {"mcu.trailing_comma": board.comma},
@@ -124,7 +115,7 @@ def _comma_wrong(board: Board, how: str) -> Finding:
 
 
 def replies(board: Board) -> Finding:
-    """Compare the form of the replies with the documented form. The daemon also reads others."""
+    """Compare the replies with the documented form. The daemon also reads other forms."""
     lines = [reply.line.partition(b"#")[0] for reply in board.replies]
     forms = {"spaces": rb", ", "unpadded": rb"[pn]\d\.", "trailing comma": rb", *\Z"}
     found = [name for name, sign in forms.items() if any(re.search(sign, line) for line in lines)]
@@ -139,7 +130,7 @@ def check(board: Board) -> Finding:
     """Find out whether the board supports the checked link and the sample fields.
 
     The checked link adds a checksum to each line. The sample fields of a reply are the board's
-    clock and its encoder counts. Later steps use both if the board supports them.
+    clock and its encoder counts.
     """
     wanted = board.mcu.link_check
     board.sealed = board.sampled = True

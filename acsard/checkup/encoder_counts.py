@@ -16,22 +16,16 @@ AGREES = 0.02
 """Largest relative difference between the measured and the stated counts per turn."""
 
 ALIKE = 0.75
-"""Smallest accepted ratio of the lowest to the highest counts per turn of the motors.
-
-The ratio is low, because with a coarse encoder the measurement of a single motor is rough.
-"""
+"""Smallest accepted ratio of the lowest to the highest counts per turn of the motors. It is low,
+because with a coarse encoder the measurement of a single motor is rough."""
 
 COARSE = 0.015
-"""Smallest mean jump of a motor's angle from reply to reply, rad, that shows a coarse encoder.
-
-The daemon must know the counts per turn of such an encoder.
-"""
+"""Smallest mean jump of a motor's angle from reply to reply, rad, that shows a coarse encoder. The
+daemon must know the counts per turn of such an encoder."""
 
 LONGEST_S = 0.05
-"""Longest time between two replies, s, for which jumps of the speed can show a coarse encoder.
-
-With a longer time, the motors' own accelerations look like such jumps.
-"""
+"""Longest time between replies, s, for which jumps of the speed can show a coarse encoder. With a
+longer time, the motors' own accelerations look like jumps."""
 
 LEAST_ANGLES = 20
 """Smallest number of nonzero speed readings that can show a coarse encoder."""
@@ -41,11 +35,10 @@ MOST_COUNTS = 100_000
 
 
 def per_turn(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
-    """Return the encoder counts per wheel turn of these motors, on average.
+    """Return the mean encoder counts per wheel turn of these motors.
 
-    This is the change of the counts divided by the angle that follows from the reported speeds. The
-    result is negative if the counts run against the speeds, and None if the motors turned too
-    little.
+    They are computed from the change of the counts and the reported speeds. The result is negative
+    if the counts run against the speeds, and None if the motors turned too little.
     """
     counts = angle = 0.0
     for step in steps(replies):
@@ -85,8 +78,8 @@ def coarse(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
 def finding(board: Board, motors: Sequence[int]) -> Finding:
     """Return the finding about `mcu.encoder_counts`, the configured counts per wheel turn.
 
-    The configured value is compared with a measurement, and with the value in the board's
-    identification if there is one. The measurement uses `motors`, which turned as commanded.
+    It is compared with the value in the board's identification, if there is one, and with a
+    measurement by `motors`, which turned as commanded.
     """
     if not board.sampled:
         about = coarse(board.replies, motors)

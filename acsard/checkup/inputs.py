@@ -21,8 +21,6 @@ NEWS_S = 0.5
 
 
 class Input(Struct, frozen=True):
-    """An input of the board: the emergency stop or a bumper."""
-
     number: int
     """0 for the emergency stop, and 1, 2, ... for the bumpers in the order of the status line."""
     name: str
@@ -66,7 +64,7 @@ def finding(board: Board, operator: Operator, safety: SafetyConfig) -> Finding:
 
 
 def _pressed(board: Board, operator: Operator, asked: Input, inputs: list[Input]) -> str:
-    """Let the operator press the input `asked`, and return its fault in words, or ""."""
+    """Let the operator press the input `asked`. Return its fault in words, or ""."""
     operator.doing(f"press the {asked.name} and release it, within {PRESS_S:g} s")
     end_s, seen = board.now_s + PRESS_S, set[int]()
     while board.now_s < end_s:

@@ -1,9 +1,9 @@
 """Measures the lateness of this computer, and decides which findings may be wrong because of it.
 
 An overloaded computer sends and receives late, and so finds faults that the board does not have. If
-the board is a program on this computer, the time for which that program waits for a processor is
-lateness as well. A step during which this computer was too late is repeated (`procedure.py`). If it
-is too late each time, the finding says so and does not blame the board.
+the board is a program on this computer, its waits for a processor count as lateness too. A step
+during which this computer was late is repeated (`procedure.py`). If it is late each time, the
+finding says so and does not blame the board.
 """
 
 from __future__ import annotations
@@ -21,14 +21,11 @@ SPOILS_S = motion.PERIOD_S
 """Smallest delay of this computer that can cause a bad finding, s: the time between two lines."""
 
 PAUSE_S = motion.WATCHDOG_LEAST_S
-"""Smallest delay of this computer that makes even a good finding doubtful, s.
-
-The board's watchdog may have stopped the motors in that time.
-"""
+"""Smallest delay of this computer that makes even a good finding doubtful, s. The board's watchdog
+may have stopped the motors in that time."""
 
 
 LATE = "late: not judged"
-"""The outcome of a step for which this computer was too late."""
 
 
 class Lateness:

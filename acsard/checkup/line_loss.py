@@ -29,21 +29,15 @@ FEW = 2
 """Smallest number of lost lines that counts as a fault. Fewer may be a coincidence."""
 
 LINES, LEAST_S, MOST_S = 300, 3.0, 10.0
-"""Limits of the count of lost lines.
-
-The count takes `LEAST_S` s. If a line was lost in this time, it goes on until it has `LINES` lines,
-which are enough to show a loss of 2 %, or until `MOST_S` s have passed.
-"""
+"""The count of lost lines takes `LEAST_S` s. If a line is lost, it goes on until it has `LINES`
+lines, enough to show a loss of 2 %, or until `MOST_S` s have passed."""
 
 SILENT = 2.0
 """A gap between two replies is a silence only if it is this many times as long as the mean gap."""
 
 
 class Count(Struct, frozen=True):
-    """Numbers of all lines, of the lost ones, and of those that arrived damaged.
-
-    `lost` includes the `damaged` lines.
-    """
+    """Numbers of all lines, of lost lines (including damaged ones), and of damaged lines."""
 
     lines: int
     lost: int
@@ -137,22 +131,15 @@ def _silence_s(board: Board, replies: Sequence[Reply]) -> float:
 
 
 PULSE_S = 0.08
-"""Time from a pulse to the zeros after it, s. A pulse is a single line that turns the motors.
-
-The encoders show the movement, but the board's watchdog does not act yet.
-"""
+"""Time from a pulse, a single line that turns the motors, to the zeros after it, s. The encoders
+show the movement, but the board's watchdog does not act yet."""
 
 TOLD, PULSES_S = 8, 20.0
-"""Limits of the search for the direction of a loss: a number of unanswered pulses, and a time, s.
-
-A pulse is a single line that turns the motors for a moment.
-"""
+"""The search for the direction of a loss ends after `TOLD` unanswered pulses, or `PULSES_S` s."""
 
 SPREAD, STRIDE = 12, 5
-"""The pause after pulse n is (n * `STRIDE`) % `SPREAD` line periods longer than the shortest.
-
-With equal pauses, losses at regular intervals could miss every pulse.
-"""
+"""The pause after pulse n is (n * `STRIDE`) % `SPREAD` line periods longer than the shortest pause.
+With equal pauses, losses at regular intervals could miss every pulse."""
 
 OBEYED = 0.5
 """The motors obeyed a pulse if they turned by at least this fraction of the usual angle."""
@@ -162,11 +149,7 @@ SEEN, GRAINS = 0.02, 4
 
 
 class Ways(Struct, frozen=True):
-    """Numbers of pulses. A pulse is a single line that turns the motors for a moment.
-
-    `sent` counts all pulses. `there` counts those that were lost on the way to the board. `back`
-    counts those that the motors obeyed, but whose reply was lost.
-    """
+    """Numbers of pulses: all, lost on the way to the board, and obeyed with a lost reply."""
 
     sent: int
     there: int
@@ -232,7 +215,7 @@ def pulsed(board: Board, motors: Sequence[int]) -> Ways | None:
 
 
 def _whole(board: Board, since_s: float) -> bool:
-    """Return whether all reports of a board that sends by its own clock arrived since `since_s`."""
+    """Return whether no periodic report of the board is missing since `since_s`."""
     times = [reply.at_s for reply in motion.since(board.replies, since_s - board.gap_s)]
     return all(after - before < 1.5 * board.gap_s for before, after in pairwise(times))
 

@@ -53,10 +53,8 @@ TREND_S = 0.5
 """Shortest length of the two intervals whose mean speeds `trend` compares, s."""
 
 FALLS = 0.97
-"""A motor slows down if its speed is below this fraction of its speed just before.
-
-It speeds up if the ratio of the two speeds is above the inverse of this number.
-"""
+"""A motor slows down if its speed is below this fraction of its speed just before. It speeds up if
+the ratio of the two speeds is above the inverse of this number."""
 
 
 class Reply(Struct, frozen=True):

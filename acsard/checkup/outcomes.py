@@ -1,8 +1,4 @@
-"""The texts of all findings of the check.
-
-A step calls `find` with the name of an outcome and with the measured values, which `find` inserts
-into the texts of that outcome.
-"""
+"""The texts of all findings of the check. `find` inserts the measured values into them."""
 
 from __future__ import annotations
 

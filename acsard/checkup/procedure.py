@@ -62,16 +62,11 @@ Step = Callable[[], Finding | None]
 
 LATE_AGAIN, LATE_MOST = 2, 8
 """Largest numbers of repetitions because this computer was late: of one step, and of all steps.
-
-Without the limit for all steps, a check could take four minutes.
-"""
+Without the limit for all steps, a check could take four minutes."""
 
 AGAIN, MOST = 1, 5
-"""Limits for restarts of the board.
-
-A step is repeated after a restart, but at most `AGAIN` times. One more restart in the same step
-ends the check, and so do `MOST` restarts in all steps together.
-"""
+"""After a restart of the board, the step is repeated up to `AGAIN` times. One more restart in the
+same step ends the check, and so do `MOST` restarts in all steps together."""
 
 
 def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
@@ -84,10 +79,7 @@ def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
     unjudged: set[str] = set()
 
     def once(finding: Finding | None) -> None:
-        """Report the first finding of each name.
-
-        If that finding was not judged, also report the first judged one.
-        """
+        """Report the first finding of each name, and the first judged one if that is another."""
         if finding is None:
             return
         judged = lateness.judged(finding)
@@ -181,10 +173,7 @@ class _Steps:
         self._take(doing, partial(self._in_time, step))
 
     def _in_time(self, step: Step) -> Finding | None:
-        """Run a step, repeat it if this computer was late, and return its finding.
-
-        If the computer is late each time, the finding says that the step was not judged.
-        """
+        """Run a step, repeat it if this computer was late, and return its finding."""
         board, known, late_s = self._board, self._board.known, 0.0
         for _ in range(1 + min(LATE_AGAIN, self._late_left)):
             if late_s:
@@ -236,10 +225,7 @@ class _Steps:
                 board.known = known
 
     def _tried(self, step: Step) -> Finding | None:
-        """Run a step and return its finding.
-
-        After a bad finding, wait until a silent board answers, so that a restart is noticed.
-        """
+        """Run a step. If the finding is bad, wait for a silent board: it may have restarted."""
         try:
             finding = step()
         except StoppedError:
@@ -274,7 +260,6 @@ class _Steps:
 
 
 def _ended(step: Step) -> tuple[Finding | None, bool]:
-    """Run a step, and return its finding and whether this finding ends the check."""
     try:
         return step(), False
     except StoppedError as error:

@@ -22,23 +22,17 @@ from acsard.core.link.session import IDENTITY
 from acsard.core.values import AcsardError
 
 ASKED_S = 1.0
-"""Longest time from a request for the identification to the board's answer, s.
-
-An identification that arrives later was sent by the board without a request.
-"""
+"""Longest time from a request for the identification to the board's answer, s. If it arrives later,
+the board sent it without a request."""
 
 UNANSWERED = 5
-"""A text from the board shows a restart only after this many successive lines without a reply.
-
-With fewer such lines, the text may be a debug print of the firmware.
-"""
+"""Number of successive lines without a reply after which a text from the board shows a restart.
+After fewer lines, the text may be a debug print of the firmware."""
 
 AHEAD_S = 2.0
-"""Largest credible gain of the board's clock on the clock of this computer between replies, s.
-
-A line that is delayed on its way causes a smaller gain. A restart causes a larger one, because the
-clock's jump back to 0 looks like a large advance modulo `CLOCK`.
-"""
+"""Largest credible gain of the board's clock on this computer's clock between replies, s. A delayed
+line causes a smaller gain. A restart causes a larger one, because the clock's jump back to 0 looks
+like a large advance modulo `CLOCK`."""
 
 CLOCK = 65536
 """Time after which the board's clock starts again at 0, ms."""
@@ -56,8 +50,6 @@ _CAUSE = re.compile(rb" reset=([a-z-]{1,20})")
 
 
 class Restart(Struct, frozen=True):
-    """One restart of the board."""
-
     sign: str
     """The observation that revealed the restart, in words."""
     turned: Motors = ZERO
@@ -90,10 +82,8 @@ class Restarts:
         """Longest time between two lines to the board since the last reply, s."""
         self._unanswered = 0
         self._replied_s: float | None = None
-        """Time of the last reply, s, or None before the first one.
-
-        Before the first reply, a printed text does not count as a restart. Opening the port resets
-        many boards, and they print texts when they boot.
+        """Time of the last reply, s, or None before the first one. Until then, a printed text does
+        not mean a restart: opening the port resets many boards, which print texts when they boot.
         """
         self._clock: tuple[int, float] | None = None
         """The board's clock, ms, in the last reply that contained it, and that reply's time, s."""
@@ -187,7 +177,6 @@ def _silent(restarts: Sequence[Restart]) -> bool:
 
 
 def _told(mcu: McuConfig, restart: Restart) -> tuple[str, str]:
-    """Return which motors turned at the restart, and the observation that revealed it, in words."""
     turned = [motor for motor in range(4) if restart.turned[motor]]
     when = f"{motor_names(mcu, turned, ', ')} turned" if turned else "no motor turned"
     return when, restart.sign + (f" (reset={restart.cause})" if restart.cause else "")

@@ -4,9 +4,9 @@ The watchdog must also act if the board receives only damaged lines, as with a h
 
 The check brings the motors to speed, sends nothing (or damaged lines) for some time, and then sends
 zeros. The watchdog's time follows from the distance that the motors ran on, minus the distance of
-an ordinary stop. The replies usually show these distances. They do not if the firmware replies only
-to lines and reports momentary speeds. The check then tries silences of different lengths, and sees
-after each silence whether the motors still turn.
+an ordinary stop. Firmware that replies only to lines, and reports momentary speeds, does not show
+these distances. The check then tries silences of different lengths, and sees after each one whether
+the motors still turn.
 """
 
 from __future__ import annotations
@@ -52,25 +52,18 @@ class Run(Struct, frozen=True):
     slow_s: float
     """Time from the beginning of the stop until all motors were slower than `STOPPED`, s."""
     first: float
-    """Speed in the first reply after the silence, as a fraction of full speed.
-
-    Firmware that computes the speed from line to line reports the mean over the silence. Firmware
-    that measures by its own clock reports the momentary speed.
-    """
+    """Speed in the first reply after the silence, as a fraction of full speed. It is the mean over
+    the silence if the firmware computes it from line to line, or the momentary speed if the
+    firmware measures by its own clock."""
     second: float
-    """Speed in the second reply after the silence, as a fraction of full speed.
-
-    A quick motor has obeyed the first line of zeros by then.
-    """
+    """Speed in the second reply after the silence, as a fraction of full speed. A quick motor has
+    obeyed the first line of zeros by then."""
     grain_s: float
     """Resolution of the speeds: the time in which a motor turns by one jump of its readings, s."""
 
 
 def finding(board: Board, motors: Sequence[int]) -> Finding:
-    """Measure the time after which the watchdog stops the motors, and return the finding.
-
-    `motors` are the motors that turn as commanded. They stand again afterwards.
-    """
+    """Measure the time after which the watchdog stops `motors`, and leave them standing."""
     if not motors:
         return outcomes.find("watchdog: untested")
     stop = run(board, motors, 0.0)
@@ -133,12 +126,7 @@ def measured(board: Board, motors: Sequence[int], stop: Run) -> Between:
 
 
 def _asked(board: Board, motors: Sequence[int], stop: Run, between: Between) -> Between:
-    """Narrow the bounds of the time for which the motors run on, by bisection.
-
-    `between` are the bounds so far, s. The motors still turn after a silence as long as the lower
-    bound, and stand after one as long as the upper bound. `stop` is their behaviour in an ordinary
-    stop.
-    """
+    """Narrow the bounds `between`, s, of the time for which the motors run on, by bisection."""
     least_s, most_s = between
     for _ in range(8):  # each run halves the interval, unless this computer pauses
         if most_s - least_s <= max(0.03, 0.1 * most_s):
@@ -197,15 +185,11 @@ def command(motors: Sequence[int]) -> Motors:
 
 
 def _per_turn(board: Board, motors: Sequence[int]) -> float:
-    """Return the measured encoder counts per wheel turn, or 0 if distances cannot be computed.
-
-    It is 0 if the counts do not change, or if they could overflow in the longest silence.
-    """
+    """Return the measured encoder counts per wheel turn; 0 if unknown, or if they may overflow."""
     per_turn = encoder_counts.per_turn(board.replies, motors) or 0.0
     wraps = per_turn * motion.RUNAWAY / math.tau * motion.STOOD_S >= FIELD / 2
     return 0.0 if wraps or per_turn < 1 else per_turn
 
 
 def _share(reply: Reply, motors: Sequence[int]) -> float:
-    """Return the speed of the fastest of these motors as a fraction of the commanded speed."""
     return max(abs(reply.motors[motor]) for motor in motors) / motion.SPEED

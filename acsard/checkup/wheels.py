@@ -48,17 +48,12 @@ class Channel(Struct, frozen=True):
     forward: bool = True
     """Whether the wheel turned forward first, as the operator saw it."""
     probed: bool = False
-    """Whether the motor was turned only for a short probe, because its own encoder did not follow.
-
-    Then `forth` contains the speeds of the probe, and `back` is zero.
-    """
+    """Whether the motor was only probed, because its own encoder did not follow. Then `forth`
+    contains the speeds of the probe, and `back` is zero."""
     unsure: float = 0.0
     """Relative error of the measured speeds that a coarse encoder may cause."""
     judged: bool = True
-    """Whether this computer was punctual during the measurement.
-
-    If it was not, the other fields may not show the motor's behaviour.
-    """
+    """Whether this computer was punctual. If it was not, the other fields may be wrong."""
 
     @property
     def moved(self) -> list[int]:
@@ -89,13 +84,12 @@ class Channel(Struct, frozen=True):
 
     @property
     def error(self) -> float:
-        """Relative error of the speed of the motor's own encoder: the larger of both directions."""
+        """Relative error of the speed of the motor's own encoder, in the worse direction."""
         own = self.motor
         return max(abs(self.forth[own] / SPEED - 1), abs(self.back[own] / SPEED + 1))
 
 
 def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
-    """Return the finding about the motor and the encoder of one channel."""
     motor, moved = channel.motor, channel.moved
     forth, back = channel.forth[motor], channel.back[motor]
     there = moved[0] if moved else motor
@@ -165,10 +159,8 @@ def wheel_map(mcu: McuConfig, found: Sequence[Channel]) -> Finding:
 
 
 NEAR = 0.8
-"""If the error of a speed exceeds this fraction of `OFF`, the speed is measured again for longer.
-
-The first measurement is too inaccurate to decide whether the error exceeds `OFF`.
-"""
+"""If the error of a speed exceeds this fraction of `OFF`, the speed is measured again for longer,
+because the first measurement is too inaccurate."""
 
 LOOK_S = 0.75 * motion.MOTOR_S
 """Time over which the second measurement averages the speed, s."""
@@ -189,8 +181,8 @@ def one(motor: int, speed: float) -> Motors:
 def turn(board: Board, motor: int, speed: float) -> tuple[Motors, float]:
     """Bring a motor to `speed`, rad/s, and measure the speeds of all encoders.
 
-    Returns these speeds, rad/s, and the possible relative error of the motor's speed. The error
-    arises because encoder counts are whole numbers.
+    Returns these speeds, rad/s, and the relative error of the motor's speed that whole encoder
+    counts may cause.
     """
     means = run_up(board, one(motor, speed))
     unsure = _unsure(board, motor, 2 * _look_s(board))
@@ -214,8 +206,8 @@ def _look_s(board: Board) -> float:
 def run_up(board: Board, motors: Motors) -> Motors:
     """Ramp up to the speeds `motors`, rad/s, and return each encoder's mean speed, rad/s.
 
-    The function holds the speeds until the encoders show them steadily. It gives up after some
-    time, or earlier if no encoder moves.
+    The function waits for steady speeds. It gives up after some time, or earlier if no encoder
+    moves.
     """
     steps = max(1, int(motion.GLANCE_S / board.period_s))
     for step in range(1, steps + 1):
@@ -247,8 +239,7 @@ def _patience_s(board: Board, told: list[int]) -> float:
 def channel(board: Board, motor: int) -> Channel:
     """Turn a motor forward and backward, and return how the encoders moved.
 
-    Some firmware obeys motor d only if a comma ends the line. If motor d seems dead, it is
-    therefore tried again with the other line ending.
+    If motor d seems dead, it is tried again with the other line ending.
     """
     found = _both_ways(board, motor)
     if motor == 3 and found.kind == "dead" and not board.latched:
@@ -283,8 +274,7 @@ def probe(board: Board, motor: int) -> Motors | None:
 
     The firmware may drive a motor without a working encoder to full speed, but the probe is too
     short for that. If the encoder does not follow, the probe is repeated, because a coarse encoder
-    may need more movement. It is not repeated if several readings show that the encoder runs
-    backward.
+    may need more movement. It is not repeated if several readings show a reversed encoder.
     """
     began_s = board.now_s
     shown = _probe(board, motor, motion.SPEED / 2)
@@ -326,10 +316,9 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
 
 
 def _with_other_comma(board: Board, dead: Channel) -> Channel:
-    """Test motor d, which does not move, again with the other line ending.
+    """Test motor d, which does not move, with the other line ending: a comma or none.
 
-    The two endings are with a comma and without one.
-    Returns the new result if the motor moves. Otherwise returns `dead`, the result so far.
+    Returns the new result if the motor moves, else `dead`.
     """
     configured, board.comma = board.comma, not board.comma
     channel = _both_ways(board, dead.motor)

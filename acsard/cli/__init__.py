@@ -1,10 +1,9 @@
 """The command line of acsard: one module for each subcommand.
 
 The docstring of such a module is the text of its `--help`. Its function `add_options` declares the
-options, and `main` calls another package and prints the results. If a subcommand has actions, such
-as `init` of `acsard tls`, each action has a main function of its own. Only the module of the typed
-subcommand is imported. It therefore imports everything it needs at its top, except libraries that
-may be missing.
+options, and `main` runs it. Each action of a subcommand, such as `init` of `acsard tls`, has a main
+function of its own. Only the module of the typed subcommand is imported. It imports everything it
+needs at its top, except libraries that may be missing.
 """
 
 from __future__ import annotations
@@ -56,8 +55,7 @@ VERBS = {
     "completion": "print the script for completion with Tab in a shell",
     "man": "print the text of every --help as a man page",
 }
-"""The subcommands and their help texts, in the order of `acsard --help`. Each one is a module of
-this package."""
+"""The subcommands, each a module of this package, with help texts, in the order of `--help`."""
 
 _EPILOG = """\
 exit codes: 0 done, 1 failure, 2 wrong usage, 65 part of the recording is damaged, 66 no such
@@ -72,8 +70,6 @@ try:  acsard run                (start the robot on the built-in simulator)
 
 
 class _Parser(argparse.ArgumentParser):
-    """An argument parser that suggests the nearest known word for a misspelt choice."""
-
     def _check_value(self, action: argparse.Action, value: object) -> None:
         try:
             super()._check_value(action, value)
@@ -85,7 +81,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def parser(called: Collection[str] = VERBS) -> argparse.ArgumentParser:
-    """Return the parser of `acsard`. It knows the options only of the subcommands in `called`."""
+    """Return the parser of `acsard`, with the options of only the subcommands in `called`."""
     whole = _Parser(
         prog="acsard",
         description="The hardware interface of a four-wheel differential-drive robot. It connects "
@@ -107,7 +103,6 @@ def parser(called: Collection[str] = VERBS) -> argparse.ArgumentParser:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the `acsard` command and return its exit code."""
     words = [_decimal(word) for word in (sys.argv[1:] if argv is None else argv)]
     known = {"-h", "--help", "--version"}
     if not words or (words[0].startswith("-") and words[0] not in known):
@@ -149,9 +144,9 @@ def _decimal(word: str) -> str:
 def entry() -> NoReturn:
     """Run `main` and end the process at once: the entry point of the `acsard` script.
 
-    The process ends with `os._exit`. Zenoh's threads may still call into Python while the
-    interpreter shuts down, which would abort the process. Everything that matters has been closed
-    and flushed by then.
+    The process ends with `os._exit`, because Zenoh's threads may still call into Python while the
+    interpreter shuts down, which would abort the process. Everything that matters is flushed by
+    then.
     """
     _fill_closed_streams()
     try:

@@ -52,10 +52,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _config(robot: Client, path: str | None) -> Config:
-    """Return the daemon's configuration, or the local file's if the robot does not give it.
-
-    Over the network only a maintainer may query the configuration.
-    """
+    """Return the daemon's configuration, or the local file's for a client that may not query it."""
     try:
         return msgspec.convert(robot.get("config"), Config)
     except (NoAnswerError, NotPermittedError, msgspec.ValidationError):

@@ -212,9 +212,8 @@ def _guided(
 ) -> tuple[Calibration, Config]:
     """Drive the robot, and return the calibration and the configuration of the robot's daemon.
 
-    Both a key press and Ctrl-C stop the robot with zero commands. `config` is the configuration in
-    the file `where`. `lines` is the prompt for --json-lines, or None. Raises `GuideError`,
-    `LogError` and `RefusedError`.
+    A key press or Ctrl-C stops the robot with zero commands. `config` is the configuration in the
+    file `where`. `lines` is the prompt for --json-lines.
     """
     require_one(args)
     endpoint, robot_id, tls = address_of(config, args.connect, args.id, args.tls)
@@ -275,11 +274,7 @@ def _usable(args: argparse.Namespace, odometry: str) -> None:
 
 
 def _differing(config: Config, mine: Config, where: str) -> str:
-    """Return why a calibration must not be written into the file `where`, or "" if it may.
-
-    It must not if the daemon's configuration `config` and the file's configuration `mine` differ in
-    the wheel radius or the track width.
-    """
+    """Return an error if the file `where` and the daemon differ in radius or track, else ""."""
     same = config.drive.wheel_radius, config.drive.wheel_separation
     if same == (mine.drive.wheel_radius, mine.drive.wheel_separation):
         return ""

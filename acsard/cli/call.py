@@ -18,7 +18,7 @@ from acsard.daemon.bus.robot_discovery import named
 from acsard.host.errors import UsageError
 
 CALLED = tuple(service for service in SERVICES if service != "set")
-"""The services that `acsard call` can call. `set` is missing, because `acsard set` calls it."""
+"""The services that `acsard call` can call. `acsard set` calls the service `set`."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -59,17 +59,13 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _fields(service: Verb) -> tuple[str, ...]:
-    """Return the names of the numbers in a service's payload; () if it has no payload."""
     if service in PLAIN_SERVICES:
         return ()
     return MESSAGES[SERVICES[service].payload].__struct_fields__
 
 
 def for_one(service: str, values: Sequence[float], ids: tuple[str, ...]) -> str:
-    """Return a message which says that `service` cannot be called on several robots at once.
-
-    The message gives the command to type for each robot in `ids`, with the payload `values`.
-    """
+    """Return a message that `service` is for one robot, with the command for each of `ids`."""
     typed = " ".join(["acsard call", service, *(f"{value:g}" for value in values), "--id"])
     each = [one for one in ids if one != "*"] or ["robot1"]
     more = "" if "*" not in ids else "; `acsard fleet` lists the ids"

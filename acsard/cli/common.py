@@ -18,7 +18,6 @@ from acsard.host.errors import Exit, ExitError, UsageError
 
 
 def add_config(parser: argparse.ArgumentParser) -> None:
-    """Add `--config`, which nearly every subcommand takes."""
     parser.add_argument(
         "--config",
         metavar="FILE",
@@ -30,8 +29,7 @@ def add_config(parser: argparse.ArgumentParser) -> None:
 def add_outcome(parser: argparse.ArgumentParser, result: str) -> None:
     """Add --json, --json-lines and --write to a subcommand that asks a person questions.
 
-    --write stores the result of the subcommand in the configuration file. `result` is the name of
-    this result in the help text.
+    `result` is the name of the result that --write stores, for the help text.
     """
     form = parser.add_mutually_exclusive_group()
     form.add_argument("--json", action="store_true", help="print one JSON object")
@@ -51,7 +49,6 @@ def add_outcome(parser: argparse.ArgumentParser, result: str) -> None:
 
 
 def require_asking(args: argparse.Namespace) -> None:
-    """Raise `UsageError` if both `--yes` and `--json-lines` are given."""
     if args.yes and args.json_lines:
         raise UsageError(
             "--yes and --json-lines exclude each other: --yes asks no questions, --json-lines asks "
@@ -60,7 +57,7 @@ def require_asking(args: argparse.Namespace) -> None:
 
 
 def count(text: str) -> int:
-    """Parse a whole number of at least 1. This function is an argparse type."""
+    """Parse a whole number of at least 1, as an argparse type."""
     number = int(text)
     if number < 1:
         raise argparse.ArgumentTypeError(f"{text} is less than 1, the smallest number")
@@ -68,10 +65,9 @@ def count(text: str) -> int:
 
 
 def seconds(text: str) -> float:
-    """Parse a duration from 1 to 600 s. This function is an argparse type.
+    """Parse a duration from 1 to 600 s, as an argparse type.
 
-    Longer measurements are refused, because all measured values stay in memory: 60 MB after 600 s
-    at 100 Hz.
+    All measured values stay in memory: 60 MB after 600 s at 100 Hz.
     """
     value = float(text)
     if not 1.0 <= value <= 600.0:
@@ -107,7 +103,7 @@ def tables(
 ) -> dict[str, dict[str, object]]:
     """Return a copy of the configuration tables `before` with the values of `options`.
 
-    `options` maps dotted keys, such as "mcu.port", to values; None leaves a key as it is.
+    `options` maps dotted keys, such as "mcu.port", to values. None leaves a key as it is.
     """
     given = {table: dict(values) for table, values in before.items()}
     for key, value in options.items():
@@ -138,9 +134,9 @@ def load(path: str | None, options: Mapping[str, object] | None = None) -> tuple
 def recorded(config: Config) -> Config:
     """Return `config` with an absolute path of the recording directory.
 
-    If `config` names no directory, the path comes from the environment variable ACSARD_RECORD,
-    which the systemd units set. If neither names one, the path stays "". It is absolute because a
-    client that reads it on the bus may run in another directory.
+    Without a configured directory, the path comes from ACSARD_RECORD, which the systemd units set,
+    or stays "". It is absolute because a client that reads it on the bus may run in another
+    directory.
     """
     told = config.record.directory or os.environ.get(RECORD, "")
     directory = os.path.abspath(told) if told else ""

@@ -82,7 +82,6 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _words() -> Mapping[tuple[str, str], list[str]]:
-    """Return the words that complete each argument, by the names of subcommand and argument."""
     config = Config()
     sources = [source.name for source in config.commands.sources]
     published = [topic.key for topic in PUBLISHED]

@@ -1,5 +1,5 @@
-"""Shared code of the subcommands that use the bus: their options, the connection, and checks of
-keys. It also explains to the operator why no message arrives.
+"""Shared code of the subcommands that use the bus: options, connection, and checks of keys. It also
+explains why no message arrives.
 """
 
 from __future__ import annotations
@@ -27,12 +27,7 @@ MANY = "; several ids separated by commas, or '*' for all robots"
 
 
 def add_bus(parser: argparse.ArgumentParser, more: str = "") -> None:
-    """Add the options of the tools that talk to a running daemon.
-
-    Args:
-        parser: the parser of the subcommand.
-        more: text that is appended to the help of `--id`.
-    """
+    """Add the options of tools that talk to a running daemon. `more` ends the help of `--id`."""
     add_config(parser)
     parser.add_argument(
         "--connect", metavar="ENDPOINT", help="address of the daemon, e.g. tcp/127.0.0.1:7448"
@@ -55,10 +50,7 @@ def connected(args: argparse.Namespace, source: str = "app") -> Iterator[Client]
 
 
 def robot_address(args: argparse.Namespace) -> Address:
-    """Return the robot's address from the options or the configuration file.
-
-    Raises `UsageError` for several robots.
-    """
+    """Return the robot's address. Raises `UsageError` for several robots."""
     require_one(args)
     _, config = load(args.config)
     return address_of(config, args.connect, args.id, args.tls)
@@ -112,8 +104,8 @@ def require_followed(key: str) -> None:
 def require_asked(key: str) -> None:
     """Raise `UsageError` if `acsard get` cannot query this key.
 
-    Some keys do not answer queries. A query to the key of a service would call the service. A key
-    with a wildcard has several answers, but `get` prints one.
+    Some keys do not answer queries. A query to a service's key would call the service. A key with a
+    wildcard has several answers, but `get` prints one.
     """
     if set(key.partition("?")[0]) & set("*$"):
         raise UsageError(
@@ -141,14 +133,15 @@ def explained(
 ) -> Iterator[Callable[[], None]]:
     """Print why no messages arrive, and yield a function that the caller calls for each message.
 
-    A separate thread finds the reason and prints it on standard error, so the caller never waits.
+    A separate thread prints on standard error, so the caller never waits.
 
     Args:
-        look: returns the reason if no message has arrived in the first `after_s` s, or "" to print
-            nothing.
-        ceased: returns the reason if messages have stopped for `after_s` s, or "" to print nothing.
-            If it is None, only the silence at the start is explained.
+        look: returns the reason if no message has arrived in the first `after_s` s.
+        ceased: returns the reason if messages have stopped for `after_s` s. If it is None, only the
+            silence at the start is explained.
         after_s: shortest silence that is explained, s.
+
+    A reason that is "" is not printed.
     """
     come, end = Event(), Event()
 
@@ -194,7 +187,6 @@ def _none_yet(robot: Client, key: str) -> str:
 
 
 def _ceased(robot: Client) -> str:
-    """Return why the connection was lost, or "" if the session is still connected."""
     try:
         if robot.session.info.links():
             return ""

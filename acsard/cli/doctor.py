@@ -20,7 +20,6 @@ from acsard.machine.examination import examine
 from acsard.terminal.output import show_whole
 
 MARKS = {"ok": ("ok  ", "green"), "warning": ("warn", "yellow"), "failure": ("FAIL", "red")}
-"""The word and the colour of each level of a finding."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -29,7 +28,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Examine the machine and print the findings. Return 1 if any of them is a failure."""
     require_one(args)
     told = partial(address_of, connect=args.connect, robot_id=args.id, tls=args.tls)
     findings = list(examine(*find(args.config), by_environment(), told))

@@ -94,7 +94,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 class Quota:
-    """Limit of the number of messages that are printed, counted for each robot."""
+    """Limit of the number of printed messages of each robot."""
 
     def __init__(self, most: int | None, robots: Collection[str]) -> None:
         """Allow `most` messages of each robot, or any number if `most` is None.
@@ -114,7 +114,6 @@ class Quota:
 
     @property
     def used_up(self) -> bool:
-        """True if there is a limit and each robot has reached it."""
         if self._most is None:
             return False
         return all(self._counts.get(one) == self._most for one in self._robots or self._counts)
@@ -130,13 +129,8 @@ def _print(
 ) -> int:
     """Print a line per message until Ctrl-C, the end of `quota`, or the end of `samples`.
 
-    Args:
-        samples: the messages. The iterator ends if no message arrives for `timeout`.
-        decoder: decodes messages for their short form; None prints JSON.
-        quota: limits the number of printed messages. Messages beyond it are skipped.
-        of_many: whether each line names its robot.
-        timeout: time, s, after which the function returns if it has printed no message, or None.
-        heard: called for each message.
+    A `decoder` gives the short form; None prints JSON. The function also returns if it has printed
+    no message for `timeout` s. It calls `heard` for each message.
     """
     printed_s = time.monotonic()
     try:
@@ -156,7 +150,6 @@ def _print(
 
 
 def _shortened(key: str) -> Decoder[Any]:
-    """Return the decoder of a key that has a short form. Raises `UsageError` for any other key."""
     kinds = {kind.__name__: kind for kind in SHORT}
     topic = by_key(key)
     if topic is None or topic.type not in kinds:
@@ -166,11 +159,7 @@ def _shortened(key: str) -> Decoder[Any]:
 
 
 def _shown(decoder: Decoder[Any] | None, encoding: str, payload: bytes, whose: str) -> str:
-    """Return a message as a printable line, in short form with a `decoder`, else as JSON.
-
-    A message that cannot be decoded is printed as JSON, too. `whose` names the robot in the line;
-    "" names none.
-    """
+    """Return a message as a line. It is JSON without a `decoder`, or if decoding fails."""
     if decoder is not None:
         try:
             told = short(decoder.decode(encoding, payload))
@@ -209,10 +198,9 @@ def _record(
 
 
 def _expected(robot: Client, ids: tuple[str, ...]) -> Collection[str]:
-    """Return the ids of the robots to print: those in `ids`, or for "*" the robots present now.
+    """Return `ids`, or for "*" the ids of the robots that are present now.
 
-    Also print on standard error which robots are present, because a present robot that sends
-    nothing looks like an absent one.
+    Also print which robots are present, because a silent robot looks like an absent one.
     """
     there: list[str] = []
     try:

@@ -58,10 +58,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def loopback(text: str) -> tuple[str, int]:
-    """Return the host and the port in a loopback address such as `127.0.0.1:8765`.
-
-    Raises `UsageError` for a malformed address and for one that other machines can reach.
-    """
+    """Return host and port of a loopback address. Raises `UsageError` for any other address."""
     host, _, digits = text.rpartition(":")
     try:
         address = ipaddress.IPv4Address("127.0.0.1" if host == "localhost" else host)

@@ -81,11 +81,7 @@ def main(args: argparse.Namespace) -> int:
 def _checked(
     args: argparse.Namespace, config: Config, configured: Config, where: str, prompt: Prompt
 ) -> int:
-    """Check the board, print the findings, and return the exit code.
-
-    `config` is the configuration with the options of the command line, and `configured` is the one
-    in the file `where`. The result suggests changes to that file.
-    """
+    """Check the board. Suggest changes to `configured`, the configuration in the file `where`."""
     port, simulated = config.mcu.port, config.mcu.simulated
     findings: list[Finding] = []
 

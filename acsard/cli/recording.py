@@ -320,8 +320,7 @@ def _tell(one: TimelineEntry, as_json: bool) -> None:
 def main_replay(args: argparse.Namespace) -> int:
     """Replay a recording and compare the result with the recorded one.
 
-    Returns 1 if they differ, except with --config, because then a difference is expected.
-    Otherwise returns 65 if a part was not compared, else 0.
+    Returns 1 if they differ (without --config), 65 if a part was not compared, else 0.
     """
     _refuse_times(args, "replay")
     recording = _recording(args)
@@ -415,7 +414,6 @@ def _refuse_times(args: argparse.Namespace, subcommand: str) -> None:
 
 
 def _files_to_write(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
-    """Return the parts to write, each of which becomes a file of its own."""
     parts = _parts(args)
     if args.new is not None and len(parts) > 1:
         raise UsageError(
@@ -515,10 +513,10 @@ def _when(text: str) -> When:
 
 @contextmanager
 def _progress(recording: Recording) -> Iterator[Callable[[int], None]]:
-    """Show the progress of the work on a recording on standard error, if that is a terminal.
+    """Show the progress of the work on a recording, if standard error is a terminal.
 
     Yield a function that the caller calls with the wall-clock time of the recording that the work
-    has reached, ns. The progress line is erased at the end.
+    has reached, ns.
     """
     if not sys.stderr.isatty():
         yield lambda wall_ns: None
@@ -547,10 +545,7 @@ def _written(new: Path) -> Iterator[None]:
 
 
 def _percent(recording: Recording) -> Callable[[int], None]:
-    """Return a function that prints the progress in percent, which the web page's server reads.
-
-    The function takes the wall-clock time of the recording that the work has reached, ns.
-    """
+    """Return a function of the wall-clock time, ns, that prints percentages for the web server."""
     last, began = read_end(recording.path), recording.about.wall_ns / 1e9
     end = last.last_ns / 1e9 if last else recording.path.stat().st_mtime
     told = 0

@@ -45,8 +45,8 @@ def of_each(
 ) -> dict[str, ServiceReply | AcsardError]:
     """Call a service of each robot in `ids` at the same time, and return the replies by robot id.
 
-    `call` gets a client of one robot and calls the service. If `ids` contains "*", all robots that
-    are present are called; raises `NoAnswerError` if no robot is present.
+    If `ids` contains "*", all robots that are present are called. Raises `NoAnswerError` if there
+    are none.
     """
     wanted = present(robot.session, ids, robot.where.endpoint) if ALL in ids else list(ids)
 
@@ -65,14 +65,9 @@ def print_each(
 ) -> int:
     """Print one line for the reply of each robot, and return the exit code.
 
-    Args:
-        replies: the replies of the robots.
-        robot: the client whose connection was used.
-        ids: the robots that the operator named; "*" names all of them.
-        silence: the line of a robot without an answer; `{error}` stands for the reason.
-        as_json: whether to print JSON.
-
-    The exit code is `UNREACHABLE` if a robot did not answer, else `FAILURE` if one refused.
+    The exit code is `UNREACHABLE` if a robot did not answer, else `FAILURE` if one refused. `ids`
+    are the ids that the operator named. `silence` is the line of a robot without an answer, in
+    which `{error}` stands for the reason.
     """
     for one, reply in replies.items():
         if isinstance(reply, AcsardError):

@@ -31,7 +31,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Run a router in a child process; with `--supervised`, run it in this process."""
     router, log = Router(args.file), Log(LogConfig())
     try:
         if not args.supervised:

@@ -71,7 +71,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def options(args: argparse.Namespace) -> dict[str, object]:
-    """Return the values of the options by dotted key; None for an option that is not given."""
+    """Return the options by dotted key; None for an option that is not given."""
     return {
         "mcu.port": args.port,
         "mcu.baud_rate": args.baud_rate,
@@ -138,8 +138,8 @@ def main(args: argparse.Namespace) -> int:
 def settings_file(where: str, config: Config, given: dict[str, object]) -> SettingsFile:
     """Return the `SettingsFile` at `where`, which reads the file as a restart would.
 
-    `config` is the configuration with which the daemon starts now. `given` maps dotted keys to the
-    values from the command line, which override the file.
+    `config` is the present configuration. `given` maps dotted keys to the values from the command
+    line, which override the file.
     """
     overrides = tables(given, by_environment())
     file = Path(where).absolute() if Path(where).is_file() else None
@@ -149,9 +149,8 @@ def settings_file(where: str, config: Config, given: dict[str, object]) -> Setti
 def page(config: Config, where: str) -> list[str] | None:
     """Return the arguments with which `acsard web` serves the robot's page, or None to serve none.
 
-    The daemon serves the page if `web.page` is set, standard output is a terminal, the daemon is
-    not a systemd service, and the libraries of the page are installed. `where` is the path of the
-    configuration file.
+    It is served if `web.page` is set, standard output is a terminal, the daemon is not a systemd
+    service, and the page's libraries are installed. `where` is the path of the configuration file.
     """
     looked_at = sys.stdout is not None and sys.stdout.isatty() and "INVOCATION_ID" not in os.environ
     there = find_spec("aiohttp") and find_spec("segno")
@@ -169,7 +168,6 @@ def page(config: Config, where: str) -> list[str] | None:
 
 
 def _bus(config: Config) -> str:
-    """Return the endpoints at which the daemon listens, or to which it connects as a client."""
     bus = config.bus
     if bus.mode == "client":
         return f"client of {', '.join(bus.connect)}"
@@ -195,10 +193,7 @@ def banner(
     """Return the banner that the daemon prints at its start.
 
     Args:
-        config: the configuration in force.
-        where: the path of the configuration.
-        device: the serial device.
-        trouble: why the device cannot be opened yet, or "".
+        trouble: why the serial device `device` cannot be opened yet, or "".
         reach: the options with which other tools find this daemon.
         served: whether the robot's web page is served.
     """

@@ -111,7 +111,6 @@ def _value(word: str) -> Plain:
 
 
 def _require_for_many(args: argparse.Namespace, settings: dict[str, Plain]) -> None:
-    """Raise `UsageError` if the options do not fit several robots."""
     if not settings:
         raise UsageError("name one robot in --id to list its settings")
     if args.write:
@@ -122,7 +121,7 @@ def _require_for_many(args: argparse.Namespace, settings: dict[str, Plain]) -> N
 
 
 def _until(settings: dict[str, Plain]) -> str:
-    """Return a text which says how long the settings stay in force."""
+    """Return a text which says until when the settings stay in force."""
     survives = "; a lowered limit survives the restart, except on the simulator"
     return f"until the next start{survives if any(map(stays, settings)) else ''}"
 
@@ -155,7 +154,6 @@ def _file(path: str | None, settings: dict[str, Plain]) -> Path:
 
 
 def _tell(config: object, as_json: bool) -> None:
-    """Print the settings that can be changed, with their present values."""
     now = {key: value for key, value in flat(config) if live(key)}
     if as_json:
         print(msgspec.json.encode(now).decode())

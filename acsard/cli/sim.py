@@ -52,13 +52,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _with_names() -> list[str]:
-    """Return the form of each fault that takes arguments, such as `bias=MOTOR:FACTOR`."""
     names = [form.partition("=")[::2] for form in forms()]
     return [f"{name}={NUMBERS.get(name, kinds)}" for name, kinds in names]
 
 
 def fault(text: str) -> NamedFault:
-    """Parse a fault with its arguments, such as `bias=a:0.9`. This function is an argparse type."""
+    """Parse a fault with its arguments, such as `bias=a:0.9`, as an argparse type."""
     try:
         return named(text)
     except ValueError as error:

@@ -104,7 +104,6 @@ def _add_router(actions: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 
 def _add_common(action: argparse.ArgumentParser) -> None:
-    """Add the options for the directory, the validity and the addresses of certificates."""
     action.add_argument(
         "--directory", type=Path, default=Path(TLS), metavar="DIR", help=f"default {TLS}"
     )
@@ -212,10 +211,9 @@ def _certified(names: list[str]) -> str:
 
 
 def _admit_service(directory: Path) -> None:
-    """Let the TLS gateway of the installed service use the certificates in `directory`.
+    """Let the installed TLS gateway use the certificates in `directory`, with a systemd drop-in.
 
-    This function writes a systemd drop-in, a file that extends the gateway's unit. It does nothing
-    if the service is not installed or this user is not root.
+    Does nothing if the service is not installed or this user is not root.
     """
     step = service.admitting(directory)
     if step is None:

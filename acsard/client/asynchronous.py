@@ -29,10 +29,7 @@ async def connect_async(
     source: str = "app",
     tls: str | None = None,
 ) -> AsyncIterator[AsyncClient]:
-    """Connect to a daemon from an asyncio program. The arguments are those of `connect`.
-
-    Opening and closing the connection do not block the event loop.
-    """
+    """Connect to a daemon without blocking the event loop. The arguments are those of `connect`."""
     where = await in_thread(lambda: address_by_environment(endpoint, robot_id, tls), 5.0)
     session = await in_thread(lambda: client_session(where.endpoint, where.tls), 10.0, late=close)
     robot = Client(session, where.robot_id, source, where.tls, where.endpoint)
@@ -43,19 +40,13 @@ async def connect_async(
 
 
 class AsyncClient:
-    """A client for asyncio programs, with methods like those of `Client`.
-
-    Create it with `connect_async`.
-    """
+    """A client with methods like those of `Client`. Create it with `connect_async`."""
 
     def __init__(self, client: Client) -> None:
         self._client = client
 
     def send(self, linear: float, angular: float = 0.0) -> None:
-        """Send one command: `linear` m/s, `angular` rad/s (left is +).
-
-        Repeat the call to keep the robot moving.
-        """
+        """Send one command: `linear` m/s, `angular` rad/s (left is +). Repeat it to keep moving."""
         self._client.send(linear, angular)
 
     async def drive(self, linear: float, angular: float = 0.0, *, seconds: float) -> None:

@@ -1,9 +1,9 @@
 """The rules for a sender of commands: what it sends and when, and why a command has no effect.
 
-This module is pure. Every program that commands the robot uses the time limits defined here. A
-program that forwards the commands of a person (`Wish`) uses a `Commander`. A `Commander` repeats no
-command, so the robot stops when the person, the panel or the network falls silent. A new command
-replaces one that has not been sent yet. A zero is sent however old it is. A drive ends with a zero.
+This module is pure. Every program that commands the robot uses these time limits. A program that
+forwards the commands of a person (`Wish`) uses a `Commander`, which repeats no command. So the
+robot stops when the person, the panel or the network falls silent. A new command replaces one that
+has not been sent yet. A zero is sent however old it is. A drive ends with a zero.
 """
 
 from __future__ import annotations
@@ -19,53 +19,39 @@ SEND_PERIOD_S = 0.05
 default timeout of 0.25 s."""
 
 SPACING_S = 0.003
-"""Shortest pause between two commands on one connection, s.
-
-The daemon accepts 1000 commands per second, and drops commands that come faster.
-"""
+"""Shortest pause between two commands on one connection, s. The daemon drops commands that come
+faster than 1000 per second."""
 
 AGAIN_S = 0.02
-"""Pause before a zero is sent a second time, s.
-
-The first zero may be lost: a busy daemon receives several commands at once, and drops some of them
-because they seem to come too fast.
-"""
+"""Pause before a zero is sent a second time, s. The first zero may be lost: a busy daemon that
+receives several commands at once drops some, because they seem to come too fast."""
 
 OPENING_S, OPENING_PERIOD_S = 0.4, 0.01
-"""Duration and period of the zeros at the beginning of a drive, s.
-
-The daemon checks for 0.25 s whether the commands of a new sender are late. With many zeros in this
-time, the jitter of a busy machine does not prolong the check.
-"""
+"""Duration and period of the zeros at the beginning of a drive, s. The daemon checks for 0.25 s
+whether the commands of a new sender are late. With many zeros in this time, the jitter of a busy
+machine does not prolong the check."""
 
 OPENED_S = 4.0
-"""Time within which the daemon must accept the zeros at the beginning of a drive, s.
-
-If the source has a long timeout, the daemon checks the delay of a new sender for up to 2 s. The
-rest of the time lets another sender finish its drive.
-"""
+"""Time within which the daemon must accept the zeros at the beginning of a drive, s. If the source
+has a long timeout, the daemon checks the delay of a new sender for up to 2 s. The rest of the time
+lets another sender finish its drive."""
 
 ZEROS = 3
 """Number of zeros that a sender sends at the end, in case the network loses one."""
 
 GRACE_S = 0.5
-"""Longest time for which commands may have no effect, s. After that, the program informs the
-operator, or ends the drive.
-
-The time is longer than the first 0.25 s of a new sender, in which its commands never have an
-effect. It is also longer than a short delay of a known sender.
-"""
+"""Longest time for which commands may have no effect, s, before the program informs the operator or
+ends the drive. It exceeds the first 0.25 s of a new sender, whose commands have no effect yet, and
+a short delay of a known sender."""
 
 SILENCE_NS = 3 * NS_PER_S // 10
-"""Time without a command after which the robot brakes, ns. It is a little longer than the default
-timeout of a source, 0.25 s."""
+"""Time without a command after which the robot brakes, ns: a little more than a source's default
+timeout of 0.25 s."""
 
 GATHER_NS = NS_PER_S // 25
-"""Time for which the first command after a silence is held, ns, to see whether a burst follows.
-
-A panel that sends at 20 Hz sends at most one command in this time. After a burst of more than
-`CROWD` commands, the next command waits again.
-"""
+"""Time for which the first command after a silence is held, ns, to see whether a burst follows. A
+panel that sends at 20 Hz sends at most one command in this time. After a burst of more than `CROWD`
+commands, the next command waits again."""
 
 CROWD = 5
 """Largest number of commands that a panel sends within `GATHER_NS`: five at 125 Hz. If more arrive,
@@ -93,7 +79,7 @@ class Wish(Struct, frozen=True):
     twist: Twist
     stamp_ns: int | None = None
     steady: bool = False
-    """True if the clock of `stamp_ns` is never adjusted."""
+    """Whether the clock of `stamp_ns` is never adjusted."""
 
 
 class Commander:
@@ -109,22 +95,18 @@ class Commander:
 
     def __init__(self, *, leads: bool = False, gathers: bool = False) -> None:
         self.replaced = self.stale = 0
-        """Numbers of commands that were not sent.
-
-        `replaced` counts those that a newer command replaced. `stale` counts those that were too
-        old or came in a burst.
-        """
+        """Numbers of commands that were not sent. `replaced`: a newer command came. `stale`: they
+        were too old or came in a burst."""
         self._leads, self._gather_ns = leads, GATHER_NS if gathers else 0
         self._wish: Wish | None = None
         self._last = Wish(REST)
-        """The newest command, whether it has been sent or not."""
+        """The newest command, sent or not."""
         self._came_ns = 0
         self._heard_ns: int | None = None
         self._lead = False
         self._hold_until_ns = 0
         self._burst = 0
-        """Number of commands that have arrived during the wait after a silence (`GATHER_NS`).
-        `send` resets it to 0."""
+        """Number of commands in the wait after a silence (`GATHER_NS`); `send` resets it."""
         self._crowded = False
         """Whether the last burst had more than `CROWD` commands."""
         self._moved_ns: int | None = None
@@ -185,8 +167,8 @@ class Commander:
         """Discard the command that waits, and end the drive of this sender.
 
         Returns a zero to send if the robot may still follow a nonzero command of this sender, else
-        None. `timeout_s` is the timeout of the sender's source, s. After that time a zero would
-        only stop the next sender that drives.
+        None. `timeout_s` is the timeout of its source, s; later, a zero would only stop the next
+        sender.
         """
         moved_ns, self._moved_ns = self._moved_ns, None
         self._wish = self._asked_ns = None

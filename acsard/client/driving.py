@@ -118,10 +118,7 @@ def _opening(checks: _Drive) -> Iterator[float]:
 
 
 def _stopping(checks: _Drive) -> Iterator[float]:
-    """Send zeros until the robot stands, or no longer slows down because something else moves it.
-
-    The generator yields the pauses between the zeros, s.
-    """
+    """Send zeros until the robot stands, or something else moves it. Yield the pauses, s."""
     begun = since = time.monotonic()
     watch, slowest = checks.watch, math.inf
     while since + SLOWS_S > (now := time.monotonic()) or watch.age(now) > QUIET_S:
@@ -151,14 +148,11 @@ class _Drive:
         now = self._fine = time.monotonic()
         self.watch = Watch(robot, now)
         self.objection: str | None = None
-        """Why the robot does not follow, according to the last state.
-
-        It is "" if the robot follows, and None before the first state.
-        """
+        """Why the robot does not follow; "" if it follows, None before the first state."""
 
     @property
     def hopeless(self) -> bool:
-        """True if the daemon will keep refusing the commands, so that waiting cannot help."""
+        """Whether the daemon will keep refusing the commands, so that waiting cannot help."""
         state = self.watch.state
         return state is not None and hopeless(state, self._robot.source)
 
@@ -170,10 +164,7 @@ class _Drive:
             raise NoAnswerError(CLOSED) from None
 
     def look(self) -> None:
-        """Process the states that have arrived.
-
-        Raises `NoAnswerError` if the daemon has been silent for too long.
-        """
+        """Process the states that have arrived. Raises `NoAnswerError` after a long silence."""
         now, watch = time.monotonic(), self.watch
         try:
             news = watch.look(now)

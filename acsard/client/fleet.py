@@ -1,8 +1,8 @@
 """Follows many robots: whether each daemon is present, its newest state and its version.
 
-A daemon is present while Zenoh shows its liveliness token. Zenoh's threads store the newest state
-of each robot undecoded, and the thread that reads the rows decodes it. Of the methods that this
-thread calls repeatedly, only `ask` may wait for the bus.
+A daemon is present while Zenoh shows its liveliness token. Zenoh's threads store the newest states
+undecoded, and the thread that reads the rows decodes them. Of the methods that this thread calls
+repeatedly, only `ask` may wait for the bus.
 """
 
 from __future__ import annotations
@@ -26,8 +26,7 @@ from acsard.daemon.bus.subscription import encoded
 from acsard.host.mailbox import Mailbox
 
 MOST = 1000
-"""Maximum number of robots. The bound is needed because any client of the bus can invent robot
-names."""
+"""Maximum number of robots, because any client of the bus can invent robot names."""
 
 
 class Row(Struct, frozen=True):
@@ -41,12 +40,10 @@ class Row(Struct, frozen=True):
     """Age of `state`, s; inf before a state has proved that the daemon runs."""
     version: str
     silent: bool = False
-    """True if no state of the robot has arrived for so long that it counts as silent."""
+    """Whether the robot counts as silent, because no state has arrived for long enough."""
 
 
 class _Known:
-    """The data that `Fleet` stores for one robot. Zenoh's threads replace each value as a whole."""
-
     def __init__(self) -> None:
         self.here: bool | None = None
         self.version = ""
@@ -55,10 +52,7 @@ class _Known:
         self.begin()
 
     def begin(self) -> None:
-        """Begin to follow the robot, or begin again because it has reappeared.
-
-        Its queries are then due at once.
-        """
+        """Begin to follow the robot, or begin again when it reappears. Its queries are then due."""
         self.since = self.info_due = time.monotonic()
         self.follower = Follower(self.since, FLEET_ASK_S)
         self.follower.due = self.since
@@ -112,10 +106,7 @@ class Fleet:
             return [self._row(name, one, now) for name, one in self._known.items()]
 
     def due(self) -> list[tuple[str, str]]:
-        """Return the queries that are due, as pairs of robot id and key, for a call of `ask`.
-
-        This also sets the times of the next queries.
-        """
+        """Return the due queries for `ask`: pairs of robot id and key. Plan the next queries."""
         now, due = time.monotonic(), []
         with self._lock:
             for name, one in self._known.items():

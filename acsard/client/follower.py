@@ -1,11 +1,11 @@
 """Follows the `state` of one robot: its newest value, its age, and whether the daemon is silent.
 
-`Follower` is pure, and `Watch` connects it to the bus. All programs that follow `state` use the
-time limits of this module, so they all report a silent robot equally soon.
+`Follower` is pure, and `Watch` connects it to the bus. All programs use the time limits of this
+module, so they all report a silent robot equally soon.
 
-A router may have a storage, which answers queries too. For a robot that is off, it answers with the
-robot's last state. A published state never comes from a storage, so it always proves that the
-daemon runs. An answer to a query proves this only if it is newer than an earlier state.
+A storage of a router answers queries too: for a robot that is off, with the last state. A published
+state never comes from a storage, so it always proves that the daemon runs. An answer to a query
+proves this only if it is newer than an earlier state.
 """
 
 from __future__ import annotations
@@ -22,15 +22,14 @@ from acsard.daemon.bus.subscription import QUEUED, Subscription, encoded
 from acsard.host.mailbox import Mailbox
 
 ASK_S = 0.3
-"""Time without a new state, s, after which the client queries `state`. The query is needed if the
-robot is configured to publish its state seldom."""
+"""Time without a new state, s, after which the client queries `state`. A robot may be configured to
+publish its state seldom."""
 
 QUIET_S = 0.5
 """Age of a state, s, above which a program must not base an action on the state."""
 
 SILENT_S = 1.0
-"""Age of the last state, s, above which the robot counts as silent. Then a drive ends, and programs
-that show the robot report the silence."""
+"""Age of the last state, s, above which the robot counts as silent, and a drive ends."""
 
 FIRST_S = 2.0
 """Time, s, within which the first message on a key arrives if the robot works normally."""
@@ -42,8 +41,7 @@ The time is longer than `ASK_S`, because such a program sends many queries."""
 STATE = "state"
 
 ANSWERS = 16
-"""Maximum number of replies that wait to be processed. A query gets one reply from the daemon and
-one from each storage."""
+"""Maximum number of waiting replies. The daemon and each storage send one reply to a query."""
 
 STEADY = ("lines", "lines_sent", "commands")
 """Names of counters in `state` that decrease only when the daemon restarts."""
@@ -54,10 +52,8 @@ class Follower:
 
     def __init__(self, now: float, ask_s: float = ASK_S) -> None:
         self.state: RobotState | None = None
-        """The newest state, or None before the first one.
-
-        Until `heard` is true, the state may be an old one from the storage of a router.
-        """
+        """The newest state, or None before the first one. Until `heard` is true, it may be an old
+        one from the storage of a router."""
         self.heard = False
         """Whether any state has proved that the daemon runs (see `answered`)."""
         self.last_seen = now
@@ -150,7 +146,7 @@ class Watch(Follower):
         if wake is not None:
             self._states.wakes(wake)
         self._answers = Mailbox[zenoh.Sample](ANSWERS)
-        """Replies to queries that a thread of Zenoh has put here, and that `look` processes."""
+        """Replies to queries, which a thread of Zenoh puts here."""
 
     def look(self, now: float) -> list[RobotState]:
         """Process the states that have arrived, and return the new ones.
@@ -185,10 +181,10 @@ class Watch(Follower):
             return None
 
     def objection(self, source: str, sender: str, now: float) -> str:
-        """Return why the commands of `sender` as `source` have no effect.
+        """Return why the commands of `sender` as `source` have no effect at the time `now`, s.
 
         Returns "" if the robot follows them, and before the first state. `source` is the name of a
-        command source, `sender` is the public name of the sender, and `now` is the present time, s.
+        command source, and `sender` is the public name of the sender.
         """
         if self.silent(now):
             return (

@@ -23,26 +23,21 @@ class Outbox:
     """The senders that command the robot, and the thread that sends their commands."""
 
     def __init__(self, dropped: Callable[[], object] = lambda: None) -> None:
-        """Start the thread.
-
-        The thread calls `dropped` for each command that has become too old to be sent.
-        """
+        """Start the thread, which calls `dropped` for each command that is too old to be sent."""
         self._dropped = dropped
         self._senders: dict[Commander, Put] = {}
         self._zeros: list[tuple[Put, Wish]] = []
         self._news = Condition()
         self._busy = self._ended = False
         self.dead: Future[Never] = Future()
-        """Future of the thread. If an exception ends the thread, the future has this exception, and
-        no command is sent any more."""
+        """Future with the exception that ended the thread, if any; then nothing is sent."""
         self._thread = Thread(target=self._live, name="outbox", daemon=True)
         self._thread.start()
 
     def take(self, commander: Commander, put: Put, wish: Wish) -> int | None:
         """Queue a command of the sender `commander`, to be sent by `put` on the thread.
 
-        Returns the time since the sender's previous command, ns, or None if that time was short
-        (see `Commander.take`).
+        Returns the time since the sender's previous command, ns, or None (see `Commander.take`).
         """
         with self._news:
             silence = commander.take(wish, clock.mono_ns())

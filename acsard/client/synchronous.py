@@ -82,7 +82,7 @@ def connect(
 
 
 def close(session: zenoh.Session) -> None:
-    """Close a session, and ignore the error of Zenoh if the other side is stuck."""
+    """Close a session. Ignore the error of Zenoh if the other side is stuck."""
     try:
         session.close()
     except zenoh.ZError:
@@ -92,17 +92,16 @@ def close(session: zenoh.Session) -> None:
 class _Puts:
     """Keeps a minimum pause between the commands on one connection.
 
-    The daemon accepts 1000 commands a second per connection and key, and drops others. So it would
-    drop a zero that is sent directly after another command. All clients of one connection share one
-    instance, because the other command may come from any of them.
+    The daemon accepts 1000 commands a second per connection and key, so it would drop a zero that
+    directly follows another command. All clients of a connection share one instance, because the
+    other command may come from any of them.
     """
 
     def __init__(self) -> None:
         # The lock is reentrant: a signal handler may also send while the same thread holds it.
         self._lock, self._next_s = threading.RLock(), 0.0
         self.moving: dict[Client, float] = {}
-        """The clients whose last command was not zero, each with the time of that command, s on the
-        monotonic clock."""
+        """The clients whose last command was not zero, with its time, s on the monotonic clock."""
 
     def wait(self) -> None:
         with self._lock:
@@ -148,9 +147,9 @@ class Client:
 
     @property
     def caller(self) -> str:
-        """The sender id that this client attaches to service calls and queries: `name/SECRET`.
+        """The sender id in this client's service calls and queries: `name/SECRET`.
 
-        The daemon's log shows a public name instead, which does not reveal the secret.
+        The daemon's log shows a public name without the secret.
         """
         return sender_id(self.name, self._secret)
 
@@ -173,7 +172,7 @@ class Client:
     def command_key(self, source: str) -> str:
         """Return the key, below the robot's id, on which this client puts commands as `source`.
 
-        Over TLS each certificate has a key of its own.
+        Over TLS it differs for each certificate.
         """
         return command_key("cmd", source, self.certificate)
 
@@ -181,8 +180,8 @@ class Client:
         """Send one command: `linear` m/s, `angular` rad/s (left is +).
 
         Repeat the call to keep the robot moving. The first call sends a zero instead, because the
-        daemon requires a zero before it follows a sender. `stamp_ns` is for a program that forwards
-        commands: the time at which the command was made, by the clock of its origin, ns.
+        daemon requires a zero before it follows a sender. A program that forwards commands sets
+        `stamp_ns` to the time of the command by the clock of its origin, ns.
         """
         if self._opened:
             self._put(linear, angular, stamp_ns)
@@ -193,8 +192,8 @@ class Client:
     def end(self) -> None:
         """Close the connection, as `connect` does at the end of its block.
 
-        First send a zero to each robot that may still follow a client of this connection. Without
-        the zero, a robot would drive on until the timeout of the source, which may be 10 s.
+        First send a zero to each robot that may still follow a client of this connection. Otherwise
+        the robot would drive on until the timeout of the source, which may be 10 s.
         """
         begun_s = time.monotonic()
         # After the longest timeout a zero would only stop the next sender that drives.
@@ -236,9 +235,9 @@ class Client:
         """Call a service, such as "stop", with the fields of its payload.
 
         `clear` releases the stop or fault that `state` shows at the time of the call, and
-        `activate` switches on a robot that is switched off at that time. If a person decided on
-        the call by an earlier state, pass `latch=state.latch` of that state. The daemon then
-        refuses the call if the robot has been stopped or switched off again since then.
+        `activate` switches on a robot that is off at that time. If a person decided by an earlier
+        state, pass `latch=state.latch` of that state. The daemon then refuses the call if the robot
+        has been stopped or switched off again since then.
         """
         if service in ("clear", "activate") and "latch" not in fields:
             fields["latch"] = self.get("state").latch
@@ -247,10 +246,10 @@ class Client:
     def set(self, settings: Mapping[str, Plain], *, keep: bool = False) -> schema.ServiceReply:
         """Change settings until the next start of the daemon, for example `{"rates.state": 5.0}`.
 
-        The daemon changes all of the settings or none. If a speed, acceleration or jerk in `limits`
-        is lowered, it stays lowered after the next start. With `keep`, the daemon also writes the
-        settings into its configuration file. The reply then names the file, or says why the
-        settings are refused or not written.
+        The daemon changes all of the settings or none. A lowered speed, acceleration or jerk in
+        `limits` stays lowered after the next start. With `keep`, the daemon also writes the
+        settings into its configuration file. The reply names the file, or says why the settings are
+        refused or not written.
         """
         fields: dict[str, object] = {"settings": settings}
         return self.request("set", fields | {"keep": True} if keep else fields)
@@ -312,10 +311,7 @@ class Client:
         return Subscription(self._queue(name), self.key(name))
 
     def ask(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
-        """Query a key without waiting for the reply.
-
-        If a reply arrives, `take` is called with it on a thread of Zenoh.
-        """
+        """Query a key without waiting. `take` is called with a reply on a thread of Zenoh."""
         self.session.get(
             self.key(name),
             lambda reply: take(reply.ok) if reply.ok is not None else None,
@@ -334,10 +330,9 @@ class Client:
     def put(
         self, twist: schema.Twist | schema.TwistStamped, signature: Signature, source: str = ""
     ) -> None:
-        """Send a command of another sender, which `signature` identifies.
+        """Forward a command of another sender, which `signature` identifies.
 
-        This is for a program that forwards commands. `source` is the command source; "" means the
-        source of this client.
+        `source` is the command source; "" means the source of this client.
         """
         self._puts.wait()
         self._publish(twist, signature, source or self.source)
@@ -414,7 +409,7 @@ class Client:
         return UsageError(f"{name!r} is not a key; `acsard topics` lists them")
 
     def _unanswered(self, name: str) -> MendableError:
-        """Return the error for a query of the key `name` that got no reply; the text says why."""
+        """Return the error for a query of the key `name` without a reply; the text says why."""
         key, no_answer = name.partition("?")[0], f"no answer on {self.key(name)}"
         if unknown(key):
             return NoAnswerError(f"{no_answer}: {key} is not in the topic table ({key_hint(key)})")
@@ -438,8 +433,8 @@ class Client:
     def unheard(self, error: UnheardError | NoAnswerError) -> MendableError:
         """Return the error to raise in place of `error`, which ended a drive or a query.
 
-        The result is one of the errors that `acsard.client` documents. If this client's role may be
-        the reason, the text of the error also names the role.
+        It is one that `acsard.client` documents, and names this client's role if that may be the
+        reason.
         """
         if isinstance(error, UnheardError) and not self.where.tls:
             return NotDrivenError(str(error))

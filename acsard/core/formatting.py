@@ -1,8 +1,6 @@
 """Formats texts and values for people; pure.
 
 Untrusted text must pass `printable`, `lines` or `json_line` before it is written to a terminal.
-This module formats the counts, durations and signed numbers of all messages, so that they look the
-same everywhere.
 """
 
 from __future__ import annotations
@@ -14,15 +12,12 @@ from itertools import accumulate
 
 
 def printable(text: str) -> str:
-    """Return the text on one line, without control characters that a terminal would obey.
-
-    White space becomes a space, and any other unprintable character becomes U+FFFD.
-    """
+    """Return the text on one line: white space becomes " ", other unprintable characters U+FFFD."""
     return "".join(" " if c.isspace() else c if c.isprintable() else "\ufffd" for c in text)
 
 
 def lines(text: str) -> str:
-    """Return a text of several lines with each line made `printable`. The line breaks stay."""
+    """Return a text with each of its lines made `printable`."""
     return "\n".join(map(printable, text.split("\n")))
 
 

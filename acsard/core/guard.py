@@ -1,4 +1,4 @@
-"""Checks every outgoing line a second time, with code of its own.
+"""Checks every outgoing line a second time, independently of the code that made the line.
 
 The guard shares no code with `limits.py`, `codec.py` or `checksum.py`. It parses the finished bytes
 in the same way as the MCU, and passes a line only if all of these conditions hold:
@@ -9,15 +9,12 @@ in the same way as the MCU, and passes a line only if all of these conditions ho
 - No wheel is faster than in the last line sent, unless there is a fresh command, the link is up and
   the mode is `driving` (rule 2 of `acsard/README.md`).
 - Without a link, all wheel speeds are zero.
+- All wheel speeds are zero if the robot must be at rest by now. This is so after the longest ramp
+  to rest since the last fresh command, and after the longest stop since a stop, a fault or a
+  shutdown. `MARGIN_NS` is added to each of the two times.
 
-Otherwise the guard replaces the line with the stop line. It returns the reason, and the robot
-latches a fault.
-
-The guard also checks that the robot comes to rest in time. A ramp from full speed to rest takes a
-known time with the configured decelerations. When this time and `MARGIN_NS` have passed since the
-last fresh command, only zero speeds pass. After a stop, a fault or a shutdown the time is that of a
-ramp at the stop decelerations. The guard remembers when these times began, so a recording stores
-the guard's `Memory` beside the state of the robot.
+Otherwise the guard replaces the line with the stop line, and the robot latches a fault. The guard
+remembers when the two times began, so a recording stores its `Memory`.
 """
 
 from __future__ import annotations
@@ -51,26 +48,22 @@ class Memory(Struct, frozen=True):
     last: bytes = b""
     """The last line that was written to the serial port; empty before the first one."""
     commanded_ns: int | None = None
-    """Monotonic time of the last step with a fresh command in mode `driving`, ns. None before the
-    first such step."""
+    """Monotonic time of the last step with a fresh command in mode `driving`, ns, if any."""
     halted_ns: int | None = None
     """Monotonic time at which the mode became one of `HALTED`, ns. None in any other mode."""
     ramp_ns: int = 0
-    """Longest time that the robot may need from full speed to rest, ns. It covers all limits that
-    were in force since the robot was last at rest."""
+    """Time of a ramp from full speed to rest, ns. It is the longest with all limits that were in
+    force since the robot was last at rest."""
     stop_ramp_ns: int = 0
-    """Longest time, ns, that a stop from full speed may take. It is the largest of the times with
-    each set of limits that was in force since the robot was last at rest."""
+    """Time of a stop from full speed, ns. It is the longest with all limits that were in force
+    since the robot was last at rest."""
 
 
 class Guard:
     """Checks each line to the board, and replaces a forbidden line with the stop line (zeros)."""
 
     def __init__(self, stop: bytes, config: Config, memory: Memory | None = None) -> None:
-        """Start with the memory of an earlier guard, or with an empty one if `memory` is None.
-
-        `stop` is the stop line without a checksum, which an MCU obeys in any state.
-        """
+        """Start. `stop` is the stop line without a checksum, which an MCU obeys in any state."""
         self._stop = stop
         memory = memory or Memory()
         self._last = memory.last
@@ -79,10 +72,7 @@ class Guard:
         self.use(config)
 
     def use(self, config: Config) -> None:
-        """Use `config` for all later checks.
-
-        Until the robot is at rest, the longer one of the old and the new ramp times applies.
-        """
+        """Use `config` from now on. Until rest, the longer of the two ramp times applies."""
         self._require_check = config.mcu.link_check == "require"
         self._most = int(config.limits.wheel_speed * 100 + 1)
         self._timeouts = {s.name: s.timeout * 1e9 for s in config.commands.sources}
@@ -100,10 +90,7 @@ class Guard:
         self._note_limits()
 
     def check(self, outputs: Outputs) -> tuple[bytes | None, str]:
-        """Return the line to send, and why the guard replaced the line of `outputs`.
-
-        The line is None if `outputs` contains none. The reason is "" if the line is unchanged.
-        """
+        """Return the line to send, if any, and why the guard replaced it ("" if it did not)."""
         if outputs.mode == "driving":
             if self._commanded(outputs):
                 self._commanded_ns = outputs.now.mono_ns
@@ -119,7 +106,6 @@ class Guard:
         return (self._stop, trip) if trip else (line, "")
 
     def _note_limits(self) -> None:
-        """Update the longest ramp times. A moving robot may still brake by its previous limits."""
         if _wheels(self._last) == _ZERO:
             self._longest = self._ramps
         else:
@@ -148,7 +134,6 @@ class Guard:
         return ""
 
     def _late(self, now_ns: int) -> bool:
-        """Return whether the robot must be at rest by now."""
         (ramp_ns, stop_ramp_ns), since_ns = self._longest, self._commanded_ns
         if since_ns is None or now_ns - since_ns > ramp_ns + MARGIN_NS:
             return True
@@ -215,11 +200,7 @@ def _wheels(line: bytes) -> Wheels | None:
 
 
 def _crc(data: bytes) -> int:
-    """Return the CRC-16/XMODEM, computed with bit shifts as in the notes of avr-libc.
-
-    It shares no code with the module that computed the checksum of the line, so it reveals an error
-    in that module.
-    """
+    """Return the CRC-16/XMODEM, computed with bit shifts as in the notes of avr-libc."""
     crc = 0
     for byte in data:
         x = crc >> 8 ^ byte

@@ -2,9 +2,9 @@
 
 A step updates the odometry with the feedback, chooses one command, checks that the mode allows it,
 limits it, converts it to wheel speeds and reports. It does no I/O: its inputs are time, bytes and
-commands, and its outputs are decisions. The memory of a robot is in `Robot` and its parts. Only a
-step changes this memory, except that the control loop adds to `counters`. The control loop reads
-and writes the port, and `core/guard.py` checks each line before it is written.
+commands, and its outputs are decisions. Only a step changes the memory of `Robot`, except that the
+control loop adds to `counters`. The control loop reads and writes the port, and `core/guard.py`
+checks each line before it is written.
 """
 
 from __future__ import annotations
@@ -62,8 +62,7 @@ stall of the process. If 1.5 control periods are longer, that time applies inste
 
 UNHEARD_S = WATCHDOG_S - 0.05
 """If no line was written to the port for this time, s, the next speeds start from rest, because the
-MCU has stopped the motors by itself. The MCU does so after `WATCHDOG_S` by its own clock, and that
-clock may run a little fast: hence the 0.05 s."""
+MCU has stopped the motors after `WATCHDOG_S`. Its clock may run a little fast: hence the 0.05 s."""
 
 HALTED = (Mode.STOPPED, Mode.FAULT, Mode.SHUTDOWN)
 """Modes in which the robot brakes at the stop deceleration."""
@@ -71,8 +70,7 @@ HALTED = (Mode.STOPPED, Mode.FAULT, Mode.SHUTDOWN)
 NS_PER_MS = 1_000_000
 
 MAX_TEXT = 200
-"""Largest number of characters that the robot keeps of a refusal's text. The text may quote a
-message from any client."""
+"""Largest number of characters of a refusal's text, which may quote a message of any client."""
 
 
 class Robot:
@@ -107,30 +105,23 @@ class Robot:
         self._choice = Choice()
         self._speeds = STILL
         self._made_of: tuple[int | None, Mode] | None = (None, self._life.mode)
-        """The command's arrival time and the mode that determined the last computed line.
-
-        The time is monotonic, in ns, and None without a command. After a press of the emergency
-        stop or of a bumper, the whole value is None, so that a new line is due at once.
-        """
+        """Arrival of the command, monotonic ns, and mode that determined the last computed line.
+        After a press of the emergency stop or a bumper, the whole value is None, so that a new line
+        is due at once."""
         self._made_ns = 0
         """Monotonic time at which the last line was computed, ns."""
         self._made = self._said = (self._limiter.state, 0)
-        """Two pairs: a state of the limiter, and the monotonic time of that state, ns.
-
-        `_made` belongs to the last line that was computed, and `_said` to the last line that was
-        written to the port. If a line was not written, `_settle` resets `_made` to `_said`.
-        """
+        """States of the limiter with their monotonic times, ns. `_made` belongs to the last
+        computed line, and `_said` to the last line written to the port. `_settle` undoes a line
+        that was not written."""
         self._status = ("", "", "", "")
         self._battery_level = ""
         """The level of the battery in the previous step, "" before its first report."""
         self.counters: Counter[str] = Counter()
-        """Counters since the start, by name.
-
-        `commands` counts accepted commands, and `command_<reason>` counts refused commands by
-        reason. `commands_of_new_senders` counts the commands of senders whose delay is still being
-        checked. Other counters count events. The control loop adds the counters of the port and
-        of the bus.
-        """
+        """Counters since the start. `commands` counts accepted commands, and `command_<reason>`
+        refused ones. `commands_of_new_senders` counts the commands of senders whose delay is still
+        being checked. Other counters count events. The control loop adds the counters of the port
+        and of the bus."""
         self._refused = ""
         self._refused_ns: int | None = None
         self._sanity = Sanity(config.feedback)
@@ -140,20 +131,14 @@ class Robot:
         self._answered = UnansweredLines(config.mcu.reply_period)
         self._tally = EventThrottle()
         self._asked: tuple[str, str, int | None] = ("", "", None)
-        """Verb, client and time of the last request, so that a repetition is not logged again.
-
-        For example, each stop arrives twice: on a key of its own, and as a query.
-        """
+        """Verb, client and time of the last request: each stop arrives twice but is logged once."""
         self._told = CommandEvents(self._life.mode)
         self._port_trouble = ""
         self._linked_once = False
         self._arbiter.require_neutral()
 
     def snapshot(self, now_ns: int) -> Snapshot:
-        """Return the values for the messages `state` and `diagnostics`.
-
-        Do not call this in every step: it is slow. `now_ns` is the present monotonic time.
-        """
+        """Return the values for `state` and `diagnostics`. This is too slow for every step."""
         session, since, silent = self.session, self._refused_ns, self.session.silent(now_ns)
         counters = {"lines": session.good_lines} | self._odometry.missed()
         counters |= {f"line_{reason}": count for reason, count in session.rejects.items() if count}
@@ -380,11 +365,7 @@ class Robot:
         return shown(self.session.status) | {"age_s": f"{age_s:.1f}"}
 
     def _believe(self, line: Feedback, now: Instant, events: list[Event]) -> Estimate | None:
-        """Update the odometry with a feedback line, and return the new estimate.
-
-        Return None if the reported values are physically impossible. Several impossible lines in a
-        row latch a fault.
-        """
+        """Update the odometry and return the estimate, or None if the line is impossible."""
         why = self._sanity.impossible(line)
         if self._sanity.warning is not None:
             events.append(self._sanity.warning)

@@ -42,10 +42,7 @@ class _Bin(NamedTuple):
 
 
 class Curve:
-    """A value over time, divided into bins, which are intervals of time of equal width.
-
-    Each bin keeps its lowest and its highest value with their times.
-    """
+    """A value over time. Each bin, an interval of time, keeps its lowest and its highest value."""
 
     def __init__(self, most: int = MOST_BINS) -> None:
         self._most, self._bins = most, list[_Bin]()
@@ -110,16 +107,10 @@ class Span(NamedTuple):
 
 
 class Band:
-    """A state over time, as a list of time spans.
-
-    If there are too many spans, short ones are merged with their neighbours.
-    """
+    """A state over time, as time spans. If there are too many, short ones are merged."""
 
     def __init__(self, ranks: Sequence[str], most: int = MOST_SPANS) -> None:
-        """Create an empty band.
-
-        When two spans are merged, the kind that is earlier in `ranks` wins.
-        """
+        """Create an empty band. When spans are merged, the kind earlier in `ranks` wins."""
         self._rank = {kind: at for at, kind in enumerate(ranks)}
         self._most, self._least = most, FIRST_WIDTH
         self._spans: list[Span] = []

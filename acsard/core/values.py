@@ -1,8 +1,7 @@
-"""The value types of acsard, in SI units, that every other module uses.
+"""The value types that all modules share, in SI units and with the wheel order `WHEELS`.
 
-This module holds frozen values without behaviour beyond simple arithmetic on themselves. It reads
-no clock, does no I/O and decides nothing. Types with `gc=False` are never part of a reference
-cycle. Wheel order is `WHEELS` everywhere.
+This module reads no clock, does no I/O and decides nothing. Types with `gc=False` are never part of
+a reference cycle.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ ROOT = "acsard"
 """The first part of every native (non-ROS) key: `acsard/<robot.id>/...`."""
 
 Role = Literal["viewer", "operator", "maintainer"]
-"""Permission of a client on the bus. Each role includes those before it."""
+"""Role of a client on the bus. Each role has the permissions of the roles before it."""
 
 ROLES: tuple[Role, ...] = get_args(Role)
 
@@ -38,10 +37,7 @@ class Instant(Struct, frozen=True, gc=False):
 
 
 class Twist(Struct, frozen=True, gc=False):
-    """Velocity of base_link, expressed in base_link.
-
-    `linear` is along x in m/s. `angular` is about z in rad/s, and positive to the left.
-    """
+    """Velocity of base_link: `linear` along x, m/s, and `angular` about z to the left, rad/s."""
 
     linear: float = 0.0
     angular: float = 0.0
@@ -84,10 +80,7 @@ class PoseCovariance(Struct, frozen=True, gc=False):
 
 
 class TwistVariances(Struct, frozen=True, gc=False):
-    """Variances of the twist of one feedback line, expressed in base_link.
-
-    `linear` is along x and `lateral` along y, both in m2/s2. `angular` is in rad2/s2.
-    """
+    """Variances of one feedback line's twist in base_link: m2/s2, and rad2/s2 for `angular`."""
 
     linear: float
     lateral: float
@@ -102,17 +95,13 @@ class Received(Struct, frozen=True):
 
 
 class Command(Struct, frozen=True):
-    """A velocity that one sender requests. Three attributes identify its origin:
+    """A velocity that one sender requests.
 
-    - source: the command source, one of `commands.sources`, such as `app` for the key `cmd/app`.
-    - sender: the public name of the program that sent the command, as far as it is known. Two
-      programs that use the same source are two senders.
-    - clock: the clock that gave `stamp_ns`. The stamp comes from the sender's attachment, from
-      Zenoh or from the header of the message.
-
-    `arrived_ns` is the monotonic time of arrival, ns, and the age is computed from it alone.
-    `stamp_ns` is the time of sending by `clock`, ns. That clock is not synchronized with the
-    daemon's clock.
+    - source: one of `commands.sources`, such as `app` for the key `cmd/app`.
+    - sender: public name of the program that sent the command, as far as it is known.
+    - arrived_ns: monotonic time of arrival, ns. The age is computed from it alone.
+    - stamp_ns: time of sending, ns, by a clock that is not synchronized with the daemon's.
+    - clock: name of the clock that gave `stamp_ns`.
     """
 
     source: str
@@ -122,21 +111,12 @@ class Command(Struct, frozen=True):
     clock: str = ""
     sender: str = ""
     cancelled: bool = False
-    """Whether the sender requested speeds, but they result in a zero twist.
-
-    An example is a speed along the y axis, in which the robot cannot move. Such a command does not
-    count as the zero that a sender must send first.
-    """
+    """Whether the requested speeds are not zero but result in a zero twist, such as a speed along
+    y. Such a command does not count as the zero that a sender must send first."""
     sequence: int | None = None
-    """Number of this command, counted by its sender; None if it has none.
-
-    A gap in the numbers means that commands were lost.
-    """
+    """Number of this command, counted by its sender; None without one. Gaps mean lost commands."""
     shared: bool = False
-    """Whether several programs may share this `sender`.
-
-    This is true for commands through a bridge, and for a sender of which only the key is known.
-    """
+    """Whether programs may share this `sender`: through a bridge, or if only the key is known."""
     ros: bool = False
     """Whether the command came from ROS. ROS tools do not send a zero command by themselves."""
     stamp_replaced: bool = False
@@ -158,10 +138,8 @@ class Request(Struct, frozen=True):
     id: int = 0
     pose: Pose | None = None
     asked_ns: int | None = None
-    """Monotonic time at which the request arrived, ns; None means the time of the step.
-
-    It is needed because a `clear` must not undo a stop that arrived after it.
-    """
+    """Monotonic time at which the request arrived, ns; None means the time of the step. A `clear`
+    needs it, because it must not undo a stop that arrived later."""
     by: str = ""
     """Name of the client that sent the request, as `core/incoming/commands.py` forms it."""
     settings: dict[str, Plain] = {}
@@ -179,11 +157,7 @@ class Answer(Struct, frozen=True):
 
 
 class Refusal(Struct, frozen=True):
-    """A command that the daemon refuses.
-
-    `reason` is a short name; `command_<reason>` is the counter of such refusals. `text` is for
-    people. `source` and `sender` are "" if they are unknown.
-    """
+    """A refused command, counted in `command_<reason>`. Unknown `source` and `sender` are ""."""
 
     reason: str
     text: str
@@ -215,11 +189,7 @@ Level = Literal["info", "warning", "error"]
 
 
 class Event(Struct, frozen=True):
-    """An event for the log.
-
-    `text` is for people. If many events have the same name, `event_throttle.py` combines those of
-    each second into one line.
-    """
+    """An event for the log. `event_throttle.py` joins those of one name into one line a second."""
 
     name: EventName
     text: str
@@ -246,44 +216,29 @@ class Estimate(Struct, frozen=True, gc=False):
     """Wheel angles since the start, rad, continuous, in `WHEELS` order."""
     speeds: WheelSpeeds
     asked_ns: int | None = None
-    """Monotonic time, ns, at which the daemon wrote the command line that the feedback answers.
-
-    None if it is unknown which command line the feedback answers.
-    """
+    """Monotonic time at which the daemon wrote the command line that the feedback answers, ns. None
+    if it is unknown which line the feedback answers."""
     heard_ns: int = 0
     """Monotonic time, ns, at which the daemon had received the complete feedback line."""
 
 
 class Wait(Struct, frozen=True):
-    """The condition that a command source waits for before it drives the robot.
-
-    `what` names the condition, and the other fields give its details.
-    `core/motion/arbiter_text.py` makes a sentence of them.
-    """
+    """The condition that a command source waits for (`arbiter_text.py` makes a sentence of it)."""
 
     what: Literal[
         "nothing", "command", "proof", "late", "neutral", "zeros", "higher", "equal", "senders"
     ]
     source: str = ""
-    """The command source that the condition `what` is about.
-
-    Depending on `what`, this source must send a zero (`neutral`), must show that its delays are
-    steady (`proof`), sends late commands (`late`), or sends only zeros (`zeros`). For `higher` and
-    `equal` it drives the robot, and has a higher or an equal priority.
-    """
+    """The source that the condition is about. It must send a zero (`neutral`), must show that its
+    delays are steady (`proof`), sends late commands (`late`), sends only zeros (`zeros`), or drives
+    the robot with a higher or an equal priority (`higher`, `equal`)."""
     seconds: float = 0.0
-    """A duration, s, whose meaning depends on `what`.
-
-    `neutral`: a sender with a shared identity must send no speed for this time after its zero.
-    `proof`: the delays must be steady for this time. `late`: commands arrive later than this.
-    """
+    """A duration, s. `neutral`: a shared sender must send no speed for this time after its zero.
+    `proof`: the delays must be steady for this time. `late`: commands arrive later than this."""
     senders: int = 0
     """Number of senders that wait while the robot follows another sender of the same source."""
     lasts: float = 0.0
-    """Time for which the wait has lasted, s, rounded down to one of a few values.
-
-    Without the rounding it would change with each step.
-    """
+    """Duration of the wait, s, rounded down to a few values so that it seldom changes."""
     kept: str = ""
     """The source that sends speeds but must wait for `source`, which sends only zeros."""
     ros: bool = False
@@ -293,10 +248,7 @@ class Wait(Struct, frozen=True):
 
 
 class SourceStatus(Struct, frozen=True):
-    """The state of one command source.
-
-    `age_s` is the time since its last accepted command, s, or None before the first one.
-    """
+    """A command source. `age_s` is the time since its last accepted command, None without one."""
 
     name: str
     priority: int
@@ -314,13 +266,9 @@ class WheelsStatus(Struct, frozen=True):
     slipping: tuple[str, ...] = ()
     """The sides that slip, `left` and `right`, now or within the last half second."""
     differ: tuple[float, float] = (0.0, 0.0)
-    """Learned fraction by which the front wheel turns more than the rear wheel.
-
-    The first value is for the left side, and the second one for the right side.
-    """
+    """Learned fraction by which the front wheel turns more than the rear wheel, left and right."""
     slow: tuple[str, ...] = ()
-    """The wheels that turn too slowly in the commanded direction, each with its share of the
-    expected speed."""
+    """Wheels slow in the commanded direction, each with its share of the expected speed."""
 
 
 class RoutersStatus(Struct, frozen=True):
@@ -352,18 +300,12 @@ GyroDoes = Literal[
     "off", "waiting for rest", "used", "silent", "disagrees",
     "reversed", "in degrees", "dead", "not believed",
 ]  # fmt: skip
-"""The state of the gyro.
-
-The odometry takes the heading from the gyro only in the states `used` and `disagrees`.
-`disagrees` means that the wheels slip.
-"""
+"""The state of the gyro. The odometry takes the heading from the gyro only in the states `used` and
+`disagrees`. `disagrees` means that the wheels slip."""
 
 TrackUse = Literal["shown", "uncertain", "too far off", "used"]
 """Whether the odometry uses the effective track that it learned from a gyro, or why it does not.
-
-The effective track is the distance between left and right wheels with which the odometry computes
-the true turn. With any value except `used`, the odometry uses the configured distance.
-"""
+The effective track is the distance between left and right wheels that gives the true turn."""
 
 
 class GyroStatus(Struct, frozen=True):
@@ -411,11 +353,8 @@ class Latch(Struct, frozen=True):
     """One latch: a stop, a fault or the robot being switched off."""
 
     number: int
-    """Number that identifies the latch: normally the time at which it was set, ms since 1970.
-
-    If an earlier latch has that number or a larger one, a still larger one is used. The number is
-    unique across restarts, and JavaScript represents it exactly.
-    """
+    """Identifies the latch across restarts: the time at which it was set, ms since 1970, or a
+    larger number if an earlier latch has that one. JavaScript represents it exactly."""
     at_ns: int
     """Wall-clock time at which the latch was set, ns since 1970."""
     by: str
@@ -457,10 +396,9 @@ class Latches(Struct, frozen=True):
 class Inputs(Struct, frozen=True):
     """The complete input of one control step.
 
-    If `tick` is true, the step computes the line that the board gets in each control period. If
-    `at_once` is true, the step may compute an extra line for a new command or mode. If both are
-    false, it computes no line. `opened` counts how often the serial port was opened: a new number
-    means a new session with the board.
+    If `tick` is true, the step computes the line of a control period. If `at_once` is true, it may
+    compute an extra line for a new command or mode. `opened` counts how often the serial port was
+    opened: a new number means a new session with the board.
     """
 
     now: Instant
@@ -476,8 +414,7 @@ class Inputs(Struct, frozen=True):
     refusals: tuple[Refusal, ...] = ()
     """The messages from the bus that were refused before they became a `Command`."""
     guard_trip: str = ""
-    """Why the guard replaced the previous line with STOP; "" if it did not. If it did, this step
-    latches a fault."""
+    """Why the guard replaced the last line with STOP, which latches a fault; "" if it did not."""
     superseded: bool = False
     """Whether the line of the previous step was not written to the port, and so had no effect."""
     missed: int = 0
@@ -488,10 +425,8 @@ class Inputs(Struct, frozen=True):
     shutting_down: bool = False
     """Whether the daemon is going down. The robot then ramps to zero and stays there."""
     late_ns: int = 0
-    """Time from the start of the previous step to the writing of its line, ns; 0 if it was normal.
-
-    It is longer than normal if the process stalled in between.
-    """
+    """Time from the start of the previous step to the writing of its line, ns, if the process
+    stalled in between; 0 otherwise."""
 
 
 class Outputs(Struct, frozen=True):
@@ -515,8 +450,7 @@ class Outputs(Struct, frozen=True):
     command_ns: int | None
     """Monotonic arrival time of the command that the robot follows, ns; None without one."""
     status_changed: bool
-    """Whether `mode`, `reason`, `link`, `source` or the battery's level has changed since the
-    previous step."""
+    """Whether `mode`, `reason`, `link`, `source` or the battery's level changed in this step."""
     events: tuple[Event, ...] = ()
     answers: tuple[Answer, ...] = ()
     news: bool = False
@@ -564,10 +498,8 @@ class Snapshot(Struct, frozen=True):
     refused: str
     """The last command that was refused and the reason, "" before the first one."""
     refused_age_s: float | None = None
-    """Seconds since the last refused command, None before the first one.
-
-    A command that is refused only because its sender is new does not count.
-    """
+    """Seconds since the last refused command, None before the first one. A command that is refused
+    only because its sender is new does not count."""
     feedback_age_s: float | None = None
     """Seconds since the last valid line of the board, None before the first one."""
     missed_last_minute: int = 0
@@ -578,10 +510,7 @@ class Snapshot(Struct, frozen=True):
     doubt: WheelsStatus = WheelsStatus()
     estop: EstopState = ""
     bumpers: tuple[bool, ...] | None = None
-    """Whether each bumper counts as pressed, in the order of the board.
-
-    None if the board has never reported its bumpers.
-    """
+    """Whether each bumper counts as pressed, in the order of the board; None if never reported."""
     bumper: str = ""
     """Why a bumper counts as pressed, in words; "" while none does."""
     battery: BatteryStatus | None = None
@@ -591,17 +520,11 @@ class Snapshot(Struct, frozen=True):
     check: str = "plain"
     """The checksum that the serial lines carry, in words; "plain" without one."""
     encoders: tuple[int, ...] = ()
-    """Configured encoder counts per wheel turn, in `WHEELS` order.
-
-    0 means that no number is configured, or that the board does not compute its speeds as a whole
-    number of counts divided by a time.
-    """
+    """Configured encoder counts per wheel turn, in `WHEELS` order. 0 if none is configured, or if
+    the board does not compute its speeds as a whole number of counts divided by a time."""
     sender: str = ""
     """The sender whose command the robot follows, "" without one."""
     routers: RoutersStatus = RoutersStatus()
     recording: Recording = Recording()
     latch_file: str | None = None
-    """Why the latches would not survive a restart, in words; "" if they would survive it.
-
-    None if the daemon does not store its latches.
-    """
+    """Why the latches would not survive a restart; "" if they would, None if not stored."""

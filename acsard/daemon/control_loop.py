@@ -64,13 +64,11 @@ QUERIES_PER_STEP = 8
 a flood of queries does not cost a period."""
 
 LATE_NS = 1_000_000
-"""Shortest delay that is passed to the robot, ns. A delay runs from the start of a step to the
-write of its line. Most delays are shorter and are passed as 0, because the sample times are not
-that accurate."""
+"""Shortest delay that is passed to the robot, ns: from the start of a step to the write of its
+line. A shorter delay is passed as 0, because the sample times are not that accurate."""
 
 NOT_STORED = "the disk has not stored this yet; until then, a restart may lose a stop"
-"""Text that is added to an answer if the disk is slow and the answer no longer waits for the latch
-file."""
+"""Text added to an answer that no longer waits for the latch file, because the disk is slow."""
 
 BUS_STUCK = Event("bus_stuck", "the bus accepts no messages; driving goes on", "warning")
 
@@ -100,23 +98,14 @@ class ControlLoop:
         """Create the robot.
 
         Args:
-            config: the configuration with which the daemon has started.
-            info: the daemon's fixed data, which the key `info` returns.
-            port: the serial port.
-            bus: the bus.
-            start: time of the daemon's start.
-            log: writes an event to the log.
-            mono_ns: returns the monotonic time, ns.
             certificate_ends: wall-clock time at which each certificate expires, ns since 1970, by
                 the name of the certificate. None or empty without TLS.
             others: events of the daemon's other parts. Each step takes them and empties the list.
             beside: returns the present value of a key that another part of the daemon publishes,
                 or None for any other key.
             adopted: called with each configuration that comes into force after the start.
-            recorder: the black box, or None.
             latches: the latches with which the robot starts.
             keeper: keeps the latches over a restart. With None they are not kept.
-            settings_file: the configuration file, or None.
             late_watch: names the causes of late periods, or None.
         """
         self.robot = Robot(config, latches)
@@ -130,16 +119,12 @@ class ControlLoop:
         self._config, self._adopted, self._settings_file = config, adopted, settings_file
         self._recorder, self._handover = recorder, Handover(latches, keeper)
         self._started, self._speed = config.limits, SpeedLimiter(self.robot.config)
-        """The limits at the start of the daemon, and the handler of the messages on the key
-        `speed_limit`."""
+        """The limits at the start of the daemon, and the handler of the key `speed_limit`."""
         self._kept: tuple[Latches, LimitsConfig, LimitsConfig, Latches] | None = None
-        """Cache of `_to_keep`: the latches and the two sets of limits of its last computation, and
-        the latches that it returned."""
+        """Cache of `_to_keep`: the latches and limits of its last computation, and the result."""
         self._step_answers: tuple[Answer, ...] = ()
-        """The answers of the present step to requests."""
         self._answers: deque[tuple[int, Answer]] = deque()
-        """Answers that wait until the latches are in the latch file. Each comes with the monotonic
-        time at which it was queued, ns."""
+        """Answers that wait for the latch file, and the monotonic times of their queueing, ns."""
         self._got = NOTHING
         """The input that the present step has taken from the bus."""
         stop = self.robot.session.codec.stop
@@ -155,9 +140,8 @@ class ControlLoop:
         """Gyro samples that have arrived since the last step."""
         self._port, self._bus, self._log, self._mono_ns = port, bus, log, mono_ns
         self._superseded, self._trip, self._late_ns = False, "", 0
-        """Three facts about the last line, for the inputs of the next step: whether the line was
-        superseded, why the guard replaced it ("" if it did not), and the delay from the start of
-        its step to its write, ns (0 below `LATE_NS`)."""
+        """Three facts about the last line: whether it was superseded, why the guard replaced it (""
+        if it did not), and its delay from the start of its step, ns (0 below `LATE_NS`)."""
         # Use the longest line of both directions, because answers must not queue in the MCU either.
         period_ns = int(NS_PER_S / config.rate_hz)
         self._pace = Pace(wire_ns(config.mcu.line_bytes, config.mcu.baud_rate), period_ns)
@@ -170,20 +154,14 @@ class ControlLoop:
         return outputs is not None and not any(outputs.speeds.as_tuple())
 
     def totals(self, now_ns: int) -> dict[str, float]:
-        """Return the values of the log line `ended`: run time in s, distance in m, counters.
-
-        `now_ns` is the monotonic time.
-        """
+        """Return the values of the log line `ended`: run time in s, distance in m, counters."""
         seconds, metres = (now_ns - self._start_ns) / NS_PER_S, self.robot.travelled
         shot = self.robot.snapshot(now_ns)
         return {"seconds": round(seconds, 1), "metres": round(metres, 2), **shot.counters}
 
     @property
     def retry_ns(self) -> int | None:
-        """Monotonic time at which the waiting command gets its step, ns; None if no command waits.
-
-        A command that comes too soon after a line must wait.
-        """
+        """Monotonic time at which the waiting command gets its step, ns; None if none waits."""
         return self._pace.retry_ns(self._port.sent_ns) if self._pace.waits else None
 
     @property
@@ -192,11 +170,7 @@ class ControlLoop:
         return self._pace.listens
 
     def step(self, now: Instant, period: Period = NO_PERIOD) -> Outputs:
-        """Run one control step at the time `now`.
-
-        `period` says how many periods have ended since the last step, and when the first of them
-        was due. It is `NO_PERIOD` for a step between two periods.
-        """
+        """Run one control step. `period` is `NO_PERIOD` for a step between two periods."""
         self._got = NOTHING
         try:
             return self._step(now, period)
@@ -267,11 +241,7 @@ class ControlLoop:
         return outputs
 
     def _decided(self, inputs: Inputs) -> tuple[Outputs, bool]:
-        """Run the robot's step and send its line.
-
-        Return the outputs, and whether the line was written. The black box gets the step even if
-        this method raises.
-        """
+        """Run the step and send its line. Return the outputs, and whether the line was written."""
         try:
             outputs = self.outputs = self.robot.step(inputs)
             self._step_answers = self._speed.settle(
@@ -321,7 +291,6 @@ class ControlLoop:
         self._handover.take_stops(self._handover.latches, _stops(self._bus.take(0)), now)
 
     def _adopt(self, config: Config) -> None:
-        """Pass the robot's new configuration to the parts that depend on it."""
         self._config = config
         self._guard.use(config)
         self.report.use(config)
@@ -400,11 +369,9 @@ class ControlLoop:
             self._others.append(BUS_STUCK)
 
     def _served(self, query: Query, now: Instant, refusals: list[Refusal]) -> Request | None:
-        """Answer a query, or return the request in it if the robot must decide about that request.
+        """Answer a query and return None, or return its request for the robot to decide.
 
-        A query that contains no request is answered at once. A `set` with `keep` goes to the
-        configuration file first. In both cases the method returns None. If the query is refused,
-        the refusal is added to `refusals`.
+        A `set` with `keep` goes to the settings file first. A refusal is added to `refusals`.
         """
         try:
             served = self._queries.serve(query, self._current, self.outputs)
@@ -424,10 +391,7 @@ class ControlLoop:
         return None
 
     def _keep(self, request: Request, now: Instant) -> None:
-        """Let the settings file check whether it can store the settings of a `set` with `keep`.
-
-        Refuse `request` if there is no configuration file.
-        """
+        """Pass a `set` with `keep` to the settings file. Refuse it if there is no settings file."""
         if self._settings_file is None:
             text = "nothing is set: this daemon has no configuration file; leave out `keep`"
             self._answers.append((now.mono_ns, Answer(request.id, False, text)))
@@ -435,10 +399,7 @@ class ControlLoop:
             self._settings_file.keep(request, now.mono_ns)
 
     def _keepable(self, now: Instant) -> tuple[Request, ...]:
-        """Return each `set` with `keep` that the configuration file can store.
-
-        Queue the answers to the requests that were refused or that have been written to the file.
-        """
+        """Return each `set` with `keep` that the file can store. Queue the answers to others."""
         if self._settings_file is None:
             return ()
         results = self._settings_file.results(now.mono_ns, self._others)
@@ -446,10 +407,7 @@ class ControlLoop:
         return tuple([one for one in results if isinstance(one, Request)])
 
     def _send(self, outputs: Outputs, now: Instant, tick: bool) -> bytes | None:
-        """Offer the line to the port. Return the line if the port wrote it, else None.
-
-        The next step passes the result to the robot. `tick` is true for the line of a period.
-        """
+        """Offer the line to the port. Return the line if the port wrote it, else None."""
         line, self._trip = self._guard.check(outputs)
         self._superseded, self._late_ns = False, 0
         if line is None:
@@ -491,10 +449,7 @@ class ControlLoop:
             self._log(event)
 
     def _answer(self, now: Instant, *, last: bool = False) -> None:
-        """Send the answers whose latches are stored, and those that have waited for `ANSWER_NS`.
-
-        If `last` is true, send all answers.
-        """
+        """Send answers whose latches are stored or that waited `ANSWER_NS`; all if `last`."""
         held, before_ns = self._handover.held, now.mono_ns - ANSWER_NS
         trouble = "" if held else self._handover.trouble or NOT_STORED
         while self._answers and (held or last or self._answers[0][0] < before_ns):

@@ -44,8 +44,7 @@ from acsard.host.version import version
 from acsard.recording.recorder import Recorder
 
 EXIT_RAMP_S = 0.6
-"""Time limit of the ramp to zero at the shutdown, s. After it the daemon sends STOP, even if the
-wheels still turn."""
+"""Time limit of the ramp to zero at the shutdown, s. After it, STOP is sent in any case."""
 
 
 class Departure:
@@ -58,10 +57,7 @@ class Departure:
         self.hurried = False
 
     def __enter__(self) -> Self:
-        """Handle the signals that end the daemon.
-
-        SIGHUP is one of them, because closing the terminal must stop the wheels too.
-        """
+        """Handle the signals that end the daemon, including SIGHUP from a closed terminal."""
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
             loop.add_signal_handler(number, self._signal, number)
@@ -72,10 +68,7 @@ class Departure:
         return kind is asyncio.CancelledError and self.begun_ns is not None
 
     def started(self) -> None:
-        """Record that the start is complete.
-
-        A signal before this call cancels the start. A signal after it begins the ramp.
-        """
+        """Record that the start is complete. Before this call, a signal cancels the start."""
         self._starting = None
 
     def _signal(self, number: signal.Signals) -> None:
@@ -89,10 +82,7 @@ class Departure:
         self._wake()
 
     def over(self, now_ns: int, at_rest: bool) -> bool:
-        """Return whether the shutdown's ramp has ended, was cut short or has taken too long.
-
-        `now_ns` is the monotonic time. `at_rest` is true if the last step commanded zero speed.
-        """
+        """Return whether the shutdown's ramp has ended, was cut short or has taken too long."""
         if self.begun_ns is None:
             return False
         return at_rest or self.hurried or now_ns - self.begun_ns > EXIT_RAMP_S * NS_PER_S
@@ -108,7 +98,7 @@ query the last sample of a latched topic."""
 
 Announce = Callable[[str, str], None]
 """Callback that runs when the start is complete. Its arguments are the path of the serial device,
-and the reason why the device is not open. The reason is "" for an open device."""
+and the reason why it is not open ("" if it is open)."""
 
 
 async def run(
@@ -122,14 +112,11 @@ async def run(
     """Run until a signal; raise a `MendableError` if the daemon cannot start.
 
     Args:
-        config: The configuration.
-        log: The log.
-        announce: Called once when everything runs.
-        gateway: Arguments of the `acsard gateway` process, which this daemon starts if
+        announce: called once when everything runs.
+        gateway: arguments of the `acsard gateway` process, which this daemon starts if
             `bus.outside` names endpoints. None if the gateway is a service of its own.
-        page: Arguments of the `acsard web` process, or None for no page.
-        settings_file: The configuration file. The daemon compares it with the settings in force,
-            and stores settings in it. None to do neither.
+        page: arguments of the `acsard web` process, or None for no page.
+        settings_file: the configuration file, to compare and store settings. None to do neither.
     """
     wake = Wakeup()
     manager = Systemd(os.environ, os.getpid())
@@ -210,11 +197,7 @@ async def run(
 def _recorder(
     config: Config, log: Callable[[Event], None], wall_ns: int, stack: AsyncExitStack
 ) -> Recorder | None:
-    """Return the black box, which records every step, or None if `[record] directory` is empty.
-
-    `stack` closes it. `log` queues an event. `wall_ns` is the wall-clock time of the daemon's
-    start, ns since 1970.
-    """
+    """Return the black box, which `stack` closes; None if `[record] directory` is empty."""
     if not config.record.directory:
         return None
     recorder = Recorder(config, log, wall_ns)
@@ -269,11 +252,7 @@ async def _control(
     wake: Wakeup,
     manager: Systemd,
 ) -> None:
-    """Run control steps until the shutdown is over.
-
-    Each period gets a step. Other events, such as received bytes, get steps of their own
-    (`wakeup.py`).
-    """
+    """Run a control step in each period and after other events, until the shutdown is over."""
     # Let each of the other tasks run once first. This first round is slow, and must end before the
     # first period.
     await asyncio.sleep(0)

@@ -4,11 +4,10 @@ A latch is a stop, a fault or "inactive", which lasts until a person releases it
 keeps the limits that `set` has lowered. `latch_rules.py` decides with which latches the robot
 starts.
 
-One thread writes the file, and a second thread syncs it to the disk. The control loop only hands
-the newest latches to the first thread, and never waits for the disk. Once the first thread has
-renamed the new file, a kill of the process loses nothing. Once the second thread has synced the
-file, a power cut loses nothing. There are two threads, because a sync takes up to seconds on an SD
-card, and a stop must not wait for the sync of earlier latches.
+The control loop hands the newest latches to a thread that writes the file, and never waits for the
+disk. Once this thread has renamed the new file, a kill of the process loses nothing. A second
+thread syncs the file; after that a power cut loses nothing. There are two threads, because a sync
+takes up to seconds on an SD card, and a stop must not wait for the sync of earlier latches.
 """
 
 from __future__ import annotations
@@ -68,11 +67,7 @@ NO_PLACE = "no directory"
 
 
 def place(config: Config, environ: Mapping[str, str]) -> Path:
-    """Return the path of this robot's latch file.
-
-    Raises:
-        OSError: Neither the configuration nor the environment names a directory.
-    """
+    """Return the path of this robot's latch file. Raise `OSError` if nothing names a directory."""
     name = f"{config.robot.id}.latches.json"
     try:
         if config.control.state_directory:
@@ -99,7 +94,6 @@ class LatchFile:
     """The latch file of one robot. Call `start` once, then `keep` after every change."""
 
     def __init__(self, config: Config, environ: Mapping[str, str]) -> None:
-        """Find the path of the file from the configuration and the environment of the process."""
         self.where = NO_PLACE
         """Path of the file for messages, or `NO_PLACE`."""
         self._path: Path | None = None
@@ -114,18 +108,16 @@ class LatchFile:
         self._lock = -1
         """Descriptor of the lock that keeps other daemons away from the latch file."""
         self._disk = threading.Lock()
-        """Lock for the disk. The thread that uses the disk holds it. The control loop never takes
-        it."""
+        """Held by the thread that uses the disk. The control loop never takes it."""
         self._abandoned = False
         """True if `start` has given up waiting for the first read of the file."""
         self._found: Latches | None = None
         """The latches that the file contained at the start; None until the file has been read."""
         self._blind = False
-        """True if the robot has started without the content of the file. The writing thread reads
-        the file before its first write, and then sets this to False."""
+        """True while the writing thread must still read a file that the start did not read in
+        time."""
         self._missed = Latches()
-        """Latches that are in the file but not in the robot, because the start could not read the
-        file in time."""
+        """Latches in the file that the robot lacks, because the start could not read it in time."""
         self._box = Mailbox[Latches](1)
         """The newest latches that `keep` was given, until the writing thread takes them."""
         self._news = Mailbox[Event](EVENTS)
@@ -139,7 +131,7 @@ class LatchFile:
         self._syncing_ns: int | None = None
         """Monotonic time at which the present sync began, ns; None between two syncs."""
         self._hung = False
-        """True while the last report about the disk says that it hangs. `news` sets it."""
+        """True if the last event about the disk reported that the disk hangs. `news` sets this."""
         self._renamed = Mailbox[Latches](1)
         """The newest latches in the file, until the syncing thread takes them."""
         self._threads: tuple[threading.Thread, ...] = ()
@@ -150,10 +142,7 @@ class LatchFile:
     async def start(self, now: Instant) -> Latches:
         """Read the file, try to write it, and return the latches with which the robot starts.
 
-        `now` is the time of the start.
-
-        Raises:
-            InUseError: another daemon uses this file for a robot with the same id.
+        Raises `InUseError` if another daemon uses this file for a robot with the same id.
         """
         try:
             latches = await in_thread(lambda: self._look(now), START_S)
@@ -185,7 +174,6 @@ class LatchFile:
         return latches
 
     def _look(self, now: Instant) -> Latches:
-        """Read the file, try to write it, and return the latches that the robot starts with."""
         with self._disk:
             if self._abandoned:
                 return Latches()
@@ -247,10 +235,7 @@ class LatchFile:
     # The control loop calls the methods below.
 
     def keep(self, latches: Latches) -> None:
-        """Hand the latches that are now in force to the writing thread, without waiting for it.
-
-        If several sets of latches wait, the thread writes only the newest.
-        """
+        """Hand the latches in force to the writing thread, which writes only the newest ones."""
         self._handed = latches
         self._box.put(latches)
 
@@ -265,7 +250,6 @@ class LatchFile:
             time.sleep(0.001)
 
     def news(self) -> list[Event]:
-        """Return the events since the last call."""
         if self._hangs is not self._hung:
             self._hung = not self._hung
             if self._hung:
@@ -322,10 +306,7 @@ class LatchFile:
             self._box.wait(None if latches is None else RETRY_S)
 
     def _try(self, latches: Latches, now: Instant) -> str:
-        """Write these latches, and report a failure.
-
-        Return the reason of a failure, or "". `now` is the time of the daemon's start.
-        """
+        """Write these latches and report a failure. Return its reason, or ""."""
         self._busy_ns = clock.mono_ns()
         with self._disk:
             if self._blind:
@@ -402,11 +383,7 @@ class LatchFile:
         return ""
 
     def _with_missed(self, latches: Latches) -> Latches:
-        """Return these latches together with the missed ones.
-
-        The missed latches come into force at the next start. A missed stop is not among them,
-        because the robot has started stopped anyway.
-        """
+        """Add the missed latches for the next start, except a stop: the robot started stopped."""
         missed = self._missed
         if latches.fault is not None:
             missed = replace_fields(missed, fault=None)

@@ -1,8 +1,8 @@
 """The rules of the latch file: its content, and the latches with which the daemon starts.
 
-If the latch file cannot be read or cannot be written, the robot starts stopped until `clear`. It
-does not matter how the previous process ended, because each latch is written when it is set and not
-when the process ends. This module is pure; `latch_file.py` reads and writes the file.
+If the latch file cannot be read or cannot be written, the robot starts stopped until `clear`. Each
+latch is written when it is set, so it does not matter how the process ends. This module is pure;
+`latch_file.py` reads and writes the file.
 """
 
 from __future__ import annotations
@@ -26,10 +26,8 @@ MAX_TEXT = 500
 """Largest number of characters of a name or a reason in the file. A longer text is cut off."""
 
 ANSWER_NS = NS_PER_S // 5
-"""Longest time for which the answer to a stop waits for the latch file, ns.
-
-With a slow disk, a longer wait would make a client believe that the robot did not receive the stop.
-"""
+"""Longest time for which the answer to a stop waits for the latch file, ns. A longer wait would
+make a client believe that the robot did not receive the stop."""
 
 BY = "acsard"
 """Name in place of a client's name in a stop that the daemon itself sets."""
@@ -58,12 +56,10 @@ def encode(robot: str, latches: Latches) -> bytes:
 def decode(robot: str, data: bytes) -> Latches:
     """Return the latches in the content of a robot's latch file, each marked as kept.
 
-    Every prefix of a valid file is refused, because a power cut may leave a part of a file. A file
-    with a missing or an unknown field name is refused too, because a damaged name must not make a
-    stop disappear.
-
-    Raises:
-        LatchFileError: The content is damaged, of another version or of another robot.
+    Raises `LatchFileError` for content that is damaged, of another version or of another robot.
+    Every prefix of a valid file is refused, because a power cut may leave a part of a file. A
+    missing or unknown field name is refused too, because a damaged name must not make a stop
+    disappear.
     """
     if not data.strip(b"\0 \r\n"):
         raise LatchFileError("it is empty")
@@ -102,12 +98,8 @@ def unwritable(where: str, reason: str) -> str:
 def stopped(latches: Latches, why: str, now: Instant, by: str = BY, before: int = -1) -> Latches:
     """Return these latches with a stop. If they have a stop already, return them unchanged.
 
-    Args:
-        latches: the latches to change.
-        why: text of the stop.
-        now: time of the stop.
-        by: the client that asked for the stop, or `BY` for the daemon itself.
-        before: the number of the last stop before this one, or -1 if there was none.
+    `by` is the client that asked for the stop, or `BY` for the daemon itself. `before` is the
+    number of the last stop before this one, or -1 if there was none.
     """
     if latches.stop is not None:
         return latches
@@ -122,11 +114,6 @@ def doubted(latches: Latches, why: str, now: Instant) -> Latches:
     The previous process may have set latches that the file lacks. So the robot starts stopped, and
     each latch of the file gets a new number. A `clear` or `activate` that names an old number has
     no effect then, because its sender may not know of the lost latches.
-
-    Args:
-        latches: the latches in the file.
-        why: text of the stop, for a file without a stop.
-        now: time of the start.
     """
     found = latches.fault, latches.inactive, latches.stop
     kept = max((latch.number for latch in found if latch), default=-1)
@@ -138,10 +125,7 @@ def doubted(latches: Latches, why: str, now: Instant) -> Latches:
 
 
 class LatchKeeper(Protocol):
-    """The storage that keeps the latches over a restart.
-
-    Only the method `wait` waits for the disk.
-    """
+    """The storage that keeps the latches over a restart. Only `wait` waits for the disk."""
 
     def keep(self, latches: Latches) -> None:
         """Store these latches, which are in force from now on. Only the newest ones are written."""
@@ -180,11 +164,10 @@ class Handover:
                 self._keeper.keep(latches)
 
     def take_stops(self, latches: Latches, by: list[str], now: Instant) -> None:
-        """Hand these latches to the keeper, with a stop if some stops came after the last step.
+        """Hand these latches to the keeper, with a stop if `by` is not empty.
 
-        `by` names the clients of the stops that no control step has processed. If it is empty, no
-        stop is added. The added stop has a new number, so that a `clear` of an earlier stop does
-        not release it.
+        `by` names the clients of the stops that no control step has processed. The added stop has a
+        new number, so that a `clear` of an earlier stop does not release it.
         """
         if by:
             before = -1 if latches.stop is None else latches.stop.number
@@ -198,15 +181,11 @@ class Handover:
         return self._keeper is None or self._keeper.holds(self.latches)
 
     def wait(self) -> None:
-        """Wait until the latches are stored, but at most `ANSWER_NS`.
-
-        Call this only at the end of the daemon, because it blocks.
-        """
+        """Block until the latches are stored, at most `ANSWER_NS`. Call this only at the end."""
         if self._keeper is not None:
             self._keeper.wait(self.latches, ANSWER_NS / NS_PER_S)
 
     def news(self) -> list[Event]:
-        """Return the events of the keeper since the last call."""
         return [] if self._keeper is None else self._keeper.news()
 
     @property

@@ -1,10 +1,9 @@
 """Names the cause of a late control period from the kernel's counters. This module is pure.
 
-`CAUSES` is the table of causes, and each cause has a rule. The rule compares the counters from
-before the lateness with those after it. It returns a clause for a sentence, or "" if its cause does
-not apply. If the counters show a duration, the cause applies only if the duration is at least
-`SHARE` of the lateness. Otherwise the small delays of normal load would count as causes. Several
-causes may apply to one lateness, or none.
+Each cause in the table `CAUSES` has a rule that compares the counters from before the lateness with
+those after it. It returns a clause for a sentence, or "" if its cause does not apply. A duration
+counts only if it is at least `SHARE` of the lateness. Otherwise the small delays of normal load
+would count as causes. Several causes may apply to one lateness, or none.
 
 The kernel also reports how the control loop's thread spent the lateness: it ran, it was ready and
 waited for a processor, or it slept. A slow processor delays only a thread that runs or waits for a
@@ -55,11 +54,9 @@ class Lateness(Struct, frozen=True, omit_defaults=True):
     before: Reading
     after: Reading
     busiest: Program | None = None
-    """The process that used the processor most, from a search at about the time of the lateness.
-    None without a search, or if no process used it much."""
+    """The process that used the processor most; None without a search, or if none used it much."""
 
     def explains(self, duration_ns: int, share: float = SHARE) -> bool:
-        """Return whether a duration is at least the share `share` of the lateness."""
         return duration_ns >= share * self.late_ns
 
     @property
@@ -83,10 +80,7 @@ class Cause(Struct, frozen=True):
 
 
 def suspended(late: Lateness) -> str:
-    """Return the clause for a computer that was suspended, or "".
-
-    Two clocks show it: CLOCK_BOOTTIME runs on during a suspend, and CLOCK_MONOTONIC does not.
-    """
+    """Return the clause for a suspend, in which only CLOCK_BOOTTIME runs on, or ""."""
     asleep_ns = late.after.asleep_ns - late.before.asleep_ns
     return (
         f"this computer was suspended for {_seconds(asleep_ns)}"
@@ -96,11 +90,7 @@ def suspended(late: Lateness) -> str:
 
 
 def undervoltage(late: Lateness) -> str:
-    """Return the clause for a low supply voltage, or "".
-
-    The voltage is too low if the hwmon chip `rpi_volt` reports an alarm (in0_lcrit_alarm), or if
-    bit 0 of the Raspberry Pi's get_throttled is set.
-    """
+    """Return the clause for a low supply voltage (`rpi_volt` or `get_throttled`), or ""."""
     return low_voltage(late.after.conditions) if late.computed else ""
 
 
@@ -120,10 +110,7 @@ def heat(late: Lateness) -> str:
 
 
 def hot(now: Conditions, hotter: bool = False) -> str:
-    """Return the clause for a processor that is slowed down by heat, or "".
-
-    `hotter` is true if a counter of slow-downs by heat has risen.
-    """
+    """Return the clause for heat, or "". `hotter`: the count of slow-downs by heat has risen."""
     return "the processor is too hot and runs slower" if now.hot or hotter else ""
 
 
@@ -149,10 +136,7 @@ def slow(now: Conditions) -> str:
 
 
 def cgroup_quota(late: Lateness) -> str:
-    """Return the clause for a used-up processor quota of the daemon's cgroup, or "".
-
-    The kernel counts the time without quota in `cpu.stat` of the cgroup (throttled_usec).
-    """
+    """Return the clause for a used-up processor quota (throttled_usec in cpu.stat), or ""."""
     without_ns = late.after.quota_ns - late.before.quota_ns
     if not late.explains(without_ns):
         return ""
@@ -160,10 +144,7 @@ def cgroup_quota(late: Lateness) -> str:
 
 
 def stolen(late: Lateness) -> str:
-    """Return the clause for a processor that the host of a virtual machine took away, or "".
-
-    The kernel counts the steal time of each processor in /proc/stat.
-    """
+    """Return the clause for steal time, in which the host took the processor away, or ""."""
     stolen_ns = most_stolen(late.before, late.after)
     if stolen_ns < LEAST_STOLEN_NS or not late.explains(stolen_ns):
         return ""
@@ -177,10 +158,7 @@ def most_stolen(before: Reading, after: Reading) -> int:
 
 
 def memory(late: Lateness) -> str:
-    """Return the clause for memory pages that had to be read from a disk, or "".
-
-    The kernel counts the major page faults of the process in /proc/self/stat.
-    """
+    """Return the clause for memory pages read from a disk (major page faults), or ""."""
     pages = late.after.major_faults - late.before.major_faults
     if not pages or not late.slept:
         return ""
@@ -190,11 +168,9 @@ def memory(late: Lateness) -> str:
 def disk(late: Lateness) -> str:
     """Return the clause for a wait for a disk, or "".
 
-    The kernel reports two waiting times. The first is that of the loop's own thread, in
-    /proc/self/stat (delayacct_blkio_ticks), if the kernel measures it. The second is that of all
-    programs, in /proc/pressure/io, or else iowait in /proc/stat. The second counts only if the
-    loop's thread itself read from a disk or wrote to one (/proc/self/task/TID/io), because other
-    programs may wait for a disk at any time.
+    The wait of the loop's own thread counts, if the kernel measures it. The wait of all programs
+    counts only if the loop's thread itself read from a disk or wrote to one, because other programs
+    may wait for a disk at any time.
     """
     before, after = late.before, late.after
     own_ns, all_ns = after.own_disk_ns - before.own_disk_ns, after.disk_ns - before.disk_ns
@@ -205,10 +181,7 @@ def disk(late: Lateness) -> str:
 
 
 def other_program(late: Lateness) -> str:
-    """Return the clause for other programs that used the processor, or "".
-
-    The kernel counts in schedstat how long the loop's thread was ready and had no processor.
-    """
+    """Return the clause for other programs that used the processor (schedstat), or ""."""
     if cgroup_quota(late) or stolen(late) or not late.explains(late.loop.waited_ns):
         return ""
     for_s = _seconds(late.loop.waited_ns)
@@ -245,10 +218,7 @@ CAUSES = (
 
 
 def causes(late: Lateness) -> tuple[tuple[str, ...], str]:
-    """Return the names of the causes of a lateness, and a clause with all causes and the advice.
-
-    Return `((), "")` if the kernel's counters show no cause.
-    """
+    """Return a lateness's causes and a clause with their advice; `((), "")` if there are none."""
     found = [(cause, clause) for cause in CAUSES if (clause := cause.rule(late))]
     clauses = [f"{clause} ({cause.advice})" for cause, clause in found]
     return tuple([cause.name for cause, _ in found]), ", and ".join(clauses)
@@ -259,37 +229,25 @@ BECAUSE = ", because "
 
 
 def event_of(late: Lateness, clause: str, *, news: bool) -> Event:
-    """Return the event for a lateness.
-
-    `clause` is the clause that `causes` has returned. `news` is false for a repetition
-    (`Event.news`).
-    """
+    """Return the event for a lateness. `clause` comes from `causes`, `news` is `Event.news`."""
     text = f"by {late.late_ns / NS_PER_S:.2f} s{BECAUSE}{clause}"
     return Event("missed_periods", text, "warning", kind="late", news=news)
 
 
 def cause_in(text: str) -> str:
-    """Return the part of a text that gives the duration and the causes of a lateness.
-
-    The text comes from an event or from a line of the log, and may begin with the number of missed
-    periods. Return "" if the text names no cause.
-    """
+    """Return the duration and the causes in the text of an event or log line; "" without any."""
     begin, because, clause = text.partition(BECAUSE)
     return begin.rpartition(": ")[2] + because + clause if because else ""
 
 
 STOLEN_SHARE = 0.02
-"""`present` reports steal time only above this share of the time. Steal time is the time for which
-the host of a virtual machine takes a processor away."""
+"""`present` reports steal time only above this share of the time."""
 
 
 def present(before: Reading, after: Reading, within_ns: int) -> list[tuple[str, str]]:
     """Return the causes that delay every program on this computer now, each with its advice.
 
-    Args:
-        before: the counters at the beginning.
-        after: the counters at the end.
-        within_ns: the time between the two readings, ns.
+    `within_ns` is the time between the two readings, ns.
     """
     now = after.conditions
     stolen_ns = most_stolen(before, after)

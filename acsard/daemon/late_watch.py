@@ -1,14 +1,12 @@
 """Watches for late control periods, and reports their cause if the kernel shows one.
 
-In each period the control loop reads one small file, `schedstat`, with the processor times of its
-thread. It hands a late period to this module's thread. Only this thread reads the kernel's other
-files, because reading them takes longer. It reads them four times a second, so that it has a
-reading from before each lateness, and once more after a lateness. `late_causes.py` compares the two
-readings.
+In each period the control loop reads only one small file, `schedstat`, with the processor times of
+its thread. This module's thread reads the kernel's other files, because that takes longer: four
+times a second, and once more after a lateness. `late_causes.py` compares the readings from before
+and after it.
 
 This module's event has the name `missed_periods`, like the robot's own event. The robot's event
-comes first and states the number of missed periods. It cannot name the cause, because the cause is
-known only later.
+comes first and states the number of missed periods. The cause is known only later.
 """
 
 from __future__ import annotations
@@ -37,36 +35,31 @@ EVERY_S = 0.25
 include more delays of normal load."""
 
 HISTORY = 12
-"""Number of readings that are kept, which cover 3 s. The thread goes on reading during a
-lateness, and afterwards still needs the last reading from before the lateness."""
+"""Number of kept readings. They cover 3 s, so that one from before a long lateness remains."""
 
 SETTLE_S = 0.03
 """Time from a late period to the reading after it, s. The kernel updates some counters only at its
 next tick, and ticks are at most 10 ms apart."""
 
 PAUSE_NS = NS_PER_S
-"""Shortest time between two reports, ns. The log shows at most one line a second for events of one
-name."""
+"""Shortest time between two reports, ns. The log shows one line a second for each name."""
 
 CONDITIONS_NS = 10 * NS_PER_S
-"""Age at which the conditions of the processor, such as its voltage, are read again, ns. They are
-not read more often, because on some computers each reading is a request to the firmware. After a
-lateness they are read in any case."""
+"""Age at which the conditions of the processor, such as its voltage, are read again, ns. On some
+computers each reading is a request to the firmware."""
 
 LOOK_S = 0.2
 """Time between the two readings of all processes in one search for the busiest process, s."""
 
 LOOK_AGAIN_NS = 10 * NS_PER_S
-"""Shortest time between two searches for the busiest process, ns. A search takes 20 us per process.
-"""
+"""Shortest time between two searches for the busiest process, ns. One takes 20 us per process."""
 
 NEWS_NS = 60 * NS_PER_S
 """Time after which a repetition of the same causes is logged immediately, ns. An earlier repetition
 waits for the next log line about missed periods (`Event.news`)."""
 
 MOST = 16
-"""Largest number of late periods that wait for the thread, and of events that wait for the control
-loop. Newer ones displace the oldest."""
+"""Largest number of waiting late periods and of waiting events. Newer ones displace the oldest."""
 
 
 class Late(Struct, frozen=True):
@@ -90,7 +83,7 @@ class Late(Struct, frozen=True):
 class LateWatch:
     """The watch of one control loop. The loop's thread creates it, and calls `period` and `news`.
 
-    It is a context manager. Its own thread runs while the context is entered.
+    Its own thread runs while this context manager is entered.
     """
 
     def __init__(self, kernel: Kernel | None = None) -> None:
@@ -108,8 +101,7 @@ class LateWatch:
         self._readings: deque[tuple[int, Reading]] = deque(maxlen=HISTORY)
         """The last readings, each with the monotonic time at which it was complete, ns."""
         self._reported: dict[tuple[str, ...], int] = {}
-        """For each combination of causes, the monotonic time of its last event that was not a
-        repetition, ns."""
+        """Monotonic time, ns, of the last event that was news, for each combination of causes."""
         self._busiest: Program | None = None
         self._searched_ns: int | None = None
 
@@ -194,10 +186,7 @@ class LateWatch:
         self._news.put(event_of(late, clause, news=news))
 
     def _busiest_of(self, kernel: Kernel) -> Program | None:
-        """Return the busiest process, or None if no process is busy.
-
-        Search again only after `LOOK_AGAIN_NS`. Until then return the result of the last search.
-        """
+        """Return the busiest process, or None. The search is at most `LOOK_AGAIN_NS` old."""
         now_ns = clock.mono_ns()
         if self._searched_ns is None or now_ns - self._searched_ns >= LOOK_AGAIN_NS:
             self._busiest, self._searched_ns = kernel.busiest(LOOK_S), now_ns

@@ -1,8 +1,7 @@
-"""Measures the daemon's own latencies, in fixed memory and without reading a clock.
+"""Measures the daemon's latencies, in us, in fixed memory. The control loop supplies all times.
 
-A latency is a duration in us. The messages `state` and `diagnostics` publish the median, the 99th
-percentile and the maximum of each latency, since the daemon's start and over the last minute. The
-control loop passes the times to `Stopwatch`.
+The messages `state` and `diagnostics` publish the median, the 99th percentile and the maximum of
+each latency, since the daemon's start and over the last minute.
 """
 
 from __future__ import annotations
@@ -20,8 +19,7 @@ PER_DECADE = 20
 """Buckets per factor of ten. A percentile is accurate to 12 %."""
 
 DECADES = 7
-"""Factors of ten that the buckets cover: durations from 1 us to 10^7 us. The first bucket also has
-all shorter durations, and the last bucket all longer ones."""
+"""Number of factors of ten, from 1 us. The end buckets also hold shorter and longer durations."""
 
 LAST = PER_DECADE * DECADES
 """Index of the last bucket."""
@@ -42,15 +40,11 @@ class Histogram:
             self._max = value
 
     def merge(self, other: Histogram) -> None:
-        """Add all measurements of another histogram."""
         self._buckets[:] = map(add, self._buckets, other._buckets)
         self._max = max(self._max, other._max)
 
     def spread(self) -> Spread:
-        """Return median, 99th percentile and maximum.
-
-        A percentile is the upper end of its bucket.
-        """
+        """Return the spread. A percentile is the upper end of its bucket."""
         totals = list(accumulate(self._buckets))
         p50, p99 = (self._percentile(totals, share) for share in (0.50, 0.99))
         return Spread(totals[-1], p50, p99, self._max)
@@ -76,12 +70,10 @@ Name = Literal[
 - command_age: from a command's arrival to the write of each line that carries it.
 - command_to_wire: from a command's arrival to the write of the first line that carries it. A
   command that had to wait until its source was chosen is not counted.
-- feedback_to_bus: from the moment at which the daemon has read a complete feedback line to the
-  moment at which its messages are queued for the bus. The time for which the line waited in the
-  kernel before the read is not included.
+- feedback_to_bus: from the read of a complete feedback line to the moment at which its messages are
+  queued for the bus. The line's wait in the kernel before the read is not included.
 - mcu_round_trip: from the write of a line to the read of the end of its reply. It is measured only
-  if the lines are checked (`mcu.link_check`). Otherwise a reply does not name the line it answers.
-"""
+  with `mcu.link_check`, because a reply otherwise does not name the line it answers."""
 
 NAMES: tuple[Name, ...] = get_args(Name)
 
@@ -100,20 +92,17 @@ class Figure:
 
     def __init__(self) -> None:
         self._past = Histogram()
-        """All measurements that are older than the slots."""
         self._slots = [Histogram() for _ in range(SLOTS)]
         self._number = -SLOTS
         self._slot, self._ends_ns = self._slots[0], 0
         """The newest slot, and the monotonic time at which it ends, ns."""
 
     def add(self, now_ns: int, duration_ns: int) -> None:
-        """Record a duration that was measured at monotonic `now_ns`."""
         if now_ns >= self._ends_ns:
             self._advance(now_ns // SLOT_NS)
         self._slot.add(duration_ns / 1000)
 
     def measured(self, now_ns: int) -> Measured:
-        """Return the percentiles at monotonic `now_ns`."""
         self._advance(now_ns // SLOT_NS)
         minute = Histogram()
         for slot in self._slots:
@@ -138,14 +127,12 @@ class LastMinute:
         self._slots: deque[tuple[int, int]] = deque(maxlen=SLOTS)
 
     def add(self, now_ns: int, count: int) -> None:
-        """Add `count` events that happened at monotonic `now_ns`."""
         number, before = now_ns // SLOT_NS, 0
         if self._slots and self._slots[-1][0] == number:
             _, before = self._slots.pop()
         self._slots.append((number, before + count))
 
     def count(self, now_ns: int) -> int:
-        """Return the number of events in the minute before monotonic `now_ns`."""
         oldest = now_ns // SLOT_NS - SLOTS
         return sum(count for number, count in self._slots if number > oldest)
 
@@ -171,19 +158,13 @@ class Stopwatch:
         return self._missed.count(now_ns)
 
     def period(self, now_ns: int, late_ns: int, missed: int = 0) -> None:
-        """Record that the step of a period began `late_ns` ns late, at monotonic `now_ns`.
-
-        `missed` is the number of periods just before this one that had no step.
-        """
+        """Record the lateness of a step, and the number of `missed` periods just before it."""
         self.figures["period_lateness"].add(now_ns, late_ns)
         if missed:
             self._missed.add(now_ns, missed)
 
     def line(self, outputs: Outputs, sent_ns: int, before_ns: int) -> None:
-        """Record the age of the command in a line that was written at `sent_ns`.
-
-        `before_ns` is the time at which the previous line was written. Both are monotonic, ns.
-        """
+        """Record the age of the command in a line; `before_ns` is the time of the previous line."""
         command_ns = outputs.command_ns
         if command_ns is None or outputs.mode != "driving":
             return
@@ -195,8 +176,8 @@ class Stopwatch:
     def feedback(self, estimate: Estimate, told_ns: int | None) -> None:
         """Record the delays of a feedback line.
 
-        `told_ns` is the monotonic time at which the messages of the line were queued for the bus,
-        ns. It is None if no client subscribes to them.
+        `told_ns` is the time at which its messages were queued for the bus. It is None if no client
+        subscribes to them.
         """
         at_ns, asked_ns = estimate.heard_ns, estimate.asked_ns
         if asked_ns is not None:
@@ -205,5 +186,4 @@ class Stopwatch:
             self.figures["feedback_to_bus"].add(told_ns, told_ns - at_ns)
 
     def step(self, began_ns: int, ended_ns: int) -> None:
-        """Record the start and the end of a step, monotonic times in ns."""
         self.figures["step_time"].add(began_ns, ended_ns - began_ns)

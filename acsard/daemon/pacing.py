@@ -1,9 +1,9 @@
 """Decides when a line may be written to the board: in every control period, and early if needed.
 
 An early line is written between two periods: for a new command or mode, or after a press of the
-emergency stop or a bumper. It replaces the line of the next period, so a flood of commands does
-not cause more lines. An early line must come at least the wire time of a line plus `BREATH_NS`
-after the previous line. Each period allows one attempt to write an early line.
+emergency stop or a bumper. It replaces the line of the next period, so a flood of commands does not
+cause more lines. An early line must come at least the wire time of a line plus `BREATH_NS` after
+the previous line. Each period allows one attempt.
 """
 
 from __future__ import annotations
@@ -12,44 +12,34 @@ from msgspec import Struct
 
 
 class Period(Struct, frozen=True):
-    """The control periods that have ended since the last step.
-
-    `expired` is their number, and `due_ns` the monotonic time at which the first one was due, ns.
-    """
+    """Number of periods that ended since the last step, and monotonic due time of the first, ns."""
 
     expired: int
     due_ns: int
 
 
 NO_PERIOD = Period(0, 0)
-"""The `Period` of a step if no period has ended since the last step."""
 
 
 BREATH_NS = 1_000_000
-"""Time that the board has for its reply between two lines, in addition to the wire time of a line,
-ns."""
+"""Time for the board's reply between two lines, in addition to the wire time of a line, ns."""
 
 IDLE_WAKES = 3
-"""If more than this number of steps in a period had input from the bus but no new command or mode,
-further input waits for the next period. This bounds the cost of a flood of messages from any
-client."""
+"""If more steps than this in a period had input but no new command or mode, further input waits for
+the next period. This bounds the cost of a flood of messages."""
 
 
 class Pace:
-    """Decides when a line may be written, from the results of the earlier steps of the period.
-
-    The argument `sent_ns` is the time of the last line, which only the serial port knows.
-    """
+    """Decides when a line may be written. `sent_ns` is the monotonic time of the last line, ns."""
 
     def __init__(self, line_ns: int, period_ns: int) -> None:
         self._gap_ns = line_ns + BREATH_NS
         self._possible = self._gap_ns < period_ns
-        """Whether a period is longer than the least time between two lines, so that a line can be
-        written between two periods."""
+        """Whether a period is long enough for a line between two periods."""
         self._ahead = False
         """Whether an early line was written in place of the next period's line."""
         self._tried = False
-        """Whether this period's attempt to write an early line was made, successful or not."""
+        """Whether this period's attempt to write an early line was made."""
         self._waiting = False
         """Whether a new command came too soon after a line, and must wait before it is sent."""
         self._idle = 0
@@ -57,18 +47,14 @@ class Pace:
     def period_ended(self, missed: int) -> bool:
         """Record the end of a period. Return whether its line must be written (`Inputs.tick`).
 
-        The line is left out if an early line was written in its place. After `missed` > 0 periods
-        without a step it is written in any case, because the previous line was written long ago.
+        The line is left out if an early line has replaced it and no period was `missed`.
         """
         ahead, self._ahead, self._tried = self._ahead, False, False
         self._idle = 0
         return missed > 0 or not ahead
 
     def at_once(self, now_ns: int, sent_ns: int) -> bool:
-        """Return whether an early line may be written now for a new command.
-
-        `sent_ns` is the time at which the last line was written. Both are monotonic, ns.
-        """
+        """Return whether an early line may be written now for a new command."""
         return self._possible and not self._tried and now_ns - sent_ns >= self._gap_ns
 
     def note(self, tick: bool, due: bool, went: bool, news: bool, heard: bool) -> None:
@@ -98,8 +84,5 @@ class Pace:
         return self._waiting and self._possible and not self._tried
 
     def retry_ns(self, sent_ns: int) -> int | None:
-        """Return the monotonic time at which a waiting command may be written, ns.
-
-        Return None if no command waits. `sent_ns` is the monotonic time of the last line, ns.
-        """
+        """Return when the waiting command may be written (monotonic ns), or None if none waits."""
         return sent_ns + self._gap_ns if self.waits else None

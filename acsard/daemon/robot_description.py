@@ -1,8 +1,7 @@
 """Reads the robot's URDF from the file in `[ros] urdf`, or explains why it cannot be published.
 
 The daemon publishes the text unchanged. The checks find mistakes that would otherwise appear only
-in the tools of ROS: a file that is not a URDF, a xacro file, and a file that is too large for the
-links of the bus.
+in the tools of ROS.
 """
 
 from __future__ import annotations
@@ -16,30 +15,22 @@ from acsard.daemon.bus.zenoh_sessions import MESSAGE_BYTES
 from acsard.host.errors import Exit, ExitError
 
 MAX_BYTES = 50_000
-"""Largest size of the file, bytes. The TLS gateway and the routers accept messages of up to
-`MESSAGE_BYTES`. The limit for the file is lower, because JSON needs two bytes for each quotation
-mark and each line end."""
+"""Largest size of the file, bytes. It is lower than `MESSAGE_BYTES`, because JSON needs two bytes
+for each quotation mark and each line end."""
 
 MAX_JSON = MESSAGE_BYTES - 1024
-"""Largest size of the description as JSON, bytes. The other 1024 bytes of a message are for the key
-and for Zenoh's headers."""
+"""Largest size of the description as JSON, bytes. The rest is for the key and Zenoh's headers."""
 
 XACRO = "/xacro}"
-"""Text by which the tag of a xacro element is recognized. ElementTree writes the tag as
-"{NAMESPACE}NAME", and the namespace is http://www.ros.org/wiki/xacro, http://ros.org/wiki/xacro or
-similar."""
+"""Text in the tag of a xacro element, which ElementTree writes as "{NAMESPACE}NAME". The namespace
+is http://www.ros.org/wiki/xacro, http://ros.org/wiki/xacro or similar."""
 
 DOCUMENT_TYPE = "<!DOCTYPE"
-"""Beginning of a document type. The file must not have one, because its entities could expand to
-any length."""
+"""Refused in the file, because the entities of a document type could expand to any length."""
 
 
 def robot_description(path: str) -> str:
-    """Return the text of the URDF at `path`, or "" if `path` is "".
-
-    Raises:
-        ExitError: the file cannot be published. The message says what to do.
-    """
+    """Return the URDF at `path`, or "" if `path` is "". Raises `ExitError` if it is not usable."""
     if not path:
         return ""
     file = Path(path)

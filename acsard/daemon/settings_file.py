@@ -1,11 +1,8 @@
 """Compares the configuration file with the settings in force, and changes the file.
 
-The file and the settings differ after a `set` that was not written to the file, and after a person
-has edited the file. A thread reads the file again whenever it has changed.
-
-A `set` with `keep` has two stages. First the thread checks that the file can be changed; if it
+A `set` with `keep` has two stages. First a thread checks that the file can be changed; if it
 cannot, nothing is set. Then the robot uses the settings, and the thread changes the file. The
-control loop exchanges requests and answers with the thread, and never waits for the disk.
+control loop never waits for the disk.
 """
 
 from __future__ import annotations
@@ -37,18 +34,15 @@ LOOK_S = 2.0
 """Time between two checks for a changed file, s."""
 
 NAMED = 3
-"""Largest number of differing settings that `SettingsFile.differ` names. The message `state`
-contains this text and must stay short."""
+"""Largest number of settings that `SettingsFile.differ` names, so that `state` stays short."""
 
 MAX_TEXT = 200
-"""Largest number of characters of `SettingsFile.differ`."""
 
 PATIENCE_NS = 5 * NS_PER_S // 2
 """Longest time from a `set` with `keep` to its answer, ns. A client waits for 3 s."""
 
 JOBS = 32
-"""Largest number of `set` requests with `keep` that may wait for an answer. Further requests are
-refused at once."""
+"""Largest number of `set` requests with `keep` that wait. More are refused at once."""
 
 Signature = tuple[int, int, int]
 """Inode, size in bytes and modification time in ns of a file."""
@@ -73,8 +67,7 @@ class _Pending(Struct):
 
     request: Request
     due_ns: int
-    """Monotonic time after which the request is answered as overdue, ns. This limit does not
-    apply while the robot decides about the request."""
+    """Monotonic time at which the request is overdue, ns, unless the robot is deciding about it."""
     edit: Edit | None = None
     """The change of the file, once the thread has checked it; None before."""
     answer: Answer | None = None
@@ -91,23 +84,19 @@ class SettingsFile:
 
         Args:
             file: the file that the daemon has read, or None for the built-in defaults.
-            parse: turns the content of the file into the configuration that a daemon would have if
-                it started with that content.
+            parse: returns the configuration of a daemon that starts with the given file content.
             started: the configuration with which the daemon has started.
         """
         self.differ = ""
-        """The settings in force that differ from the file, in words. If the file cannot be used,
-        this text says why. It is "" if nothing differs."""
+        """The settings in force that differ from the file, in words, or the reason why the file
+        cannot be used. It is "" if nothing differs."""
         self._file, self._parse = file, parse
         self._in_force = self._written = started
-        """The settings in force, and the settings in the file."""
         self._signature: Signature | None = None
-        """The signature of the file that `_written` was read from."""
         self._box = Mailbox[Request | Literal["look"]](JOBS)
-        """The requests that the thread must check. "look" only wakes the thread."""
+        """The requests to check. "look" only wakes the thread."""
         self._changes = deque[tuple[Edit, Answer]]()
-        """The changes that the thread must write, each with the robot's answer. The thread writes
-        them before its next check."""
+        """The changes to write before the next check, each with the robot's answer."""
         self._results = Mailbox[_Checked | Answer](JOBS)
         self._pending: dict[int, _Pending] = {}
         self._started = self._limits = started.limits
@@ -127,19 +116,12 @@ class SettingsFile:
             self.differ = f"this process cannot compare settings and file ({error})"
 
     def use(self, config: Config) -> None:
-        """Compare the file with this configuration from now on.
-
-        `config` is the configuration in force, without the limit from the key `speed_limit`.
-        """
+        """Compare the file with `config`, the settings in force without the key `speed_limit`."""
         self._in_force = config
         self._look()
 
     def keep(self, request: Request, now_ns: int) -> None:
-        """Queue a `set` with `keep` for the check of the file. `now_ns` is the monotonic time.
-
-        Later, `results` returns the request if the file can be changed, or an answer that refuses
-        it.
-        """
+        """Queue a `set` with `keep` for the check of the file. `results` returns the outcome."""
         full = len(self._pending) >= JOBS
         # A request beyond the limit is overdue from the start, so that `results` refuses it in this
         # step.
@@ -148,10 +130,7 @@ class SettingsFile:
             self._box.put(request)
 
     def _look(self) -> None:
-        """Wake the thread, unless the mailbox has an item, which has woken it already.
-
-        In a full mailbox, the item "look" would displace a request.
-        """
+        """Wake the thread. In a full mailbox, "look" would displace a request."""
         if not self._box.waiting:
             self._box.put("look")
 
@@ -159,8 +138,8 @@ class SettingsFile:
         """Process the robot's answer to any request. Return whether the answer must wait.
 
         An answer waits if its request is a `set` with `keep` whose settings the robot has used. The
-        thread then writes the settings to the file, and `results` returns the answer. If this
-        method returns False, the caller must send the answer.
+        thread then writes the file, and `results` returns the answer. The caller sends all
+        others.
         """
         pending = self._pending.get(answer.id)
         if pending is None or pending.edit is None:
@@ -176,8 +155,7 @@ class SettingsFile:
     def results(self, now_ns: int, events: list[Event]) -> list[Request | Answer]:
         """Return the requests that the robot may obey now, and the answers for clients.
 
-        For each request whose settings were written to the file, an event is added to `events`.
-        `now_ns` is the monotonic time.
+        Adds an event to `events` for each request whose settings were written to the file.
         """
         if not self._pending:
             return []
@@ -219,13 +197,9 @@ class SettingsFile:
     def latches(self, latches: Latches, now: LimitsConfig) -> Latches:
         """Return the robot's latches, changed for the next start of the daemon.
 
-        `Latches.lowered` has the limits that are lower now than at the start of the daemon. But the
-        next start reads the limits from the file. If the daemon has written limits to the file, the
-        result therefore has the limits that are lower now than in the file.
-
-        Args:
-            latches: the latches of the robot.
-            now: the limits in force, without the limit from the key `speed_limit`.
+        The next start reads the limits from the file. If the daemon has written limits to the file,
+        `lowered` therefore has the limits that are lower in `now` than in the file. `now` has the
+        limits in force, without the limit from the key `speed_limit`.
         """
         file = self._limits
         if file is self._started:
@@ -256,12 +230,10 @@ class SettingsFile:
             self.differ = printable(self._difference())[:MAX_TEXT]
 
     def _write(self) -> None:
-        """Write the changes whose settings the robot has used."""
         while self._changes:
             self._results.put(self._written_answer(*self._changes.popleft()))
 
     def _checked(self, request: Request) -> _Checked | Answer:
-        """Return the request if its settings can be written, else the answer that refuses it."""
         try:
             # Refuse settings that the robot would refuse even at rest.
             changed(self._in_force, request.settings, at_rest=True)
@@ -273,7 +245,6 @@ class SettingsFile:
             return Answer(request.id, False, f"nothing is set: {error}")
 
     def _written_answer(self, edit: Edit, answer: Answer) -> Answer:
-        """Write a change to the file, and return the answer to its request."""
         told = answer.message
         try:
             keep(edit)
@@ -302,7 +273,6 @@ class SettingsFile:
         return listed(told, NAMED)
 
     def _read(self) -> None:
-        """Read the file if it has changed. Raises `OSError` or `ConfigError`."""
         if self._file is None:
             return
         about = self._file.stat()

@@ -1,8 +1,7 @@
 """Supervises the TLS gateway, a fleet's router or the web page, each a process of its own.
 
-Each process sends signs of life to the supervisor. If a process is silent, because it was stopped
-or hangs, the supervisor ends it and starts it again. If the gateway is a service, systemd does this
-with the unit `acsard-gateway.service`, which has limits that only systemd can set.
+A process that sends no signs of life is ended and started again. If the gateway is a service,
+systemd does this with the unit `acsard-gateway.service`, whose limits only systemd can set.
 """
 
 from __future__ import annotations
@@ -25,8 +24,6 @@ LATER_S = 2.0
 
 
 class Kind(Struct, frozen=True):
-    """A kind of supervised process."""
-
     name: str
     ended: EventName
     final: frozenset[int] = frozenset()
@@ -39,17 +36,15 @@ class Kind(Struct, frozen=True):
 
 
 GATEWAY = Kind("the TLS gateway", "gateway_ended")
-"""The TLS gateway. It is always started again: the robot drives on without it, and a person may
-correct the gateway's files while the robot drives."""
+"""The TLS gateway. It is always restarted, as a person may correct its files during a drive."""
 
 ROUTER = Kind(
     "the router",
     "router_ended",
     final_at_first=frozenset({Exit.USAGE, Exit.BAD_CONFIG}),
 )
-"""The router of a fleet. If its files are unusable at its first start, it is not started again. At
-a later restart it is tried again, because a person may be changing the files at that moment, and
-the fleet needs its router."""
+"""The router of a fleet. If its files are unusable at the first start, it is not started again. At
+a later restart a person may be changing the files, so it is started again."""
 
 PAGE = Kind(
     "the robot's page",
@@ -57,8 +52,8 @@ PAGE = Kind(
     frozenset({Exit.OK, Exit.USAGE, Exit.IN_USE, Exit.NO_PERMISSION, Exit.BAD_CONFIG}),
     LATER_S,
 )
-"""The web page. Its pause before a restart is longer, because a page that keeps failing must not
-take processor time from the robot. The page's process itself reports why it ends."""
+"""The web page. Its pause is longer, because a page that keeps failing must not take processor time
+from the robot. The process itself reports why it ends."""
 
 
 async def keep_running(
@@ -66,8 +61,7 @@ async def keep_running(
 ) -> int:
     """Run `acsard` with the arguments `words`, and start it again when it ends, until cancelled.
 
-    If the process ends with an exit code that is final for its `kind`, return this code and do not
-    start the process again. `log` gets an event for each restart.
+    Returns the exit code if it is final for `kind`. `log` gets an event for each restart.
     """
     final = kind.final | kind.final_at_first
     while True:

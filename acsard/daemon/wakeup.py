@@ -56,10 +56,7 @@ class Alarm(_Timer):
         self._at_ns: int | None = None
 
     def set(self, at_ns: int | None) -> None:
-        """Call `wake` at monotonic `at_ns`.
-
-        If `at_ns` is None, the time that was set before stays in force.
-        """
+        """Call `wake` at monotonic `at_ns`. None keeps the time that was set before."""
         if at_ns is not None and at_ns != self._at_ns:
             self._timer.set(at_ns)
         self._at_ns = at_ns
@@ -71,10 +68,7 @@ class Alarm(_Timer):
 
 
 class Ticker(_Timer):
-    """A timer that calls `wake` at the end of every period, while its context is entered.
-
-    `take` returns the periods that have ended.
-    """
+    """A timer that calls `wake` at the end of every period. `take` returns the ended periods."""
 
     def __init__(self, period_ns: int, wake: Callable[[], None]) -> None:
         super().__init__(wake)
@@ -107,10 +101,7 @@ class Ticker(_Timer):
 
 
 class Next(Struct, frozen=True):
-    """Result of a step: says whether a command, a retry or a stop may start the next step.
-
-    The other events, such as the end of a period, start a step in any case.
-    """
+    """Result of a step: says whether a command, a retry or a stop may start the next step."""
 
     listens: bool
     """Whether a command that arrives gets a step of its own, before the next period."""
@@ -143,8 +134,7 @@ class Wakeup:
     def command(self) -> None:
         """Report a sample that may be a command, from any thread.
 
-        The sample wakes the loop if the last step has asked for commands (`Next.listens`). Only the
-        first sample after such a step does so.
+        Only the first sample after a step with `Next.listens` wakes the loop.
         """
         self._heard = True
         if self._listens:

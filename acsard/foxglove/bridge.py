@@ -1,9 +1,4 @@
-"""Connects a robot to Foxglove viewers, by a main loop that runs on one thread.
-
-Each round of the loop checks whether the daemon is present, subscribes to the topics that viewers
-look at, and forwards new messages. If a viewer drives and the robot does not follow, the round also
-tells the viewers the reason.
-"""
+"""Connects a robot to Foxglove viewers, by a main loop that runs on one thread."""
 
 from __future__ import annotations
 
@@ -43,8 +38,6 @@ GONE = "daemon"
 
 
 class Bridge:
-    """Connects one robot to its viewers."""
-
     def __init__(
         self,
         robot: Client,
@@ -68,10 +61,7 @@ class Bridge:
         self._relay = Relay(robot, context, self._wake.set)
         self._relay.offer(facts)
         self._deaf = facts.deaf
-        """Reason why this program cannot show the commands of other programs, in words.
-
-        It is "" if the program can show them, and after the viewers have been told the reason.
-        """
+        """Why commands of other programs cannot be shown; "" if they can or the viewers know it."""
         logging.getLogger("foxglove").addHandler(Refusals(self._notices))
         listener = Listener(self._shown, self._drives, self._settings)
         offered = services(robot, ros, CALLED if acts else STOPS)
@@ -84,10 +74,7 @@ class Bridge:
         self._token = robot.session.liveliness().declare_subscriber(key, self._alive, history=True)
 
     def run(self) -> None:
-        """Run the main loop until `end` is called.
-
-        If the thread that sends the viewers' commands has died, raise the exception that ended it.
-        """
+        """Run the main loop until `end` is called. Raises an error of the sending thread."""
         dead = self._drives.outbox.dead
         while not self._ended.is_set():
             if dead.done():
@@ -110,10 +97,7 @@ class Bridge:
         self._server.stop()
 
     def _viewer(self, client: int) -> Client:
-        """Return a bus client that sends the commands of the viewer with the id `client`.
-
-        To the daemon, each of these bus clients is a different sender.
-        """
+        """Return the viewer's bus client. To the daemon, each viewer is a different sender."""
         name = self._robot.sender.rpartition("/")[0]
         return self._robot.like(self._id, f"{name}/{client}")
 
@@ -144,10 +128,7 @@ class Bridge:
         return True
 
     def _came_back(self) -> bool:
-        """Query the restarted daemon, which may have other sources and settings.
-
-        Returns False if the daemon does not answer yet.
-        """
+        """Query the restarted daemon. Return False if it does not answer yet."""
         try:
             facts = learn(self._robot)
         except AcsardError as error:
@@ -180,11 +161,7 @@ class Bridge:
                 self._watch.look(now)
 
     def _object(self, driving: dict[int, Client]) -> None:
-        """Tell all viewers why the robot does not follow a viewer that requests a speed.
-
-        `driving` maps the id of each such viewer to its bus client. The message about a viewer is
-        removed when its reason ends.
-        """
+        """Tell all viewers why the robot does not follow a viewer that requests a speed."""
         now_ns = clock.mono_ns()
         for client in driving.keys() - self._objections.keys():
             self._objections[client] = Objections()

@@ -27,19 +27,17 @@ from acsard.foxglove.notices import Notices
 from acsard.host import clock
 
 SLOW_NS, SLOW_TIMES = 5 * NS_PER_S // 2, 3
-"""A panel publishes too seldom if `SLOW_TIMES` messages in a row each come after a silence. Such a
-silence is longer than `commander.SILENCE_NS` (0.3 s) and at most `SLOW_NS` (2.5 s)."""
+"""A panel publishes too seldom if `SLOW_TIMES` messages in a row come after a silence of more than
+`commander.SILENCE_NS` (0.3 s) and at most `SLOW_NS` (2.5 s)."""
 
 _receiver = Receiver(JointsConfig(), Kinematics(DriveConfig()))
-"""Decoder of velocity commands (twists). The configuration of joints and wheels has no effect on a
-twist, so the default one is sufficient."""
+"""Decoder of velocity commands (twists), which do not depend on the joints and wheels."""
 
 
 def encoding_of(encoding: str, schema_name: str) -> str:
-    """Return the Zenoh encoding for the messages of a channel that a viewer has announced.
+    """Return the Zenoh encoding of a viewer's channel. Raises `DecodeError` if it cannot drive.
 
     `encoding` is "json" or "cdr", and `schema_name` is a ROS type such as "geometry_msgs/Twist".
-    Raises `DecodeError` if messages of this kind cannot drive the robot.
     """
     package, _, name = schema_name.partition("/")
     full = f"{package}/msg/{name.removeprefix('msg/')}"
@@ -59,10 +57,7 @@ def encoding_of(encoding: str, schema_name: str) -> str:
 
 
 def wish(encoding: str, payload: bytes) -> Wish:
-    """Decode a viewer's velocity command; `encoding` is the Zenoh encoding of `payload`.
-
-    Raises `DecodeError` if any part of the message is not valid.
-    """
+    """Decode a velocity command in a Zenoh encoding. Raises `DecodeError` if it is not valid."""
     found = _receiver.command(Arrival("cmd/app", True, payload, encoding, 0, None, ""))
     return Wish(found.twist, found.stamp_ns)
 
@@ -73,10 +68,7 @@ class Viewer:
     def __init__(self, robot: Client) -> None:
         self.robot, self.commander = robot, Commander(leads=True, gathers=True)
         self.channels: dict[int, tuple[str, str]] = {}
-        """The Zenoh encoding of each channel and an error text, by the id of the channel.
-
-        One of the two is "". The error text says why the channel cannot drive.
-        """
+        """By channel id: (Zenoh encoding, ""), or ("", reason why the channel cannot drive)."""
         self._slow = 0
 
     def is_slow(self, silence_ns: int | None) -> bool:
@@ -109,10 +101,7 @@ class Drives:
     def advertised(
         self, client: int, channel: int, topic: str, encoding: str, schema_name: str
     ) -> None:
-        """Register a channel on which a viewer will publish.
-
-        If the channel cannot drive the robot, `came` reports the reason at each message.
-        """
+        """Register a viewer's channel. If it cannot drive, `came` reports the reason."""
         found, problem = "", ""
         if topic != self.topic:
             problem = f"no program listens on {topic}: send commands to {self.topic} instead"
@@ -129,10 +118,7 @@ class Drives:
                 viewer.channels[channel] = found, problem
 
     def came(self, client: int, channel: int, data: bytes) -> None:
-        """Queue the command in a message of a viewer, or tell the viewers why it is refused.
-
-        `client` is the id of the viewer, and `channel` is the id of the viewer's channel.
-        """
+        """Queue the command in a message of a viewer, or tell the viewers why it is refused."""
         viewer = self._viewers.get(client)
         encoding, problem = viewer.channels.get(channel, ("", "")) if viewer else ("", "")
         if viewer is None or not encoding:
@@ -163,10 +149,7 @@ class Drives:
             )
 
     def withdrawn(self, client: int, channel: int) -> None:
-        """Remove a channel that the viewer `client` has closed, explicitly or by disconnecting.
-
-        If the robot may still follow this viewer, send a zero command.
-        """
+        """Remove a channel. Send a zero command if the robot may still follow this viewer."""
         with self._lock:
             viewer = self._viewers.get(client)
             if viewer is None:

@@ -1,8 +1,4 @@
-"""Shows messages about the robot in the Foxglove viewers and at the terminal.
-
-A viewer gets each message as a status message and on the topic `log`. `Objections` decides when to
-report that the robot does not follow a viewer.
-"""
+"""Shows messages about the robot in the Foxglove viewers and at the terminal."""
 
 from __future__ import annotations
 
@@ -37,8 +33,7 @@ WAITING = 100
 class Notice(Struct, frozen=True):
     """A message to the viewers.
 
-    If `stays` is not "", it is the id of a message that the viewers show until it is removed. A
-    notice with this id and an empty `text` removes it.
+    With an id in `stays`, the viewers show it until a notice has this id and an empty `text`.
     """
 
     level: Level
@@ -58,11 +53,10 @@ class Notices:
         self._staying: dict[str, Notice] = {}
 
     def say(self, level: Level, name: str, text: str, stays: str = "") -> None:
-        """Queue a message to all viewers.
+        """Queue a message to all viewers; `name` is its subject on the topic `log`.
 
-        `name` is the subject, for the topic `log`. If `stays` is not "", it is an id, and the
-        viewers show the message until `over` is called with this id. Without an id, a text that
-        repeats too soon (`AGAIN`) is dropped.
+        With an id in `stays`, the viewers show the message until `over` is called with this id.
+        Without an id, a text that repeats too soon (`AGAIN`) is dropped.
         """
         now_ns = clock.mono_ns()
         with self._lock:
@@ -77,8 +71,7 @@ class Notices:
     def send(self, server: WebSocketServer, log: Callable[[Log], None], *, newcomers: bool) -> None:
         """Send and print the waiting notices; `log` publishes each of them on the topic `log`.
 
-        If `newcomers` is true, a viewer may be new. So first send again each message that the
-        viewers show until it is removed.
+        If `newcomers` is true, the messages that stay are sent again first, for new viewers.
         """
         if newcomers:
             for one in self._staying.values():
@@ -107,9 +100,8 @@ class Objections:
     def look(self, objection: str, now_ns: int) -> bool:
         """Update `told`, and return whether it has changed.
 
-        `objection` is the present reason why the robot does not follow, "" if it follows. A reason
-        is copied to `told` once the robot has not followed for `GRACE_S`. `now_ns` is the monotonic
-        time, ns.
+        `objection` is the present reason, "" if the robot follows. It is copied to `told` once the
+        robot has not followed for `GRACE_S`.
         """
         if not objection:
             self._since_ns = None

@@ -41,10 +41,7 @@ class News:
         self._told: list[LogEvent] = []
 
     def of(self, events: Events) -> list[Log]:
-        """Return the events that are new in the list `events`, as log messages.
-
-        After a restart of the daemon, all events of the list are new.
-        """
+        """Return the new events as log messages. After a restart of the daemon, all are new."""
         known, told, stamp_ns = self._total, self._told, events.stamp.to_ns()
         if events.total < known:
             if stamp_ns <= self._stamp_ns:
@@ -58,8 +55,6 @@ class News:
 
 
 class _Out:
-    """A topic that is offered to the viewers, and the last message on it."""
-
     def __init__(self, row: Channel, key: str, channel: foxglove.Channel) -> None:
         self.row, self.key, self.channel = row, key, channel
         self.last: bytes | None = None
@@ -73,8 +68,7 @@ class Way(Struct, frozen=True):
     """How the daemon interprets the commands that arrive on one key of the bus."""
 
     native: str
-    """The daemon's own key for commands of this kind, without the robot's id. "*" in it stands for
-    the name of a certificate."""
+    """The daemon's own key, without the robot's id. "*" stands for the name of a certificate."""
     encoding: str = ""
     """Encoding of all commands on the key; "" if each command names its encoding."""
     via: Via = "native"
@@ -83,8 +77,7 @@ class Way(Struct, frozen=True):
 def ways(key_of: Callable[[str], str], ros: RosConfig, source: str) -> dict[str, Way]:
     """Return how the daemon interprets the commands of `source`, by the key on which they arrive.
 
-    The keys are the daemon's keys for twists and wheel speeds, and the keys of ROS. `key_of`
-    returns the full key for a key below the robot's id.
+    The keys are the daemon's own and those of ROS. `key_of` adds the robot's id to a key.
     """
     native = source_keys([source])
     found = {key_of(key): Way(key) for key in (*native, *source_keys([source], "*"))}
@@ -95,20 +88,14 @@ def ways(key_of: Callable[[str], str], ros: RosConfig, source: str) -> dict[str,
 
 
 class Reader:
-    """Converts commands of any kind to messages of the topic `cmd_vel_in/<source>`.
-
-    Wheel speeds are converted with the configuration of the robot.
-    """
+    """Converts commands of any kind to messages of the topic `cmd_vel_in/<source>`."""
 
     def __init__(self, config: Config) -> None:
         self._receiver = Receiver(config.joints, Kinematics(config.drive))
         self._frame = config.odometry.base_frame
 
     def read(self, arrival: Arrival, wall_ns: int) -> TwistStamped:
-        """Return the twist of a command that arrived at `wall_ns`, ns on the wall clock.
-
-        Raises `DecodeError` if the command is not valid.
-        """
+        """Return the twist of a command that arrived at `wall_ns`, or raise `DecodeError`."""
         twist = self._receiver.command(arrival).twist
         return asked(twist, Time.from_ns(wall_ns), self._frame)
 
@@ -116,8 +103,7 @@ class Reader:
 class Commanders:
     """Receives the commands that programs send to the robot. Each command source has a topic.
 
-    A command is decoded as the daemon decodes it. A command that the daemon refuses appears only in
-    the daemon's counters. Only one thread may use this class; Zenoh's threads call `wake`.
+    Only one thread may use this class. Zenoh's threads call `wake`.
     """
 
     def __init__(self, robot: Client, wake: Callable[[], object]) -> None:
@@ -127,7 +113,6 @@ class Commanders:
         self._heard: dict[str, _Heard] = {}
 
     def use(self, facts: Facts) -> None:
-        """Use the configuration and the sources in `facts` from now on."""
         ros, self._deaf = facts.config.ros, bool(facts.deaf)
         self._reader = Reader(facts.config)
         for source in facts.sources:
@@ -141,10 +126,7 @@ class Commanders:
         return self._ways.keys()
 
     def follow(self, topics: Collection[str]) -> None:
-        """Subscribe to the commands of `topics` only, and end the other subscriptions.
-
-        A client over TLS may not receive commands, so over TLS nothing is subscribed.
-        """
+        """Subscribe to the commands of `topics` only. Over TLS, commands are not permitted."""
         wanted = set() if self._deaf else self._ways.keys() & set(topics)
         for topic in self._heard.keys() - wanted:
             self._heard.pop(topic).undeclare()
@@ -152,10 +134,7 @@ class Commanders:
             self._heard[topic] = _Heard(self._robot.session, self._ways[topic], self._wake)
 
     def take(self) -> Iterator[tuple[str, TwistStamped]]:
-        """Yield each command that has arrived since the last call, with its topic.
-
-        A command that cannot be decoded is skipped.
-        """
+        """Yield each decodable command that has arrived since the last call, with its topic."""
         for topic, heard in self._heard.items():
             for arrival, wall_ns in heard.take():
                 try:
@@ -212,10 +191,7 @@ class _Heard:
 
 
 class Relay:
-    """Forwards all topics of a robot to the viewers. Only one thread may use this class.
-
-    Zenoh's threads call `wake` when a message arrives.
-    """
+    """Forwards all topics of a robot to the viewers. Only one thread may use this class."""
 
     def __init__(self, robot: Client, context: foxglove.Context, wake: Callable[[], None]) -> None:
         self._robot, self._context, self._wake = robot, context, wake
@@ -245,14 +221,13 @@ class Relay:
 
     @property
     def commanders(self) -> Collection[str]:
-        """The names of the topics that show commands, one for each command source."""
         return self._commanders.topics
 
     def follow(self, topics: Collection[str], fresh: Collection[str]) -> None:
         """Subscribe only to the keys of `topics`, the topics that viewers look at.
 
-        `fresh` are the topics that have a new viewer. If such a topic is published seldom, send its
-        last message again.
+        Topics in `fresh` have a new viewer, for whom the last message of a seldom one is
+        repeated.
         """
         if self.log_topic in fresh:
             self._news = News()  # a viewer that opens the log sees the last events

@@ -1,7 +1,4 @@
-"""The facts about a robot that the Foxglove bridge needs: its configuration, and what is allowed.
-
-The bridge reads them at its start, and again after each restart of the robot's daemon.
-"""
+"""The robot's configuration and this client's permissions, for the Foxglove bridge."""
 
 from __future__ import annotations
 
@@ -19,10 +16,7 @@ from acsard.host.errors import ReplyError
 
 
 class Facts(Struct, frozen=True):
-    """The configuration and the command sources of a robot, and the permissions of this client.
-
-    `config` has the default values if this program may not read the robot's configuration.
-    """
+    """Facts about a robot. `config` has the default values if this client may not read it."""
 
     config: Config
     tables: object
@@ -31,14 +25,12 @@ class Facts(Struct, frozen=True):
     forbidden: str
     """Reason why this program may not drive, in words; "" if it may."""
     deaf: str = ""
-    """Reason why this program cannot receive the commands of other programs, in words; "" if it
-    can."""
+    """Reason why this program cannot receive other programs' commands, in words; "" if it can."""
 
     def rows(self) -> list[tuple[Channel, str]]:
         """Return the topics to offer to the viewers, each with the name of a command source.
 
-        The topic `CMD_VEL_IN` shows the commands of one source, so it appears once for each source.
-        Every other topic has the source "".
+        `CMD_VEL_IN` appears once for each source. Every other topic has the source "".
         """
         found = []
         for row in published_channels(left_out(self.config)):
@@ -48,18 +40,14 @@ class Facts(Struct, frozen=True):
 
 
 def key_of(row: Channel, source: str) -> str:
-    """Return the key of the messages that the topic `row` shows, without the robot's id.
-
-    `source` replaces the placeholder `<source>` in the key.
-    """
+    """Return the key of the topic's messages, without the robot's id."""
     return row.native.replace(SOURCE, source)
 
 
 def learn(robot: Client) -> Facts:
     """Query the robot for its configuration, its sources and the permissions of this client.
 
-    Raises the errors of `Client.get`, and `ReplyError` if a reply is not readable, for example
-    because the daemon has another version.
+    Raises the errors of `Client.get`, and `ReplyError` if a reply is not readable.
     """
     forbidden, role, deaf = "", "maintainer", ""
     if robot.where.tls:

@@ -1,8 +1,7 @@
 """Starts the WebSocket server of foxglove-sdk, with its callbacks, settings and services.
 
-The library implements the protocol, which has no authentication. So the subcommand
-(`cli/foxglove.py`) accepts only an address of this machine. Viewers call the services in JSON, and
-get the replies of the daemon.
+The protocol has no authentication. So the subcommand (`cli/foxglove.py`) accepts only an address of
+this machine.
 """
 
 from __future__ import annotations
@@ -33,8 +32,7 @@ from acsard.host import clock
 from acsard.host.errors import InUseError, NotPermittedError
 
 POLL_NS = 5 * NS_PER_S
-"""Time between two reads of the settings while a viewer subscribes to a setting, ns. The settings
-are read again because other clients may change them."""
+"""Time between two reads of the settings, which other clients may change, ns."""
 
 
 class Shown:
@@ -47,14 +45,12 @@ class Shown:
         self._fresh: set[str] = set()
 
     def add(self, topic: str, client: int) -> None:
-        """Record that a viewer subscribed to a topic."""
         with self._lock:
             self._viewers.setdefault(topic, set()).add(client)
             self._fresh.add(topic)
         self._wake()
 
     def remove(self, topic: str, client: int) -> None:
-        """Record that a viewer ended its subscription."""
         with self._lock:
             left = self._viewers.get(topic, set())
             left.discard(client)
@@ -63,10 +59,7 @@ class Shown:
         self._wake()
 
     def take(self) -> tuple[set[str], set[str]]:
-        """Return the topics that have viewers, and the topics that have a new viewer.
-
-        A viewer is new if it subscribed after the last call.
-        """
+        """Return the topics with viewers, and those that got a viewer since the last call."""
         with self._lock:
             fresh, self._fresh = self._fresh, set()
             return set(self._viewers), fresh
@@ -75,7 +68,7 @@ class Shown:
 class Settings:
     """The settings of the robot that viewers can read and change while the daemon runs.
 
-    The server's threads answer the viewers. The main thread reads the settings from the daemon.
+    The main thread calls `learn` and `refresh`. The server's threads call the other methods.
     """
 
     def __init__(self, robot: Robot, notices: Notices, tables: object) -> None:
@@ -89,10 +82,7 @@ class Settings:
         self.learn(tables)
 
     def learn(self, tables: object) -> dict[str, Any]:
-        """Store the configuration, and return the settings that changed.
-
-        `tables` is the configuration as plain tables, or None if this program may not read it.
-        """
+        """Store the configuration, None if unreadable, and return the settings that changed."""
         now = {} if tables is None else live_settings(tables)
         with self._lock:
             news = changes(self._known, now)
@@ -107,20 +97,15 @@ class Settings:
             return asked(self._known, names)
 
     def follow(self, names: Collection[str]) -> None:
-        """Record that a viewer follows these settings."""
         with self._lock:
             self._followed.update(names)
 
     def unfollow(self, names: Collection[str]) -> None:
-        """Record that no viewer follows these settings any longer."""
         with self._lock:
             self._followed.difference_update(names)
 
     def set(self, wishes: Mapping[str, Any]) -> dict[str, Any]:
-        """Change all of these settings or none of them, and return their values afterwards.
-
-        All viewers get a message that says whether the daemon has changed the settings.
-        """
+        """Change all of these settings or none of them, and return their values afterwards."""
         try:
             if any(value is None for value in wishes.values()):
                 raise AcsardError("a setting cannot be removed, only changed")
@@ -218,9 +203,7 @@ def start(
     *,
     acts: bool,
 ) -> WebSocketServer:
-    """Start the server at `address`, a host and a port.
-
-    `acts` says whether viewers may send commands and change settings.
+    """Start the server at `address`. `acts` lets viewers send commands and change settings.
 
     Raises `InUseError` if the port is taken, and `NotPermittedError` if the port needs root.
     """
@@ -260,7 +243,6 @@ class Refusals(logging.Handler):
         self._notices = notices
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Report to the viewers if a line of the library's log says that a client was refused."""
         if "handshake failed" in record.getMessage():
             self._notices.say(
                 "warning",
@@ -271,8 +253,7 @@ class Refusals(logging.Handler):
 
 
 CALLED: tuple[Verb, ...] = tuple(verb for verb in SERVICES if verb != "set")
-"""Services that viewers may call with the option `--drive`. `set` is left out, because viewers
-change settings as parameters of the protocol."""
+"""Services with the option `--drive`: all but `set`, because viewers set parameters instead."""
 
 STOPS: tuple[Verb, ...] = ("stop",)
 """Services that viewers may call without the option `--drive`. Any web page in a local browser can

@@ -24,13 +24,11 @@ def replace(
 
     Args:
         file: The file. Other processes find the old file or the new one, never a part of it.
-        content: The content of the new file. Only its owner can read the file until its mode is
-            set.
+        content: The new content. Only the owner can read the file until its mode is set.
         mode: The mode. None keeps that of the old file, and gives a new file `NEW_MODE`.
-        owner: The user and the group. None keeps those of the old file, if this process may set
-            them.
-        synced: True waits for the disk before the rename, so that a power cut leaves the old file
-            or the new one. If False, a power cut before `sync` may leave a part of the new file.
+        owner: The user and the group. None keeps those of the old file, if this process may.
+        synced: True waits for the disk before the rename. If False, a power cut before `sync` may
+            leave a part of the new file.
     """
     kept = owner
     if file.exists():

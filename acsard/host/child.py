@@ -1,11 +1,11 @@
 """Starts child processes, limits them, watches their signs of life, and ends them.
 
-Each child gets a session of its own, so that a Ctrl-C at the terminal reaches only the parent. The
-parent then ends its children in its own way. A child does not outlive its parent.
+Each child gets a session of its own, so that a Ctrl-C at the terminal reaches only the parent,
+which then ends its children. A child does not outlive its parent.
 
-`Child` is used in the parent process, and `Parent` in the child process. A socket, the child's
-standard input, connects them. The child writes a sign of life to the socket again and again, and
-ends when its parent closes the other end. The parent kills a child that falls silent.
+`Child` is used in the parent, and `Parent` in the child. A socket, the child's standard input,
+connects them. The child writes signs of life to it, and ends when the parent closes its end. The
+parent kills a child that falls silent.
 """
 
 from __future__ import annotations
@@ -31,18 +31,14 @@ from acsard.core.values import NS_PER_S
 from acsard.host import clock
 
 OUR_UNIT = ("NOTIFY_SOCKET", "INVOCATION_ID")
-"""Variables that systemd sets for the parent. A child must not notify systemd in the parent's
-name."""
+"""Variables of systemd that a child does not inherit, so that it cannot notify as the parent."""
 
 BEAT_S = 0.5
 """Longest time between two signs of life of a child, and between two checks by its parent, s."""
 
 SILENT_NS = 3 * NS_PER_S
-"""Time without a sign of life after which a child is killed, ns.
-
-The TLS gateway ends itself after a second without progress (`daemon/gateway/listener_process.py`).
-This limit is for a process that cannot even do that.
-"""
+"""Time without a sign of life after which a child is killed, ns. The TLS gateway ends itself after
+1 s without progress, so this limit is for a process that cannot even do that."""
 
 START_NS = 15 * NS_PER_S
 """Longest wait for a child's first sign of life, ns. Python starts slowly on a busy machine."""
@@ -51,18 +47,16 @@ START_NS = 15 * NS_PER_S
 class Silence:
     """Detects that another process has given no sign of life for longer than `most_ns`, ns.
 
-    The computer or a CPU quota may stop both processes for a while. Therefore at most 0.5 s of the
-    time between two calls of `too_long` counts as silence.
+    Of the time between two calls, at most 0.5 s counts, because both processes may be stopped.
     """
 
     def __init__(self, most_ns: int) -> None:
         self._most_ns, self._ns = most_ns, 0
 
     def too_long(self, heard: bool, passed_ns: int) -> bool:
-        """Return whether the other process has been silent for longer than the limit.
+        """Return whether the silence exceeds the limit.
 
-        `heard` says whether it has given a sign of life since the last call. `passed_ns` is the
-        time since that call, ns.
+        `heard` says whether a sign of life came in the `passed_ns` since the last call.
         """
         self._ns = 0 if heard else self._ns + min(passed_ns, NS_PER_S // 2)
         return self._ns > self._most_ns
@@ -102,10 +96,7 @@ def limit(pid: int, limits: Limits) -> None:
 
 
 def how_it_ended(code: int) -> str:
-    """Return how a process ended, in words.
-
-    `code` is its exit code, or the negative number of the signal that ended it.
-    """
+    """Return how a process ended, in words. A negative `code` is the number of a signal."""
     return f"was ended by signal {-code}" if code < 0 else f"ended with {code}"
 
 
@@ -130,8 +121,7 @@ async def running(
 ) -> AsyncIterator[Process]:
     """Start a child process, yield it, and kill it if it still runs at the end of the block.
 
-    `stdin`, `stdout` and `stderr` have the same meaning as in `subprocess`. Raises `OSError` if the
-    child cannot be started.
+    Raises `OSError` if the child cannot be started.
     """
     child = await asyncio.create_subprocess_exec(
         *command,
@@ -168,10 +158,7 @@ class Child:
         """Why the child was killed, or "" if it was not killed."""
 
     def run(self) -> int:
-        """Start the child, wait for its end and return its exit code.
-
-        This call blocks until the child has ended. Raises `OSError` if the child cannot be started.
-        """
+        """Run the child to its end and return its exit code. Raises `OSError` if none can start."""
         ours, its = socket.socketpair()
         with ours:
             with its:
@@ -190,10 +177,7 @@ class Child:
             return process.wait()
 
     def _falls_silent(self, ours: socket.socket) -> bool:
-        """Wait until the child falls silent, ends or is released. Return True if it fell silent.
-
-        `ours` is the parent's end of the socket, on which the signs of life arrive.
-        """
+        """Wait until the child falls silent, ends or is released. Return True if it fell silent."""
         silence, before_ns, alive = Silence(START_NS), clock.mono_ns(), False
         while True:
             beat = ours.recv(4096) if select.select([ours], [], [], BEAT_S)[0] else None
@@ -250,7 +234,6 @@ class Parent:
 def end_with_parent(number: signal.Signals) -> None:
     """Let the kernel send the signal `number` to this process when its parent ends.
 
-    A child calls this function, so that it also ends if its parent crashes. The kernel regards the
-    thread that started this process as the parent, so the end of that thread is enough.
+    It is also sent if the parent crashes, or if only the thread that started this process ends.
     """
     ctypes.CDLL(None).prctl(1, number)  # PR_SET_PDEATHSIG in linux/prctl.h

@@ -1,11 +1,10 @@
 """Reads the clocks of this computer, and detects that it was suspended.
 
 In the daemon, no other module reads a clock. The monotonic clock is CLOCK_MONOTONIC_RAW, because
-NTP makes CLOCK_MONOTONIC faster or slower by up to 8 %. With that clock, each distance that is
-computed as speed times time, and each measured delay of a command, would be wrong by as much.
+NTP makes CLOCK_MONOTONIC up to 8 % faster or slower. Distances and delays would be as wrong.
 
-The times in an `Instant` are whole microseconds. Reading the clocks takes about 1 us, so smaller
-digits mean nothing, and storing them would make a recording twice as large.
+The times in an `Instant` are whole microseconds. Reading the clocks takes about 1 us, and smaller
+digits would make a recording twice as large.
 """
 
 from __future__ import annotations
@@ -17,17 +16,11 @@ from functools import partial
 from acsard.core.values import Instant
 
 mono_ns: Callable[[], int] = partial(time.clock_gettime_ns, time.CLOCK_MONOTONIC_RAW)
-"""Read the monotonic clock, ns.
-
-A Python function would be slower, and the loop calls this one about a dozen times in each period.
-"""
+"""Read the monotonic clock, ns. A Python function would be slower."""
 
 
 def asleep_ns() -> int:
-    """Return how long this computer was suspended since its start, ns.
-
-    The clock `mono_ns` does not advance during a suspend.
-    """
+    """Return for how long this computer was suspended since its start, ns."""
     awake_ns = time.clock_gettime_ns(time.CLOCK_MONOTONIC)
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - awake_ns
 
@@ -51,9 +44,7 @@ def now() -> Instant:
 
 
 MOMENT_NS = 100_000_000
-"""Shortest time that counts as a suspend, ns. Every real suspend takes longer. Setting the wall
-clock does not count as a suspend, because the measured time does not depend on it.
-"""
+"""Shortest time that counts as a suspend, ns. Every real suspend takes longer."""
 
 
 class Asleep:
@@ -64,7 +55,6 @@ class Asleep:
     """
 
     def __init__(self, read: Callable[[], int] = asleep_ns) -> None:
-        """Use `read`, which returns how long the computer was suspended since its start, ns."""
         self._read, self._known_ns = read, read()
 
     def was(self) -> bool:

@@ -54,9 +54,8 @@ def find(path: str | None) -> tuple[str, bytes]:
 def writable(path: str | None) -> Path:
     """Return the path of the configuration file that the option --write changes.
 
-    `path` is the value of --config, or None. Raises `MendableError` if the file or the library
-    tomlkit is missing, if the file is the `acsard.toml` of a clone of acsard, or if this user may
-    not change it.
+    `path` is the value of --config. Raises `MendableError` if the file or tomlkit is missing, if
+    the file is the `acsard.toml` of a clone of acsard, or if this user may not change it.
     """
     require_tomlkit()
     where, text = find(path)
@@ -88,15 +87,13 @@ class Edit(Struct, frozen=True):
     before: bytes
     """The content of the file from which `after` was computed."""
     after: str
-    """The new text of the file."""
 
 
 def keepable(file: Path | None, keys: Keys) -> Edit:
     """Prepare the change that writes these settings into the file of the running daemon.
 
-    `file` is None if the daemon runs without a file. Raises `MendableError` with the reason if the
-    file is None, tracked by git or read-only, if the library tomlkit is missing, or if the text
-    before or after the change is not a valid configuration.
+    Raises `MendableError` if the file is None (the daemon runs without one), tracked by git or
+    read-only, if tomlkit is missing, or if the old or new text is not a valid configuration.
     """
     if file is None:
         raise MendableError(
@@ -120,10 +117,9 @@ def keepable(file: Path | None, keys: Keys) -> Edit:
 
 
 def keep(edit: Edit) -> None:
-    """Write a prepared change into the file.
+    """Write a prepared change. If another program has changed the file since, prepare it again.
 
-    If another program has changed the file since, the change is prepared again first. Raises
-    `MendableError` and leaves the file unchanged if the change cannot be written.
+    Raises `MendableError` and leaves the file unchanged if the change cannot be written.
     """
     try:
         # A change takes 0.2 s to compute, and a person's editor may write the file meanwhile.
@@ -195,9 +191,8 @@ def require_tomlkit() -> None:
 def change(file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = False) -> Keys:
     """Set keys in an `acsard.toml`, and return the keys with their values.
 
-    `keys` may be a function that computes them from the file's configuration. If `new` is true, a
-    missing file is created. Raises `MendableError` and leaves the file unchanged if it cannot be
-    changed.
+    `keys` may be a function of the file's configuration. `new` creates a missing file. Raises
+    `MendableError` and leaves the file unchanged if it cannot be changed.
     """
     try:
         place, text, given = _changed(file, keys, new)
@@ -210,10 +205,7 @@ def change(file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = Fal
 def require_changeable(
     file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = False
 ) -> None:
-    """Raise the `MendableError` that `change` would raise.
-
-    Call this function before long work whose result `change` will write.
-    """
+    """Raise the `MendableError` that `change` would raise. Call this before long work."""
     try:
         place, _, _ = _changed(file, keys, new)
         if not os.access(place.parent, os.W_OK):

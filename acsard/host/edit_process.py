@@ -1,9 +1,7 @@
 """Computes the changed text of an `acsard.toml` for the daemon, in a separate process.
 
-The library tomlkit needs a tenth of a second for a file as long as the reference configuration. In
-a thread of the daemon it would delay the control loop, because it holds the interpreter lock again
-and again, for half a millisecond each time. In a measurement with such a thread, the loop was up to
-12 ms late and missed 3 of 559 periods.
+tomlkit needs 0.1 s, and holds the interpreter lock for half a millisecond at a time. In a thread of
+the daemon, it made the control loop up to 12 ms late, and 3 of 559 periods were missed.
 """
 
 from __future__ import annotations
@@ -41,10 +39,9 @@ class Result(Struct, frozen=True):
 
 
 def edited_apart(text: str, keys: Mapping[str, object]) -> str:
-    """Return a configuration text with new values, which a separate process sets.
+    """Return the configuration text with new values, which a separate process sets.
 
-    `text` is the present text, and `keys` maps dotted keys to the new values. Raises `ValueError`
-    with the reason if the text cannot be changed, and `OSError` if no process can be started.
+    Raises `ValueError` if the text cannot be changed, and `OSError` if no process can start.
     """
     task = msgspec.json.encode(Task(text, dict(keys)))
     # With -P Python ignores the working directory, so it runs the installed package.

@@ -1,10 +1,8 @@
 """Errors with an external cause that a person can fix, and the exit codes of acsard.
 
-Each of these errors is an `AcsardError`. Most are also the built-in exception that Python uses for
-such a case, so a caller may catch either class. The text says what is wrong and how to fix it. The
-attribute `code` is the exit code of a subcommand that ends with the error. `MendableError` itself
-is raised for problems that no other class describes. This module has no errors for bugs, or for
-states of the robot such as a lost port or a stale command.
+Each is an `AcsardError`. Most are also the built-in exception for such a case, so a caller may
+catch either. The text says what is wrong and how to fix it. Bugs, and states of the robot such as a
+lost port, have no errors here.
 """
 
 from __future__ import annotations

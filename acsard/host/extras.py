@@ -37,10 +37,9 @@ def missing(library: str, extra: Extra) -> MendableError:
 
 
 def wanted_by(installed: Distribution, extra: Extra) -> list[str]:
-    """Return the arguments with which `pip install` installs an extra.
+    """Return the arguments of `pip install` for an extra: its source directory with the extra.
 
-    The arguments name the extra and the directory from which `installed` was installed. If that
-    directory no longer exists, they name only the libraries of the extra.
+    If the directory from which `installed` was installed no longer exists, return the libraries.
     """
     told = json.loads(installed.read_text("direct_url.json") or "{}")
     url = urlsplit(told.get("url", ""))

@@ -1,8 +1,7 @@
 """Reads the kernel's counters that can explain why a program was late.
 
-`Kernel` reads the files of the kernel, and the functions in this module decode their text. The
-values of a file are 0 if this computer does not have it or this user may not read it. Reading the
-files can take a few milliseconds, so the control loop never does it.
+A value is 0 if this computer does not have its file or this user may not read it. Reading can take
+a few milliseconds, so the control loop never does it.
 """
 
 from __future__ import annotations
@@ -19,14 +18,12 @@ from acsard.core.values import NS_PER_S
 from acsard.host import clock
 
 SLOWED_BITS = 0b1110
-"""Mask (0b1110) of three bits in the Raspberry Pi's `get_throttled`. They say that at present the
-clock is limited, the processor is throttled, or the soft temperature limit is active."""
+"""Bits of the Raspberry Pi's `get_throttled` that are set while the clock is limited, the processor
+is throttled, or the soft temperature limit is active."""
 
 OWN_SCALING = ("intel_pstate", "amd-pstate", "amd-pstate-epp")
-"""The cpufreq drivers whose governor `powersave` adapts the processor's frequency to the load.
-
-With every other driver, this governor keeps the lowest frequency.
-"""
+"""The cpufreq drivers whose governor `powersave` adapts the frequency to the load. With every other
+driver, this governor keeps the lowest frequency."""
 
 COOLERS = ("Processor", "cpufreq", "thermal-cpufreq", "thermal-idle", "intel_powerclamp")
 """Beginnings of the type names of cooling devices that slow a processor down."""
@@ -54,12 +51,10 @@ class Conditions(Struct, frozen=True, omit_defaults=True):
 class Reading(Struct, frozen=True, omit_defaults=True):
     """The kernel's counters at one moment.
 
-    Each counter is a total since the start of the computer, of this process or of its cgroup. Only
-    the difference between two readings shows the activity in between.
+    Each counter is a total. The difference between two readings shows the activity in between.
     """
 
     asleep_ns: int = 0
-    """Time in which this computer was suspended."""
     steal_ns: tuple[int, ...] = ()
     """Time in which the host of a virtual machine ran something else, for each processor."""
     disk_ns: int = 0
@@ -95,10 +90,7 @@ class Program(Struct, frozen=True):
 
     @property
     def real_time(self) -> bool:
-        """Whether the first thread of the process is a real-time thread.
-
-        Such a thread runs before all ordinary threads.
-        """
+        """Whether the first thread has real-time priority, above all ordinary threads."""
         return self.priority < 0
 
 
@@ -114,11 +106,7 @@ def steal(text: str, tick_ns: int) -> tuple[int, ...]:
 
 
 def iowait(text: str, tick_ns: int) -> int:
-    """Return how long a processor was idle while a program waited for I/O, ns.
-
-    Of all processors, the one with the longest time counts. `text` is the text of `/proc/stat`, and
-    `tick_ns` is the length of the kernel's clock tick.
-    """
+    """Return the longest time, ns, that a processor was idle while a program waited for I/O."""
     return max((int(row[5]) * tick_ns for row in _processors(text)), default=0)
 
 
@@ -129,11 +117,7 @@ def _processors(text: str) -> list[list[str]]:
 
 
 def stalled(text: str) -> int:
-    """Return the time in which at least one task waited for the resource, ns.
-
-    `text` is that of a file of the kernel's pressure stall information, such as
-    `/proc/pressure/io`.
-    """
+    """Return the time in which a task waited, ns, from a file such as `/proc/pressure/io`."""
     for line in text.splitlines():
         if line.startswith("some "):
             return int(line.rpartition("total=")[2]) * 1000
@@ -141,10 +125,7 @@ def stalled(text: str) -> int:
 
 
 def quota(text: str) -> int:
-    """Return the time in which a cgroup did not run because it had used up its CPU quota, ns.
-
-    `text` is that of the cgroup's file `cpu.stat`, in version 1 or 2 of cgroups.
-    """
+    """Return how long a cgroup was stopped by its CPU quota, ns, from `cpu.stat` (v1 or v2)."""
     for line in text.splitlines():
         name, _, value = line.partition(" ")
         if name == "throttled_usec":
@@ -161,10 +142,7 @@ def disk_bytes(text: str) -> int:
 
 
 def fields(text: str) -> list[str]:
-    """Return the fields of `/proc/PID/stat` that follow the name of the program.
-
-    Index 0 of the result is field 3 in the manual page proc(5).
-    """
+    """Return the fields of `/proc/PID/stat` from field 3 of proc(5) on."""
     return text.rpartition(")")[2].split()
 
 
@@ -182,9 +160,8 @@ def busiest(
 ) -> Program | None:
     """Return the process that ran most between two readings, with the time that it ran in between.
 
-    The readings `before` and `after` are `within_ns` ns apart. Processes that cannot delay a thread
-    of the kernel priority `priority` are ignored. Returns None if no other process used a quarter
-    of a processor.
+    The readings are `within_ns` apart. Returns None if no process used a quarter of a processor.
+    Processes that cannot delay a thread of kernel priority `priority` are ignored.
     """
     # A process whose nice value is higher by 9 can still delay the thread noticeably. At a
     # difference of 10, the kernel gives the process only a tenth of the thread's weight.
@@ -200,11 +177,10 @@ def busiest(
 
 
 def slow_clock(policy: Mapping[str, str]) -> SlowClock | None:
-    """Return the limit of a processor's clock frequency if the limit is low, else None.
+    """Return the limit of a processor's clock frequency if it is below 0.6 of the full frequency.
 
-    `policy` maps the names of the files in the processor's `cpufreq` directory to their texts. A
-    limit is low if it is less than 0.6 of the full frequency. The present frequency does not
-    matter, because an idle processor runs slowly and speeds up when there is work.
+    `policy` maps the file names in the processor's `cpufreq` directory to their texts. The present
+    frequency does not matter, because an idle processor runs slowly.
     """
     governor, limit = policy.get("scaling_governor", ""), policy.get("scaling_max_freq", "")
     if governor == "powersave" and policy.get("scaling_driver") not in OWN_SCALING:
@@ -262,7 +238,6 @@ class Kernel:
         )
 
     def conditions(self) -> Conditions:
-        """Read the conditions under which the processor works now."""
         bits = 0
         for path in self._firmware:
             bits |= _number(path, 16)

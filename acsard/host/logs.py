@@ -3,8 +3,7 @@
 A thread writes the lines from a bounded queue, because a full disk, a closed pipe or a stopped
 terminal must not delay the control loop. Lines that do not fit in the queue are dropped.
 
-A line for the journal is a datagram that also contains the values as separate fields. With these
-fields, `journalctl ACSARD_EVENT=link_down` finds exactly the lines of an event.
+In the journal, the values are also separate fields, for `journalctl ACSARD_EVENT=link_down`.
 """
 
 from __future__ import annotations
@@ -65,10 +64,7 @@ def _message(line: Mapping[str, Any]) -> str:
 
 
 class JournalStream(io.StringIO):
-    """Stream that sends each written text to the systemd journal as a datagram.
-
-    The constructor raises `OSError` if there is no journal.
-    """
+    """Stream of datagrams to the journal. `__init__` raises `OSError` if there is no journal."""
 
     def __init__(self, path: str = "/run/systemd/journal/socket") -> None:
         super().__init__()
@@ -132,8 +128,7 @@ class Writer:
 def write_through(stream: TextIO, text: str) -> None:
     """Write directly to the stream's file descriptor, without the stream's buffer.
 
-    A thread that is stuck in a write would hold the lock of the buffer. No other thread could then
-    flush the buffer at the end of the process.
+    A thread stuck in a write would hold the buffer's lock and prevent the flush at the end.
     """
     try:
         fd = stream.fileno()
@@ -147,8 +142,6 @@ def write_through(stream: TextIO, text: str) -> None:
 
 
 class Log:
-    """The daemon's log."""
-
     def __init__(self, settings: LogConfig, stream: TextIO = sys.stderr) -> None:
         form: Form = settings.format if settings.format != "auto" else _fitting(stream)
         if form == "journal":

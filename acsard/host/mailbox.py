@@ -22,10 +22,7 @@ T = TypeVar("T")
 
 
 class Bell:
-    """Signal that wakes one waiting thread.
-
-    If `ring` was called before `wait`, even several times, the next `wait` ends at once.
-    """
+    """Signal that wakes one waiting thread. A `ring` before `wait` ends the next wait at once."""
 
     def __init__(self) -> None:
         self._lock = Lock()
@@ -49,22 +46,15 @@ class Mailbox(Generic[T]):
     """Bounded queue of the items that wait for one reader, in the order of their arrival."""
 
     def __init__(self, most: int, wake: Callable[[], object] | None = None) -> None:
-        """Create an empty mailbox.
+        """Create a mailbox for at most `most` items.
 
-        Args:
-            most: largest number of waiting items.
-            wake: function that `put` calls on the writer's thread after it has stored an item. The
-                default ends the reader's `wait`.
+        `put` calls `wake` on the writer's thread after storing an item. The default ends `wait`.
         """
         self.waiting: deque[T] = deque(maxlen=most)
-        """The items that wait, the oldest on the left. Only the reader may remove items from it.
-
-        The attribute is public because the daemon checks about forty mailboxes in each step. A
-        method call for each of them would take too long.
-        """
+        """The items that wait, the oldest on the left. Only the reader may remove items. It is
+        public because a method call for each of forty mailboxes in each step would be slow."""
         self.lost = 0
-        """Number of items that newer ones have displaced. With several writers it is approximate.
-        """
+        """Number of items that newer ones have displaced; approximate with several writers."""
         self._bell = Bell()
         self.wake = wake or self._bell.ring
         """Function that wakes the reader. A writer that calls `store` must call it afterwards."""
@@ -100,10 +90,9 @@ class Mailbox(Generic[T]):
     # The reader's side
 
     def wakes(self, wake: Callable[[], object]) -> None:
-        """Make writers call the function `wake` to wake the reader, from now on.
+        """Make writers call `wake` from now on. They then no longer end the reader's `wait`.
 
-        Writers then no longer end the reader's `wait`. `wake` is called at once if an item waits or
-        the mailbox is closed.
+        `wake` is called at once if an item waits or the mailbox is closed.
         """
         self.wake = wake
         if self.waiting or self.closed:

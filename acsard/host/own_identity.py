@@ -16,10 +16,7 @@ from acsard.host.processes import called
 
 
 def own_name() -> str:
-    """Return the names of the user, the machine and the program, as "alice@laptop patrol".
-
-    The program is left out if it has no name.
-    """
+    """Return the user, the machine and the program (if it has a name), as "alice@laptop patrol"."""
     try:
         user = pwd.getpwuid(os.getuid()).pw_name
     except KeyError:
@@ -41,10 +38,7 @@ def new_secret() -> str:
 
 
 def own_addresses() -> list[str]:
-    """Return the IP addresses at which other machines can reach this one.
-
-    Loopback and link-local addresses are left out. The list is empty if the command `ip` fails.
-    """
+    """Return this machine's IP addresses, but no loopback or link-local ones; [] if `ip` fails."""
     try:
         found = json.loads(called(("ip", "-json", "address"), 5.0).stdout or "[]")
     except (OSError, ValueError, subprocess.TimeoutExpired):

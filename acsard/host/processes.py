@@ -20,8 +20,6 @@ PTY_MAJORS = range(136, 144)
 
 
 class Holder(Struct, frozen=True):
-    """A process that has a device open."""
-
     pid: int
     name: str
 
@@ -50,10 +48,7 @@ def holders(path: str) -> Iterator[Holder]:
 
 
 def holder_of(path: str) -> Holder | None:
-    """Return another process that uses the device `path`, or None.
-
-    A process with a lock on the device comes before one that only has the device open.
-    """
+    """Return another process that uses the device, preferably one with a lock on it, or None."""
     found = None
     for one in _having_open(path):
         try:
@@ -92,10 +87,7 @@ def name_of(pid: int) -> str:
 
 
 def waited_ns(pid: int) -> int:
-    """Return how long the first thread of a process has waited for a processor in total, ns.
-
-    Returns 0 if the kernel does not report this time.
-    """
+    """Return how long the first thread of a process waited for a processor, ns; 0 if unknown."""
     try:
         return int((PROC / str(pid) / "schedstat").read_text().split()[1])
     except (OSError, IndexError, ValueError):
@@ -103,7 +95,6 @@ def waited_ns(pid: int) -> int:
 
 
 def running(name: str) -> bool:
-    """Return whether any process with this program name runs on this computer."""
     for process in _processes():
         try:
             if _comm(process) == name[:15]:
@@ -159,10 +150,7 @@ def _holder(process: Path) -> Holder:
 
 
 def _name(process: Path) -> str:
-    """Return the program name of a process; `process` is its directory in /proc.
-
-    The name is "acsard" even if Python runs acsard as a module or script.
-    """
+    """Return the program name of a process: "acsard" even if Python runs it as a module."""
     words = (process / "cmdline").read_bytes().split(b"\0")
     if any(Path(os.fsdecode(word)).name == "acsard" for word in words[:4]):
         return "acsard"

@@ -1,9 +1,6 @@
-"""Limits how often something may happen, and how many things may exist at once.
+"""Token buckets that limit rates, and places that limit how many things exist at once.
 
-`Buckets` limits rates with token buckets: one for each name (an address, a token, a text), and one
-for all names together. A bucket with room for one unit enforces a shortest interval. `Places`
-limits how many things, such as connections, exist at the same time, for each name and in all. This
-module is pure.
+A bucket with room for one unit enforces a shortest interval. This module reads no clock.
 """
 
 from __future__ import annotations
@@ -21,7 +18,6 @@ class Rate(NamedTuple):
 
     hz: float
     most: float = 1.0
-    """Number of units that may be taken at once after a pause."""
 
 
 class Bucket:
@@ -31,15 +27,13 @@ class Bucket:
         self._unit_ns = round(NS_PER_S / rate.hz)
         self._burst_ns = round((rate.most - 1.0) * self._unit_ns)
         self._paid_ns = 0
-        """Monotonic time at which the bucket is full again, ns. Each consumed unit adds `_unit_ns`.
-        """
+        """Time at which the bucket is full again, ns. Each consumed unit adds `_unit_ns`."""
 
     def room(self, now_ns: int) -> bool:
         """Return whether the bucket contains a unit now."""
         return self._paid_ns <= now_ns + self._burst_ns
 
     def full(self, now_ns: int) -> bool:
-        """Return whether the bucket has all of its units again."""
         return self._paid_ns <= now_ns
 
     def take(self, now_ns: int) -> bool:
@@ -60,7 +54,6 @@ class Buckets:
         self._buckets: dict[str, Bucket] = {}
 
     def room(self, name: str, now_ns: int) -> bool:
-        """Return whether the bucket of this name contains a unit now."""
         return name not in self._buckets or self._buckets[name].room(now_ns)
 
     def take(self, name: str, now_ns: int) -> bool:
@@ -88,7 +81,6 @@ class Places:
         return self._taken.total()
 
     def room(self, name: str) -> bool:
-        """Return whether a place is free for this name."""
         return self._taken[name] < self._of_one and self.taken < self._most
 
     def enter(self, name: str) -> bool:
@@ -99,7 +91,6 @@ class Places:
         return True
 
     def leave(self, name: str) -> None:
-        """Give one place back."""
         self._taken[name] -= 1
         if not self._taken[name]:
             del self._taken[name]

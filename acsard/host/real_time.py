@@ -15,10 +15,8 @@ PRIORITY = 10
 """Real-time priority of the control loop: below that of the kernel's interrupt threads (50)."""
 
 SPIN_S = 1
-"""Time that the control loop may run without a pause before the kernel ends the process, s. A limit
-is needed because the loop has priority over all ordinary programs. A step takes a thousandth of
-this time.
-"""
+"""Time that the control loop may run without a pause before the kernel ends the process, s. The
+loop precedes all ordinary programs. A step takes a thousandth of this time."""
 
 DOZE = "/dev/cpu_dma_latency"
 """The kernel's device through which a process limits how long a processor may take to wake."""
@@ -49,10 +47,9 @@ def ask() -> str:
 
 
 def has(pid: int) -> bool | None:
-    """Return whether the first thread of a process has real-time scheduling.
+    """Return whether the first thread of a process (0: this one) has real-time scheduling.
 
-    In the daemon, this thread runs the control loop. The process id 0 means this process. Returns
-    None if the scheduling cannot be read.
+    In the daemon, this thread runs the control loop. Returns None if it cannot be read.
     """
     try:
         policy = os.sched_getscheduler(pid)
@@ -64,8 +61,7 @@ def has(pid: int) -> bool | None:
 def allowed() -> bool:
     """Return whether a daemon started by this user would get real-time scheduling.
 
-    Either the capability CAP_SYS_NICE or the limit RLIMIT_RTPRIO grants it. Without the capability,
-    as in a container, the limit also applies to root.
+    CAP_SYS_NICE or RLIMIT_RTPRIO grants it. In a container, root may lack the capability.
     """
     limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
     return _capable(_CAP_SYS_NICE) or limit == resource.RLIM_INFINITY or limit >= PRIORITY
@@ -90,10 +86,7 @@ def _schedule() -> bool:
 
 
 def _stay_awake() -> bool:
-    """Keep the processor out of deep sleep.
-
-    A processor that sleeps between steps takes longer to wake, and finds its caches cold.
-    """
+    """Keep the processor out of deep sleep, from which it wakes late and with cold caches."""
     try:
         wish = os.open(DOZE, os.O_WRONLY | os.O_CLOEXEC)
     except FileNotFoundError:

@@ -1,8 +1,7 @@
 """Informs systemd that this process is ready, alive or stopping, and about its status.
 
-The protocol is that of sd_notify: a datagram with lines `NAME=value`. Nothing is sent if systemd
-did not start this process (`$NOTIFY_SOCKET` is not set). The control loop itself sends
-`WATCHDOG=1`. If the loop hangs, these messages stop, and systemd ends the process.
+The protocol is that of sd_notify: a datagram with lines `NAME=value`. The control loop itself sends
+`WATCHDOG=1`, so systemd ends the process if the loop hangs.
 """
 
 from __future__ import annotations
@@ -13,9 +12,7 @@ from collections.abc import Mapping
 from acsard.core.values import NS_PER_S, Outputs
 
 FEEDS_PER_WATCHDOG = 4
-"""Number of times that the control loop feeds systemd's watchdog within the watchdog's timeout. No
-separate timer feeds it, because systemd could then not see that the loop hangs.
-"""
+"""Number of times that the control loop feeds systemd's watchdog within the watchdog's timeout."""
 
 PATIENCE_S = 30
 """Time by which `waiting` extends systemd's timeout for the start, s."""
@@ -47,7 +44,6 @@ class Systemd:
         self._socket = made
 
     def ready(self) -> None:
-        """Report that the start is complete."""
         self._send("READY=1")
 
     def stopping(self) -> None:
@@ -59,11 +55,9 @@ class Systemd:
         self._send(f"EXTEND_TIMEOUT_USEC={PATIENCE_S * 1_000_000}\nSTATUS={why}")
 
     def status(self, text: str) -> None:
-        """Report a status line, which `systemctl status` shows."""
         self._send(f"STATUS={text}")
 
     def alive(self) -> None:
-        """Tell systemd's watchdog that this process is alive."""
         self._send("WATCHDOG=1")
 
     def step(self, outputs: Outputs) -> None:
@@ -97,7 +91,6 @@ class Systemd:
 
 
 def status_of(outputs: Outputs) -> str:
-    """Return the status in one line, for `systemctl status`."""
     if outputs.mode == "driving":
         twist = outputs.applied
         turn = f", {twist.angular:.1f} rad/s" if abs(twist.angular) >= 0.05 else ""

@@ -21,8 +21,7 @@ def coloured(stream: TextIO) -> bool:
 def one_by_one() -> Iterator[None]:
     """Let standard input deliver each key press at once, and restore the terminal at the end.
 
-    Ctrl-S becomes an ordinary key during the block. Otherwise it would stop the program's output,
-    and so block the program while it drives the robot.
+    Ctrl-S becomes an ordinary key. Otherwise it would block a program that drives the robot.
     """
     before = termios.tcgetattr(sys.stdin)
     tty.setcbreak(sys.stdin)

@@ -1,8 +1,7 @@
 """Runs blocking calls outside the event loop, with a time limit.
 
 The calls run in daemon threads of their own and not in the default executor. A call that never
-returns, such as a driver that hangs in close or a router that does not answer, must not keep the
-process from ending.
+returns, such as a close that hangs in a driver, must not keep the process from ending.
 """
 
 from __future__ import annotations

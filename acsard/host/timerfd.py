@@ -1,8 +1,7 @@
 """A timer of the kernel that wakes the event loop more precisely than asyncio's own timers.
 
-asyncio rounds every wait up to whole milliseconds. The kernel's timerfd wakes the loop on time, and
-counts its expirations. Python itself offers timerfd only from 3.13 on, so this module calls the C
-library.
+asyncio rounds every wait up to whole milliseconds. Python itself offers timerfd only from 3.13 on,
+so this module calls the C library.
 """
 
 from __future__ import annotations

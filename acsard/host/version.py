@@ -1,7 +1,6 @@
 """Finds the version of this program and the commit of its source.
 
-`deploy/build_hook.py` imports this module when it builds a wheel. The module therefore uses only
-the standard library.
+`deploy/build_hook.py` imports this module, which therefore uses only the standard library.
 """
 
 from __future__ import annotations
@@ -14,8 +13,7 @@ from acsard import __version__
 _PACKAGE = Path(__file__).parents[1]
 
 COMMIT_FILE = "commit"
-"""Name of the file in an installed package that contains the commit. `deploy/build_hook.py` adds
-the file."""
+"""Name of the file with the commit, which `deploy/build_hook.py` adds to the package."""
 
 DIGITS = 9
 """Number of digits of the commit in the version."""

@@ -1,9 +1,8 @@
 """Creates the certificate authority of a robot, and certificates that it signs, as files.
 
-The files are `ca.pem`, `certificate.pem`, `key.pem` and `ca-key.pem`. The keys are P-256 keys, in
-files that only their owner can read. People make their phones trust the authority. Its certificate
-therefore limits the hosts for which it may sign. A thief of the authority's key can pose as a robot
-or as a host of a private network, but not as any other web site.
+The keys are P-256 keys, in files that only their owner can read. People make their phones trust the
+authority, so its certificate limits the hosts for which it may sign. A thief of its key can pose as
+a robot or as a host of a private network, but not as any other web site.
 """
 
 from __future__ import annotations
@@ -47,13 +46,10 @@ class Authority:
     ) -> Authority:
         """Create an authority with the common name `name`, and write its files into `directory`.
 
-        `days` is the validity of the certificates that it will sign. Its own certificate is valid
-        for five times as long.
-
-        It may sign for the host names in `addresses` and `LOCAL`, with all names below them, and
-        for the IP addresses in `addresses` and `PRIVATE`. For an IPv6 address in `addresses`, it
-        may sign for the whole /64 network. Common names, which identify clients on the bus, are not
-        limited.
+        Its own certificate is valid for five times `days`. It may sign for the host names in
+        `addresses` and `LOCAL`, with all names below them, and for the IP addresses in `addresses`
+        and `PRIVATE`. For an IPv6 address in `addresses`, it may sign for the whole /64 network.
+        Common names, which identify clients on the bus, are not limited.
         """
         directory.mkdir(mode=0o755, parents=True, exist_ok=True)
         key = ec.generate_private_key(ec.SECP256R1())
@@ -71,10 +67,9 @@ class Authority:
 
     @classmethod
     def load(cls, directory: Path, password: Callable[[], str]) -> Authority:
-        """Load the authority from the files in `directory`.
+        """Load the authority from `directory`. If the key is encrypted, `password` is called.
 
-        If the key is encrypted, `password` is called for the password. Raises `OSError` or
-        `ValueError` if the authority cannot be loaded.
+        Raises `OSError` or `ValueError` if the authority cannot be loaded.
         """
         data = (directory / CA_KEY).read_bytes()
         try:
@@ -89,8 +84,7 @@ class Authority:
     def permits(self, address: str) -> bool:
         """Return whether this authority may sign a certificate for a host name or IP address.
 
-        The certificate of an authority that acsard made lists the permitted names. If another
-        program made the authority, it may have no such list, and then everything is permitted.
+        Without a list of permitted names, all are permitted. acsard always writes a list.
         """
         try:
             constraints = self._certificate.extensions.get_extension_for_class(x509.NameConstraints)
@@ -122,11 +116,10 @@ class Authority:
         return [*names.get_values_for_type(x509.DNSName), *map(str, addresses)]
 
     def issue(self, directory: Path, name: str, addresses: list[str], days: float) -> None:
-        """Sign a certificate for servers and clients, and write its files into `directory`.
+        """Sign a certificate for servers and clients, and write it into `directory`.
 
-        The files are the certificate, its key and the authority's certificate. `name` is the common
-        name. `addresses` are the host names and IP addresses at which the owner of the certificate
-        can be reached. `days` is the validity in days.
+        Its key and the authority's certificate are written too. `name` is the common name.
+        `addresses` are the host names and IP addresses of the certificate's owner.
         """
         directory.mkdir(mode=0o755, parents=True, exist_ok=True)
         key = ec.generate_private_key(ec.SECP256R1())
@@ -184,7 +177,6 @@ def _usage(signs: bool) -> x509.KeyUsage:
 
 
 def _constraints(addresses: Sequence[str]) -> x509.NameConstraints:
-    """Return the list of permitted names for an authority that signs for these addresses."""
     hosts, networks = list(LOCAL), [ipaddress.ip_network(one) for one in PRIVATE]
     for address in addresses:
         named = _general_name(address)

@@ -1,7 +1,4 @@
-"""Examines the certificates of this machine and of the routers that it connects to.
-
-A finding about a problem contains the commands that fix it.
-"""
+"""Examines the certificates of this machine and of the routers that it connects to."""
 
 from __future__ import annotations
 
@@ -33,11 +30,7 @@ from acsard.machine.finding import LEVELS, Finding
 
 
 def certificates(tls: str) -> Iterator[Finding]:
-    """Yield findings about the certificates in the directory `tls`, or nothing if `tls` is "".
-
-    The findings say whether the files exist, whether other users can read the key, and whether the
-    certificates have expired or will expire soon.
-    """
+    """Yield findings about the certificates in the directory `tls`, or nothing if `tls` is ""."""
     if not tls:
         return
     directory = Path(tls)
@@ -103,8 +96,7 @@ def _mend_of_absent(directory: Path) -> str:
 def _command(action: str, directory: Path) -> str:
     """Return the command line of an action of `acsard tls` in this directory.
 
-    If it needs sudo, it contains the full path of acsard, because sudo does not search this user's
-    PATH.
+    With sudo it has the full path of acsard, because sudo does not search this user's PATH.
     """
     there = next(one for one in (directory, *directory.absolute().parents) if one.exists())
     program = "acsard"

@@ -45,8 +45,7 @@ def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -
     """Create an authority, the robot's certificate and one for each role, in `directory`.
 
     Returns the names and addresses in the robot's certificate: those of this machine, and
-    `addresses`. `days` is the validity of the certificates. An existing authority is replaced only
-    if `force` is set.
+    `addresses`. An existing authority is replaced only if `force` is set.
     """
     if (directory / CA).exists() and not force:
         raise MendableError(
@@ -67,8 +66,7 @@ def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -
 def add(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path:
     """Create a client certificate with the common name `name`, and return its directory.
 
-    `directory` contains the authority. `addresses` are host names and IP addresses of the client.
-    `days` is the validity of the certificate in days.
+    `directory` contains the authority. `addresses` are the client's host names and addresses.
     """
     authority = _load(directory)
     place = directory / "clients" / name
@@ -83,8 +81,7 @@ def add(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path
 def renew_client(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path:
     """Replace the client certificate with the common name `name`, and return its directory.
 
-    The new certificate contains `addresses`, and those addresses of the old one for which the
-    authority may sign. `days` is its validity in days.
+    The new one contains `addresses`, and those of the old one that the authority permits.
     """
     authority = _load(directory)
     clients = directory / "clients"
@@ -105,9 +102,8 @@ def renew_client(directory: Path, name: str, addresses: Sequence[str], days: int
 def renew(directory: Path, addresses: Sequence[str], days: int) -> list[str]:
     """Replace the robot's own certificate, and return the names and addresses in the new one.
 
-    The new certificate contains `addresses`. It also contains the names and addresses of this
-    machine and of the old certificate, if the authority may sign for them. `days` is the validity
-    of the new certificate in days.
+    The new one contains `addresses`, and the names and addresses of this machine and of the old
+    certificate that the authority permits.
     """
     authority = _load(directory)
     _require_permitted(authority, addresses)
@@ -121,9 +117,8 @@ def renew(directory: Path, addresses: Sequence[str], days: int) -> list[str]:
 def _names_of(name: str) -> list[str]:
     """Return the host names that a certificate with this common name should contain.
 
-    They are the name itself and NAME.local, if they are possible host names. If a certificate
-    contains no host name, OpenSSL checks its common name, such as `anna.meyer` or `10.0.0.5`, as a
-    host name. It then refuses the certificate if the authority may not sign for this name.
+    If a certificate contains no host name, OpenSSL checks its common name, such as `anna.meyer` or
+    `10.0.0.5`, as a host name. It refuses the certificate if the authority may not sign for it.
     """
     named = [name] if ADDRESS.match(name) else []
     if not HOST_LIKE.match(name) or name.endswith(".local"):
@@ -189,7 +184,6 @@ def _load(directory: Path) -> Authority:
 
 
 def _password() -> str:
-    """Ask for the password of an encrypted authority key."""
     if not sys.stdin.isatty():
         raise UsageError(
             "the authority's key is encrypted: run this in a terminal, where it asks for the "

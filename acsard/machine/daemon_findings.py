@@ -54,8 +54,7 @@ OPTIONS = (
     "mcu.port", "mcu.baud_rate", "robot.id", "bus.listen", "bus.connect", "record.directory",
     "ros.namespace",
 )  # fmt: skip
-"""Keys that `acsard run` takes as options. If the daemon's value of such a key differs from the
-file's, that is probably intended."""
+"""Keys that `acsard run` takes as options. A difference from the file is probably intended."""
 
 WAYS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = (
     (
@@ -83,11 +82,8 @@ WAYS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = (
         "writes a value into the file",
     ),
 )
-"""Possible reasons why the daemon uses another value of a key than the configuration file has.
-
-Each row has four items: a function that says whether the row applies to a key, the level of the
-finding, the reason, and the remedy.
-"""
+"""Reasons why the daemon's value of a key may differ from the file's. Each row has a function that
+says whether it applies to a key, the level of the finding, the reason and the remedy."""
 
 
 class Running(Struct, frozen=True):
@@ -98,27 +94,20 @@ class Running(Struct, frozen=True):
     before: RobotState
     state: RobotState
     looked_ns: int
-    """Wall-clock time of this machine, halfway between the request for `state` and its answer, ns.
-    """
+    """Wall-clock time of this machine halfway between the `state` request and its answer, ns."""
     trip_ns: int = 0
     """Time from the request for `state` to its answer, ns."""
     rows: tuple[DiagnosticStatus, ...] = ()
-    """The rows of the daemon's diagnostics."""
     here: bool = True
-    """Whether the daemon's process is found on this machine.
-
-    The daemon's address does not show this, because it may lead to a tunnel or a router.
-    """
+    """Whether the daemon's process is on this machine. Its address may lead to another machine."""
     events: tuple[LogEvent, ...] = ()
-    """The daemon's last events."""
 
 
 def asked(config: Config, address: Address) -> Running:
-    """Query the daemon at this address for its configuration, its states and its events.
+    """Query the daemon at this address. Raises an `AcsardError` if it does not answer.
 
-    `config` is the configuration in the local file. If this client may not query the daemon's
-    configuration, the result contains `config`, corrected by the daemon's `info`, instead. Raises
-    an `AcsardError` if the daemon does not answer.
+    `config` is the configuration in the local file. It is used, corrected by the daemon's `info`,
+    if this client may not query the daemon's configuration.
     """
     endpoint, robot_id, tls = address
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
@@ -134,11 +123,7 @@ def asked(config: Config, address: Address) -> Running:
 
 
 def _configuration(robot: Client, info: Info, file: Config) -> Config:
-    """Return the daemon's configuration.
-
-    If this client cannot query it, return the local configuration `file` with the values that
-    `info` gives.
-    """
+    """Return the daemon's configuration; if it is not readable, `file` corrected by `info`."""
     try:
         return from_builtins(robot.get("config"))
     except (AcsardError, msgspec.ValidationError):  # not permitted, or a daemon of another version
@@ -275,10 +260,7 @@ def _battery(config: BatteryConfig, battery: BatterySummary | None, mend: str) -
 
 
 def lost(passed: Mapping[str, int], config: Config) -> Iterator[str]:
-    """Yield a warning if the board has not replied to enough of the daemon's lines.
-
-    `passed` gives the increase of each of the daemon's counters in a second.
-    """
+    """Yield a warning if the board answered too few lines. `passed` has the counts of 1 s."""
     sent, came = passed.get("lines_sent", 0), passed.get("lines", 0)
     # With fewer than 40 lines, a fraction means nothing.
     if config.mcu.reply_period or sent < 40 or came >= (1 - LOST) * sent - 1:
@@ -290,10 +272,7 @@ def lost(passed: Mapping[str, int], config: Config) -> Iterator[str]:
 
 
 def refused(counters: Mapping[str, int]) -> list[str]:
-    """Return a list with one warning if the daemon rejected many lines of the board, else [].
-
-    `counters` are the daemon's counters, or their increases in some time.
-    """
+    """Return a warning in a list if the daemon rejected many lines of the board, else []."""
     kinds = {
         name.removeprefix("line_"): count
         for name, count in counters.items()
@@ -306,10 +285,9 @@ def refused(counters: Mapping[str, int]) -> list[str]:
 
 
 def gone(counters: Mapping[str, int]) -> list[tuple[int, str]]:
-    """Return a list with one pair: the number of losses of the link, and a sentence about them.
+    """Return [(number of losses of the link, sentence)], or [] if there was no loss.
 
-    Losses that a stall of the daemon's computer caused do not count. If the number is 0, the list
-    is empty. `counters` are the daemon's counters.
+    Losses that a stall of the daemon's computer caused do not count.
     """
     times = counters.get("link_lost", 0) - counters.get("link_lost_host_stall", 0)
     text = (
@@ -320,7 +298,7 @@ def gone(counters: Mapping[str, int]) -> list[tuple[int, str]]:
 
 
 def check(running: Running) -> str:
-    """Return a text with the command that examines the board, and what to do before."""
+    """Return a text with the command that examines the board, and the preparation that it needs."""
     port = running.config.mcu.port
     return (
         f"`acsard mcu check --port {port}` finds the cause, with the wheels lifted; stop the "
@@ -386,10 +364,7 @@ def routers(config: Config) -> Iterator[Finding]:
 
 
 def found(config: Config, address: Address) -> Running | Finding:
-    """Return the answers of the daemon at this address, or a finding if it does not answer.
-
-    Raises `UsageError` if the endpoint of the address is not valid.
-    """
+    """Return the daemon's answers, or a finding. Raises `UsageError` for an invalid endpoint."""
     endpoint = address.endpoint
     if not answers(endpoint):
         if config.bus.mode == "client" and endpoint in map(reachable, config.bus.connect):
@@ -440,11 +415,7 @@ def daemon(running: Running) -> Iterator[Finding]:
 
 
 def certificate(row: DiagnosticStatus | None, here: bool) -> Iterator[Finding]:
-    """Yield a finding if a certificate that the daemon or its gateway uses expires soon.
-
-    `row` is the row about certificates in the daemon's diagnostics, or None. `here` says whether
-    the daemon runs on this machine; the remedy depends on it.
-    """
+    """Yield a finding if a certificate that the daemon or its gateway uses expires soon."""
     if row is None or not row.level:
         return
     mend = "run `acsard doctor` on that machine, which examines its files"
@@ -463,8 +434,7 @@ def certificate(row: DiagnosticStatus | None, here: bool) -> Iterator[Finding]:
 def late(running: Running) -> Iterator[Finding]:
     """Yield a warning if the daemon misses control periods, and the last known causes.
 
-    The daemon's counters show the periods that were missed since its start. If those are few, its
-    diagnostics show whether periods were missed recently. Its events name the causes.
+    The counters cover the time since the daemon's start. The diagnostics cover recent periods.
     """
     counters = running.state.counters
     missed, lines = counters.get("missed_periods", 0), counters.get("lines_sent", 0)
@@ -488,12 +458,10 @@ def late(running: Running) -> Iterator[Finding]:
 
 
 def clocks(running: Running) -> Iterator[Finding]:
-    """Yield a warning if the daemon's clock differs from this machine's.
+    """Yield a warning if the daemon's clock differs from this machine's, or if it replaced stamps.
 
     The daemon read its clock at an unknown moment between the request and the answer. So a
-    difference of up to 0.4 s plus half of the time between the two is tolerated.
-
-    Also yield a warning if commands came with stamps from the future. Zenoh replaces such stamps.
+    difference of up to 0.4 s plus half of that time is tolerated.
     """
     its_ns, counters = running.state.stamp.to_ns(), running.state.counters
     apart = (its_ns - running.looked_ns) / NS_PER_S
@@ -509,10 +477,7 @@ def clocks(running: Running) -> Iterator[Finding]:
 
 
 def gyro(does: str, counters: Mapping[str, int]) -> Iterator[Finding]:
-    """Yield a finding about the gyro's status, and one if the daemon rejected its samples.
-
-    `does` is the status in the daemon's `state`. `counters` are the daemon's counters.
-    """
+    """Yield a finding about the gyro's status `does`, and one if the daemon rejected samples."""
     words = next((text for name, text in WORDS.items() if name == does), does)
     if does != "off":
         mend = next(

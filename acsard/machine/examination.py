@@ -1,12 +1,11 @@
 """Runs all examinations of `acsard doctor` in order.
 
-This module itself examines the configuration, the machine and the serial port.
-`certificate_findings.py` examines the certificates, and `daemon_findings.py` examines the daemon
-and its link. The doctor opens no port, and only queries a robot.
+`certificate_findings.py` examines the certificates, and `daemon_findings.py` the daemon and its
+link. The doctor opens no port, and only queries a robot.
 
-If a daemon runs, the doctor examines the daemon's configuration. The file may have changed since
-the daemon's start, and options may override the file. If the daemon runs on another machine, the
-doctor examines only its reports, because its port, files and gateway are on that machine.
+If a daemon runs, the doctor examines the daemon's configuration, which may differ from the file
+after an edit or through options. If the daemon runs on another machine, the doctor examines only
+its reports, because its port, files and gateway are there.
 """
 
 from __future__ import annotations
@@ -63,9 +62,7 @@ def clock_set() -> Iterator[Finding]:
 def scheduling(wanted: bool, pid: int | None) -> Iterator[Finding]:
     """Yield a finding that says whether the daemon has or would get real-time scheduling.
 
-    Args:
-        wanted: the setting control.real_time.
-        pid: the process id of the daemon. If it is None, the permissions of this user are examined.
+    `wanted` is control.real_time. If `pid` is None, the permissions of this user are examined.
     """
     has = None if pid is None else real_time.has(pid)
     if not wanted:
@@ -158,15 +155,13 @@ def examine(
     given: dict[str, dict[str, object]],
     told: Callable[[Config], Address] = address_of,
 ) -> Iterator[Finding]:
-    """Yield all findings of the doctor.
+    """Yield all findings of the doctor. Raises `UsageError` if the address is not a valid endpoint.
 
     Args:
         where: the path of the configuration file, for messages.
         text: the content of the configuration file.
         given: values that override those of the file, by table and key.
         told: function that returns the daemon's address for a configuration.
-
-    Raises `UsageError` if the address is not a valid endpoint.
     """
     try:
         config = parse(text, given)

@@ -12,10 +12,7 @@ LEVELS: tuple[Level, ...] = ("ok", "warning", "failure")
 
 
 class Finding(Struct, frozen=True):
-    """The result of `acsard doctor` for one subject.
-
-    `mend` is the remedy for a problem. If the level is ok, it is advice or "".
-    """
+    """Result of `acsard doctor` for one subject. `mend` is the remedy, advice or ""."""
 
     subject: str
     level: Level

@@ -23,17 +23,13 @@ BOARDS: dict[str, str] = {
     "0403:6015": "FTDI FT-X",
     "10c4:ea60": "Silicon Labs CP210x",
 }
-"""USB ids of common microcontroller boards and USB-to-serial chips, with their names.
-
-The file deploy/udev/70-acsar.rules must contain the same ids, and a test checks this.
-"""
+"""USB ids of common microcontroller boards and USB-to-serial chips, with their names. A test checks
+that deploy/udev/70-acsar.rules has the same ids."""
 
 BY_ID = Path("/dev/serial/by-id")
 
 
 class SerialDevice(Struct, frozen=True):
-    """One serial port of this machine."""
-
     device: str
     names: list[str]
     """Links to the port whose names stay the same when the device is plugged in again."""

@@ -1,9 +1,8 @@
 """Installs acsard as a system service, or removes it.
 
-The files of the service come from `deploy/`; the path of this installation is inserted into the
-units. A file that another person or program has written is neither overwritten nor removed without
-force. Each step of an installation is an object with a text, so that the user can read all steps
-before they are carried out.
+The files come from `deploy/`, with the path of this installation in the units. A file that another
+person or program has written is neither overwritten nor removed without force. The user can read
+the text of every step before the steps are carried out.
 """
 
 from __future__ import annotations
@@ -122,8 +121,6 @@ class File(Struct, frozen=True):
 
 
 class Write(Struct, frozen=True):
-    """Step that writes a file."""
-
     file: File
 
     def __str__(self) -> str:
@@ -184,12 +181,9 @@ class Keep(Struct, frozen=True):
 
 
 class Run(Struct, frozen=True):
-    """Step that runs a command."""
-
     words: tuple[str, ...]
     may_fail: bool = False
-    """True if the installation goes on after a failure of the command. For example, the machine may
-    have no udev."""
+    """True if the installation goes on after a failure, as on a machine without udev."""
 
     def __str__(self) -> str:
         return f"run     {' '.join(self.words)}"
@@ -281,9 +275,8 @@ def admitting(directory: Path) -> Write | Keep | None:
     """Return the step that gives the service's TLS gateway the certificates in `directory`.
 
     Return None if the service is not installed, or if the user is not root. The step writes a
-    drop-in, which is a file that extends the gateway's unit. Without it, the gateway may use only
-    loopback and cannot read root's files. An existing drop-in keeps its networks, because an
-    administrator may have narrowed them.
+    drop-in of the gateway's unit. Without it, the gateway may use only loopback and cannot read
+    root's files. An existing drop-in keeps its networks, because they may have been narrowed.
     """
     if os.geteuid() != 0 or not (UNITS / GATEWAY).exists():
         return None
@@ -294,8 +287,7 @@ def admitting(directory: Path) -> Write | Keep | None:
 def admitted(file: File, found: bytes | None, directory: Path) -> Write | Keep:
     """Return the step that makes a drop-in name the certificates in `directory`.
 
-    A drop-in is a file that extends a unit of systemd. `file` is the drop-in as the installation
-    writes it. `found` is its present content, which the step changes, or None if it is missing.
+    `file` is the installation's drop-in. `found` is its present content, which the step changes.
     """
     place = str(directory).encode()
     text = re.sub(
@@ -314,10 +306,9 @@ def present(wanted: Iterable[File]) -> dict[Path, bytes | None]:
 
 
 def installing(wanted: Iterable[File], found: Found, *, force: bool) -> list[Step]:
-    """Return the steps that install the service.
+    """Return the steps that install the service; `found` has the present contents of the files.
 
-    `found` gives the present contents of the files `wanted`. Raises `MendableError` if a step would
-    replace a changed file, unless `force` is set.
+    Raises `MendableError` if a step would replace a changed file, unless `force` is set.
     """
     steps: list[Step] = []
     changed: list[str] = []
@@ -361,12 +352,10 @@ def uninstalling(
 ) -> list[Step]:
     """Return the steps that remove the service, with a reason for each file that stays.
 
-    `found` gives the present contents of the files `wanted`. `others` are further paths in the
-    service's directories. `stateful` are the units that have a state directory.
-
-    A changed file stays unless `force` or `purge` is set. Only `purge` removes a changed file with
-    `kept`, the `others`, and the state directories. To purge a state directory, the steps first
-    install its unit again if the unit is missing.
+    `others` are further paths in the service's directories. `stateful` are the units that have a
+    state directory. A changed file stays unless `force` or `purge` is set. Only `purge` removes a
+    changed file with `kept`, the `others`, and the state directories. To purge a state directory,
+    the steps first install its unit again if the unit is missing.
     """
     wanted, stateful = list(wanted), list(stateful)
     # systemd knows the real path of a state directory, but only while the unit is installed. An
@@ -414,10 +403,7 @@ def state(unit: str) -> str:
 
 
 def source() -> Path:
-    """Return the directory `deploy/`.
-
-    It is inside the package if acsard is installed, and beside the package in a clone.
-    """
+    """Return the directory `deploy/`: in the package, or beside the package in a clone."""
     package = Path(acsard.__file__).parent
     inside = package / "deploy"
     if inside.is_dir():

@@ -1,9 +1,8 @@
 """Writes a file or a directory atomically, and protects recordings against an overwrite.
 
-The content is written under another name in the same directory and renamed at the end. Therefore
-the target is complete or absent. With `force` an existing target is replaced, but only if it is a
-regular file or a ROS bag. A recording is replaced only by another recording that contains all of
-it. A directory with other files is never replaced.
+The target is complete or absent, because it is renamed at the end. With `force` an existing target
+is replaced, but only if it is a regular file or a ROS bag. A recording is replaced only by another
+recording that contains all of it.
 """
 
 from __future__ import annotations
@@ -36,12 +35,9 @@ def replacing(
 ) -> Iterator[Path]:
     """Yield a temporary path to write to, and rename it to `new` when the block succeeds.
 
-    Without `force`, an existing `new` is an error. Raises `FileExistsError` if `new` must not be
-    replaced, and any other `OSError`. After an error `new` is unchanged and the temporary file is
-    removed.
-
-    Args:
-        may_replace: takes the recording at `new`, and returns whether `force` may replace it.
+    Raises `FileExistsError` if `new` must not be replaced, for example because `force` is not set.
+    `may_replace` says whether `force` may replace the recording at `new`. After an error `new` is
+    unchanged and the temporary file is removed.
     """
     _require_free(new, force, may_replace)
     part = _near(new, "part")
@@ -63,8 +59,7 @@ def synced(stream: BinaryIO) -> None:
 def _put(part: Path, new: Path) -> None:
     """Rename `part` to `new`.
 
-    No system call replaces a directory that contains files. Therefore an existing directory at
-    `new` is renamed first, and deleted at the end.
+    No system call replaces a directory with files, so an existing directory is renamed first.
     """
     if not new.is_dir():
         os.replace(part, new)
@@ -121,10 +116,7 @@ def _recording(path: Path) -> Recording | None:
 
 
 def _remove(path: Path) -> None:
-    """Remove a file, or the files of a ROS bag and their directory.
-
-    The removal is not recursive, because that could delete more than a bag.
-    """
+    """Remove a file or a ROS bag. A recursive removal could delete more than a bag."""
     if path.is_dir() and not path.is_symlink():
         for file in path.iterdir():
             file.unlink()

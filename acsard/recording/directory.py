@@ -44,13 +44,10 @@ from acsard.recording.retention import (
 DIRECTORY_MODE = 0o750
 
 OPEN_DIRECTORY_MODE, OPEN_MODE = 0o755, 0o644
-"""Modes of the directory and its files when the daemon records as a systemd service.
-
-The modes let every user read. This is safe because only root can enter the parent directory. The
-robot's web page, which must read the recordings, gets the directory from its systemd unit as a
-read-only mount. Group permissions cannot give the page access, because a dynamic group has no name,
-and systemd 257 makes the user nobody the owner of state directories.
-"""
+"""Modes of the directory and its files when the daemon records as a systemd service. Every user may
+read them, but only root can enter the parent directory. The robot's web page gets the directory as
+a read-only mount of its unit. Group permissions cannot give the page access: a dynamic group has no
+name, and systemd 257 makes the user nobody the owner of state directories."""
 
 PRIVATE = Path("/var/lib/private")
 """Parent of the state directories of services with a dynamic user. Only root can enter it."""
@@ -67,17 +64,13 @@ ENDINGS: dict[Kind, str] = {"plain": WHOLE, "near": NEAR, "kept": KEPT}
 
 TRIM_ROUNDS = 600
 """Number of calls of `Ring.tend`, one each second, between two searches for files that are too old.
-
-These ten minutes are short enough, because a file may cover an hour.
-"""
+A file may cover an hour, so ten minutes are short enough."""
 
 S_PER_DAY = 86400
 
 FRESH_S = 10.0
-"""Time without a write, s, after which a `.part` file no longer counts as being recorded.
-
-A daemon writes once a second. If the disk hangs for longer, the daemon's log reports it.
-"""
+"""Time without a write after which a `.part` file no longer counts as being recorded, s. A daemon
+writes once a second."""
 
 STAMP = "%Y%m%dT%H%M%SZ"
 """Format of the time in a file's name: the time at which the file began, in UTC."""
@@ -95,10 +88,7 @@ def listed(directory: Path) -> list[Path]:
 
 
 def is_being_recorded(path: Path, now_s: float) -> bool:
-    """Return whether a daemon is writing to this recording. `now_s` is the time now, s since 1970.
-
-    Raises `OSError` if the file cannot be examined.
-    """
+    """Return whether a daemon writes to the file at `now_s`, s since 1970. Raises `OSError`."""
     return path.name.endswith(PART) and abs(now_s - path.stat().st_mtime) < FRESH_S
 
 
@@ -116,20 +106,16 @@ def _stem(path: Path) -> str:
 
 
 def mark_cut(part: Path, kind: Kind, cut: Literal["late", "disk"]) -> None:
-    """Create a marker file for a `.part` file whose end could not be written.
+    """Create a marker file for a `.part` file whose end could not be written, or raise `OSError`.
 
-    Without the marker, the next start would treat the file as cut off by a crash. The marker is an
-    empty file whose name holds the retention class `kind` and the cause `cut`. Even a full disk
-    usually accepts a new name. Raises `OSError` if the disk does not.
+    Without the marker, the next start would treat the file as cut off by a crash. It is an empty
+    file with `kind` and `cut` in its name, because even a full disk usually accepts a new name.
     """
     part.with_name(f".{part.name}.{kind}.{cut}{MARKER}").touch()
 
 
 def _marked(part: Path) -> tuple[Kind, str] | None:
-    """Return the retention class and the cause from the marker of a `.part` file.
-
-    Returns None if the file has no marker, so that a crash may have cut it off.
-    """
+    """Return the retention class and the cause from the marker of a `.part` file, if it has one."""
     for marker in part.parent.glob(f".{part.name}.*{MARKER}"):
         words = marker.name.removeprefix(f".{part.name}.").removesuffix(MARKER)
         first, _, cut = words.partition(".")
@@ -145,10 +131,8 @@ class Run(Struct):
     numbers: set[int] = field(default_factory=set)
     """The numbers in the names of the files that ended in this run of the daemon."""
     cut: dict[str, Kind] = field(default_factory=dict)
-    """Retention class of each file that a disk error cut off in this run, by the file's name.
-
-    All other `.part` files without a marker were cut off by a crash before this run.
-    """
+    """Retention class of each file that a disk error cut off in this run, by the file's name. Other
+    `.part` files without a marker were cut off by a crash before this run."""
     freed: int = 0
     """Number of bytes deleted because the disk refuses to write; 0 after a successful write."""
     clock: ClockWatch = field(default_factory=ClockWatch)
@@ -165,8 +149,7 @@ class Ring:
     ) -> None:
         """Lock the directory, make room in it, and finish the files that were cut off.
 
-        `run` is the state of this run of the daemon, or None for a new one. `refused` is true if
-        the last write failed because the disk was full.
+        `refused` is true if the last write failed because the disk was full.
         """
         self._directory = Path(settings.directory)
         self._bytes, self._days = int(settings.megabytes * 1e6), settings.days
@@ -234,10 +217,7 @@ class Ring:
                 self._retain_before(part, found.st_mtime_ns)
 
     def _retain_before(self, part: Path, cut_ns: int) -> None:
-        """Retain the files that ended less than a minute before a crash cut off `part`.
-
-        `cut_ns` is the time of the crash, ns since 1970.
-        """
+        """Retain the older files that ended within a minute of the crash at `cut_ns`."""
         for path in listed(self._directory):
             # Another process may have just removed the file.
             with suppress(FileNotFoundError):
@@ -249,10 +229,7 @@ class Ring:
                     self.retain(path)
 
     def _open_files(self) -> None:
-        """Let every user read the directory and its files.
-
-        An earlier version may have made them with other modes.
-        """
+        """Let every user read the directory and its files, also those of an earlier version."""
         for path in (self._directory, *listed(self._directory)):
             mode = OPEN_DIRECTORY_MODE if path == self._directory else OPEN_MODE
             # The file may belong to another user. Recording goes on in any case.
@@ -278,8 +255,7 @@ class Ring:
     def end(self, writing: Writing, kind: Kind, cut: str = "", why: str = "") -> Path:
         """Finish a file, rename it for its retention class `kind`, and return its new path.
 
-        If the daemon did not end in the ordinary way, `cut` is a key of `CUTS`, and `why` may
-        explain that cause. Otherwise both are "".
+        `cut` is a key of `CUTS` with the explanation `why`, or "" after an ordinary end.
         """
         writing.finish(cut, why)
         path = writing.path.with_name(_stem(writing.path) + ENDINGS[kind])
@@ -289,10 +265,7 @@ class Ring:
         return path
 
     def just_ended(self, now: Instant) -> Iterator[tuple[Path, Kind, int]]:
-        """Yield the files that ended less than a minute ago according to the wall clock.
-
-        Each item is the path, the retention class, and the monotonic time of the end, ns.
-        """
+        """Yield path, class and monotonic end, ns, of files that ended less than a minute ago."""
         for file in self._ended():
             ago_ns = now.wall_ns - int(file.at_s * NS_PER_S)
             if 0 <= ago_ns < AROUND_NS:
@@ -320,10 +293,7 @@ class Ring:
             self.trim(now)
 
     def _shift_times(self, jumped_ns: int) -> None:
-        """Add a jump of the wall clock to the times of the files that ended in this run.
-
-        Otherwise these files would seem older or newer than they are.
-        """
+        """Add a jump of the wall clock to the times of the files that ended in this run."""
         for path in listed(self._directory):
             if _number(path) in self._run.numbers:
                 # Another process may have just removed the file.
@@ -335,12 +305,9 @@ class Ring:
     def trim(self, now: Instant | None, refused: bool = False) -> None:
         """Delete files that exceed the limits of total size, of age or of free disk space.
 
-        A file that is being written is never deleted. This method also sets `file_bytes`, the size
-        above which the present file should end.
-
-        Args:
-            now: the present time, or None if it is not known; then no file counts as too old.
-            refused: true if the last write failed because the disk was full.
+        The file that is being written is never deleted. This method sets `file_bytes`, the size
+        above which that file should end. If `now` is None, the time is not known and no file counts
+        as too old. `refused` is true if the last write failed because the disk was full.
         """
         ended, disk = self._ended(), self._disk()
         oldest_s = -math.inf

@@ -1,7 +1,4 @@
-"""The metadata record at the end of a finished recording.
-
-It holds the times of the recording, a summary of its events, and the cause if it was cut off.
-"""
+"""The metadata record at the end of a finished recording."""
 
 from __future__ import annotations
 
@@ -24,14 +21,11 @@ END = "acsard end"
 """Name of the MCAP metadata record that holds the `EndRecord`."""
 
 TAIL_BYTES = 1 << 16
-"""Number of bytes at the end of a file in which the end record is searched for.
-
-The end record of a typical recording begins 1960 bytes before the end of the file.
-"""
+"""Number of bytes at the end of a file in which the end record is searched for. It typically begins
+1960 bytes before the end of the file."""
 
 _NAMED = struct.pack("<I", len(END)) + END.encode()
-"""Name of the end record, after the length of the name. In the file, the record's head is before
-these bytes."""
+"""The end record's name after its length. In the file, the record's head precedes these bytes."""
 
 _FOOTER = HEAD.pack(Opcode.FOOTER, 20)
 """Head of the MCAP footer, which has 20 bytes."""
@@ -49,26 +43,17 @@ CUTS = {
     "late": "cut: the daemon was asked to end, and the disk was too slow to write the last steps",
     "open": "cut, or still being recorded, when it was recovered",
 }
-"""Maps each cause that cuts off a recording to its description.
-
-For the cause `bug`, the failing daemon itself finishes the file. For every other cause, the file is
-finished later.
-"""
+"""Maps each cause that cuts off a recording to its description. For the cause `bug`, the failing
+daemon itself finishes the file. For every other cause, the file is finished later."""
 
 
 class EndRecord(Struct, frozen=True):
-    """Content of the metadata record at the end of a recording.
-
-    A list of recordings needs only this record of each file.
-    """
+    """The end record of a recording. A list of recordings needs only this record of each file."""
 
     wall_ns: Ns
     """Wall-clock time at which the recording began, ns since 1970."""
     last_ns: Ns
-    """Wall-clock time of the last message, ns since 1970.
-
-    A message with several steps has the time of its first step.
-    """
+    """Wall-clock time of the last message (for steps, of their first step), ns since 1970."""
     said: str
     """Summary of the events in a few words, from `timeline.summary`."""
     cut: str = ""
@@ -76,10 +61,8 @@ class EndRecord(Struct, frozen=True):
     why: str = ""
     """For the cause `bug`, the step in which the daemon failed and the exception; otherwise ""."""
     earliest_ns: Ns | None = None
-    """Earliest wall-clock time of a message, ns since 1970; None if it is not known.
-
-    It is before `wall_ns` if the clock was set back during the recording.
-    """
+    """Earliest wall-clock time of a message, ns since 1970; None if it is not known. It is before
+    `wall_ns` if the clock was set back during the recording."""
 
 
 CRASHES = frozenset({"bug", "crash"})
@@ -87,10 +70,9 @@ CRASHES = frozenset({"bug", "crash"})
 
 
 def how_it_ends(cut: str, why: str = "") -> str:
-    """Describe how a recording was cut off, from the fields `cut` and `why` of its end record.
+    """Describe how a recording was cut off, from the fields of its end record.
 
-    Returns "" if the daemon ended in the ordinary way, and "cut" for a cause that only a later
-    version knows.
+    Returns "" if the daemon ended in the ordinary way, and "cut" for a cause of a later version.
     """
     if not cut:
         return ""
@@ -133,10 +115,7 @@ def end_in(data: bytes) -> EndRecord | None:
 
 
 def _last(tail: bytes) -> dict[str, str] | None:
-    """Return the metadata of the end record in the last bytes of a file.
-
-    Returns None if the file is not finished.
-    """
+    """Return the metadata of the end record in `tail`, or None if the file is not finished."""
     footer_at = len(tail) - len(MAGIC) - 20 - HEAD.size
     if footer_at < 0 or not (tail.startswith(_FOOTER, footer_at) and tail.endswith(MAGIC)):
         return None

@@ -1,9 +1,8 @@
 """Exports a recording for other programs: as ROS messages in MCAP or a ROS bag, or as CSV.
 
 In the CSV table each feedback line and each gyro sample has its own row. The columns for `acsard
-calibrate` come first. The columns `odom_...` hold the pose from odometry. Calibration must not use
-them as a measured position: odometry is computed from the wheels, so calibration would compare the
-wheels with themselves.
+calibrate` come first. Calibration must not use the columns `odom_...` as a measured position,
+because odometry is computed from the wheels that it calibrates.
 """
 
 from __future__ import annotations
@@ -45,8 +44,6 @@ _ENDLESS = "{sec: 9223372036, nsec: 854775807}"
 
 
 class BagTopic(Struct, frozen=True):
-    """A topic of a ROS bag."""
-
     name: str
     type: str
     qos: Qos
@@ -73,17 +70,11 @@ def offered_qos(qos: Qos) -> str:
 
 
 def bag_metadata(file: str, topics: Sequence[BagTopic], first_ns: int, last_ns: int) -> str:
-    """Return the `metadata.yaml` that makes a ROS bag of a directory with one MCAP file.
+    """Return the `metadata.yaml` that makes a ROS bag of a directory with the MCAP file `file`.
 
-    The text has format version 5 with numeric QoS policies, which every ROS 2 release since Humble
-    reads. The MCAP file holds the same QoS text in the metadata of each channel, because
-    `ros2 bag play FILE` reads the QoS there.
-
-    Args:
-        file: name of the MCAP file.
-        topics: the topics in the file.
-        first_ns: wall-clock time of the earliest message, ns since 1970.
-        last_ns: wall-clock time of the latest message, ns since 1970.
+    Every ROS 2 release since Humble reads format version 5 with numeric QoS policies. The MCAP file
+    has the same QoS text in the metadata of each channel, where `ros2 bag play FILE` reads it.
+    `first_ns` and `last_ns` are the earliest and the latest wall-clock time of a message.
     """
     count = sum(topic.count for topic in topics)
     begins = f"nanoseconds_since_epoch: {first_ns}"
@@ -125,11 +116,8 @@ def _quoted(text: str) -> str:
 
 
 MEASURED = ("t [s]", "fr [rad/s]", "fl [rad/s]", "rl [rad/s]", "rr [rad/s]", "yaw_rate [rad/s]")
-"""Columns that calibration reads.
-
-`t` is the wall-clock time, s since 1970. `yaw_rate` is from a gyro. The others are the speeds of
-the wheels: front right, front left, rear left and rear right.
-"""
+"""Columns that calibration reads: the wall-clock time, s since 1970, the speeds of the wheels
+(front right, front left, rear left and rear right), and the yaw rate from a gyro."""
 
 OUTPUT_COLUMNS = (
     "odom_x [m]", "odom_y [m]", "odom_yaw [rad]", "linear [m/s]", "angular [rad/s]",
@@ -176,8 +164,8 @@ def wheel_columns(estimate: Estimate) -> str:
 def gyro_columns(sample: GyroSample, now: Instant) -> str:
     """Return the columns of `MEASURED` for a gyro sample. The wheel speeds are empty.
 
-    The time is the sample's stamp. Without a stamp it is the sample's arrival, converted from the
-    monotonic clock to the wall clock with the offset of the two clocks at `now`.
+    Without a stamp, the time is the arrival, converted to wall-clock time with the offset in
+    `now`.
     """
     arrived_ns = sample.at_ns + now.wall_ns - now.mono_ns
     at_ns = arrived_ns if sample.stamp_ns is None else sample.stamp_ns
@@ -195,8 +183,6 @@ SUFFIX: dict[Kind, str] = {"mcap": ".ros2.mcap", "csv": ".csv", "rosbag2": ".ros
 
 
 class ExportResult(Struct, frozen=True):
-    """Result of an export."""
-
     count: int
     """Number of messages, or of rows of a CSV table."""
     gaps: list[Gap]
@@ -210,29 +196,19 @@ class _Writer:
     """Number of messages or rows so far."""
 
     def step(self, step: Step, outputs: Outputs) -> None:
-        """Write a step and its replayed outputs."""
         raise NotImplementedError
 
     def skip(self, step: Step, inside: bool) -> None:
-        """Process a step whose outputs are not exported.
-
-        `inside` is false for a step outside of the time span. It is true for a step in the time
-        span that cannot be replayed; then the log lines of the step are exported nevertheless.
-        """
+        """Process a step that is not exported. If it is `inside` the span, export its log lines."""
 
     def end(self, ending: str = "") -> None:
-        """Write the log lines after the last step.
-
-        `ending` says how the recording was cut off; it is "" if the daemon ended normally.
-        """
+        """Write the log lines after the last step; `ending` says how a recording was cut off."""
 
     def finish(self) -> None:
         """Write the end of the file."""
 
 
 class _MessageWriter(_Writer):
-    """Writes ROS messages to an MCAP file."""
-
     def __init__(self, stream: BinaryIO, run: RecordedRun, about: About, name: str) -> None:
         self._run = run
         self._publisher = Publisher(run.robot, about.started_ns or about.wall_ns)
@@ -276,7 +252,6 @@ class _MessageWriter(_Writer):
         self.count += 1
 
     def _open(self, channel: Channel, source: str) -> int:
-        """Register a new channel, and return its number in the file."""
         kind = channel.schema_name
         if kind not in self._schemas:
             text = channel.schema.encode()
@@ -302,8 +277,6 @@ class _MessageWriter(_Writer):
 
 
 class _TableWriter(_Writer):
-    """Writes a CSV table."""
-
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
         self._stream.write(f"{CSV_HEADER}\n".encode())
@@ -326,15 +299,12 @@ def export(
     """Replay a recording and write its messages to `new`: a file, or a directory for `rosbag2`.
 
     Args:
-        kind: the format of the exported file.
         other: the configuration to replay with; None for the recorded one.
-        span: the part of the recording to export.
         progress: called every `PROGRESS_STEPS` steps.
         force: overwrite `new`, as far as `atomic_output.replacing` allows it.
 
     Raises:
-        RecordingError: nothing was recorded in the span of time, or the recording cannot be
-            replayed.
+        RecordingError: nothing was recorded in `span`, or the recording cannot be replayed.
         FileExistsError: `new` must not be overwritten.
         OSError: the disk refuses to write. After any error no partial file is left.
     """
@@ -405,16 +375,12 @@ def _write_steps(
 
 
 def _gaps(run: RecordedRun, span: Span, about: About) -> list[Gap]:
-    """Return the gaps that overlap the time span."""
     begin_ns, end_ns = [about.mono_ns + seconds * NS_PER_S for seconds in span]
     return [gap for gap in run.gaps if gap.begin_ns < end_ns and gap.end_ns > begin_ns]
 
 
 def measured(recording: Recording) -> bytes:
-    """Return the CSV table that `acsard calibrate` reads.
-
-    Raises `RecordingError` if the recording has no gyro samples, because calibration cannot use it.
-    """
+    """Return the CSV table for `acsard calibrate`. Raises `RecordingError` without gyro samples."""
     run = RecordedRun(recording)
     lines, has_gyro = [MEASURED_CSV_HEADER], False
     with run.state_errors():

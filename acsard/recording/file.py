@@ -3,20 +3,17 @@
 A file has four channels:
 - `steps`: batches of steps, as `rows.py` encodes them.
 - `events`: one event per message, in JSON.
-- `state`: the complete `Robot` object between two steps, as `state.py` encodes it. Each of these
-  messages has its own chunk. Therefore damage to a chunk of steps does not destroy a state, and
-  damage to a state does not destroy steps. A file that begins after the daemon's first step has a
-  `state` message first.
+- `state`: the complete `Robot` object between two steps, as `state.py` encodes it. Each state has
+  its own chunk, so that damage to a chunk of steps does not destroy a state. A file that begins
+  after the daemon's first step has a `state` message first.
 - `unfinished`: the inputs of the step in which the daemon failed.
 
 A metadata record names the robot and the version of acsard, and an attachment holds the
 `acsard.toml`. A finished file has both at its beginning and before its end, because nothing can be
-replayed without them. The metadata of the channels, and a further metadata record, explain the file
-to a person who opens it with another MCAP program.
+replayed without them.
 
-The messages are in chunks of about ten seconds, which `mcap_records.py` writes. A file that was cut
-off has no end record, but all data that was synced to the disk can still be read. `rewrite` copies
-its messages to a new, finished file.
+A file that was cut off has no end record, but all data that was synced to the disk can still be
+read. `rewrite` copies its messages to a new, finished file.
 """
 
 from __future__ import annotations
@@ -57,10 +54,8 @@ from acsard.recording.state import Checkpoint
 from acsard.recording.timeline import INCIDENTS, TimelineEntry, summary
 
 CHUNK_NS = 10 * NS_PER_S
-"""Longest time that an MCAP chunk covers, ns.
-
-Longer chunks would save little space, and damage to a chunk would destroy more data.
-"""
+"""Longest time that an MCAP chunk covers, ns. Longer chunks would save little space, and damage to
+a chunk would destroy more data."""
 
 CHUNK_BYTES = 1 << 20
 """Uncompressed size at which a chunk ends, bytes. Ten seconds of driving take 160 000 bytes."""
@@ -71,10 +66,8 @@ MODE = 0o640
 Topic = Literal["steps", "events", "state", "unfinished"]
 
 CHANNELS: tuple[Topic, ...] = ("steps", "state", "events", "unfinished")
-"""Channels in the order of their MCAP channel numbers, which begin with 1.
-
-The reader relies on this order, because the records that define the channels may be damaged.
-"""
+"""Channels in the order of their MCAP channel numbers, which begin with 1. The reader relies on
+this order, because the records that define the channels may be damaged."""
 
 NUMBERS = {topic: number for number, topic in enumerate(CHANNELS, 1)}
 
@@ -126,10 +119,8 @@ class About(Struct, frozen=True):
     """Configuration at the beginning of the recording, as an `acsard.toml` with every key."""
     format: str = FORMAT
     started_ns: Ns = 0
-    """Wall-clock time of the daemon's start, ns since 1970; 0 if it is not known.
-
-    The daemon may have started hours before this recording began.
-    """
+    """Wall-clock time of the daemon's start, ns since 1970; 0 if it is not known. The daemon may
+    have started hours before this recording began."""
 
 
 class EndRecordBuilder:
@@ -160,11 +151,7 @@ class EndRecordBuilder:
             self._incidents.append(event)
 
     def end_record(self, cut: str = "", why: str = "") -> EndRecord:
-        """Return the end record for the messages so far.
-
-        If the daemon did not end in the ordinary way, `cut` is a key of `CUTS`, and `why` may
-        explain that cause. Otherwise both are "".
-        """
+        """Return the end record for the messages so far, with the cause `cut` and `why`."""
         text = summary(self._incidents, self._starts)
         return EndRecord(self._wall_ns, self._last_ns, text, cut, why, self._earliest_ns)
 
@@ -200,10 +187,7 @@ class Index:
         self._totals.chunk_count += 1
 
     def record(self, record: McapRecord, at: int, length: int) -> None:
-        """Add a record to the index if it is metadata or an attachment. Ignore all other records.
-
-        `at` is the offset of the record in the file, and `length` is its size, both in bytes.
-        """
+        """Add metadata or an attachment to the index. Its offset `at` and `length` are in bytes."""
         if isinstance(record, Metadata):
             self._totals.metadata_count += 1
             self._places.append(MetadataIndex(at, length, record.name))
@@ -219,10 +203,7 @@ class Index:
 
 
 class Writing:
-    """A recording that is being written.
-
-    Every method may raise `OSError`. After that, call only `close`.
-    """
+    """A recording that is being written. After an `OSError` of any method, call only `close`."""
 
     def __init__(self, path: Path, about: About, mode: int = MODE) -> None:
         self.path, self._mode = path, mode
@@ -318,11 +299,7 @@ class Writing:
         self._index.chunk()
 
     def finish(self, cut: str = "", why: str = "") -> None:
-        """Write the end of the file and close it.
-
-        If the daemon did not end in the ordinary way, `cut` is a key of `CUTS`, and `why` may
-        explain that cause. Otherwise both are "".
-        """
+        """Write the end of the file and close it. `cut` and `why` are fields of `EndRecord`."""
         self.end_chunk()
         for record in self._about:
             self._write(record)
@@ -367,10 +344,7 @@ def _is_intact(metadata: Mapping[str, str]) -> bool:
 
 
 def _definitions() -> Iterator[McapRecord]:
-    """Yield the records that define the schema and the channels.
-
-    A file contains them at its beginning and in its summary section.
-    """
+    """Yield the records that define the schema and the channels."""
     schema = msgspec.json.encode(msgspec.json.schema(TimelineEntry))
     yield Schema(EVENTS_SCHEMA, schema, "jsonschema", "acsard.TimelineEntry")
     for topic, number in NUMBERS.items():
@@ -394,10 +368,8 @@ class Recording:
                 f"cannot read {path}: {error.strerror}; `acsard recording` lists the recordings"
             ) from None
         self.ended = False
-        """True if the file is finished. This is known only after `messages` was read to its end.
-
-        A finished file may be damaged just before its end. `damaged` then counts that place too.
-        """
+        """True if the file is finished (known only after `messages` has ended). A finished file may
+        be damaged just before its end, which `damaged` counts too."""
         self.damaged = 0
         """Number of damaged places, mostly MCAP chunks, that have readable data after them."""
         self.cut = ""
@@ -410,28 +382,19 @@ class Recording:
 
     @property
     def whole(self) -> bool:
-        """True if the file is finished and has no damaged place.
-
-        This is known only after `messages` has been read to its end.
-        """
+        """True if the file is finished and undamaged (known only after `messages` has ended)."""
         return self.ended and not self.damaged
 
     @property
     def ending(self) -> str:
-        """How the recording ended, in words, or "" if the daemon ended normally.
-
-        This is known only after `messages` has been read to its end.
-        """
+        """How the recording ended, or "" if normally (known only after `messages` has ended)."""
         if not self.ended:
             return UNFINISHED
         return how_it_ends(self.cut, self.why)
 
     @property
     def missing(self) -> str:
-        """The damaged places and the ending in words, or "" if the recording is whole.
-
-        This is known only after `messages` has been read to its end.
-        """
+        """Damaged places and ending in words, or "" (known only after `messages` has ended)."""
         places = many(self.damaged, "damaged place is", "damaged places are")
         damaged = f"{places} left out" if self.damaged else ""
         return "; ".join(filter(None, [damaged, self.ending]))
@@ -531,10 +494,7 @@ def rewrite(recording: Recording, path: Path, cut: str = "open") -> int:
 
 
 def is_part(part: Recording, recording: Recording) -> bool:
-    """Return whether `recording` has the metadata and all the messages of `part`.
-
-    If so, no data is lost when `recording` replaces `part`.
-    """
+    """Return whether `recording` has the metadata and all the messages of `part`."""
     if part.about != recording.about:
         return False
     return Counter(part.messages()) <= Counter(recording.messages())

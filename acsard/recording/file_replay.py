@@ -1,7 +1,4 @@
-"""Replays a recording file, from its first step to its end.
-
-After a damaged place the replay goes on at the next point for which the file has the robot's state.
-"""
+"""Replays a recording file. After damage, it goes on at the next state of the robot in the file."""
 
 from __future__ import annotations
 
@@ -49,11 +46,7 @@ INCOMPLETE_STATE_ERRORS = (
 
 
 class Gap(Struct):
-    """A part of a recording that is not replayed.
-
-    It consists of the steps that cannot be read, and of the steps between them and the next state
-    of the robot in the file.
-    """
+    """A part that is not replayed: from unreadable steps to the next state of the robot."""
 
     begin_ns: int
     """Monotonic time of the last replayed step before the gap, ns."""
@@ -70,21 +63,14 @@ class Gap(Struct):
 
 
 class ReplayResult(NamedTuple):
-    """Result of the replay of a file."""
-
     comparison: Comparison
     gaps: list[Gap]
     """The parts of the file that are not compared."""
     failed_step: str = ""
-    """Sentence that says whether this version fails in the same step as the recorded daemon.
-
-    It is "" if the daemon did not fail.
-    """
+    """Sentence that says whether this version fails in the same step as the recorded daemon; "" if
+    the daemon did not fail."""
     event_copies: str = ""
-    """Sentence about the first event that differs from its copy in the channel `events`.
-
-    It is "" if all copies are equal.
-    """
+    """Sentence about the first event that differs from its copy in the channel `events`, or ""."""
 
     @property
     def same(self) -> bool:
@@ -113,10 +99,7 @@ def steps(recording: Recording) -> Iterator[Step]:
 def _items(
     recording: Recording, copies: EventCopies | None = None
 ) -> Iterator[list[Step] | Checkpoint]:
-    """Yield the batches of steps and the states of the robot, in order.
-
-    If `copies` is not None, it receives the same steps, and the messages of the channel `events`.
-    """
+    """Yield the batches of steps and the states of the robot. Pass steps and events to `copies`."""
     for topic, _, data in recording.messages():
         if topic == "events" and copies is not None:
             copies.copy(data)
@@ -133,11 +116,9 @@ def _items(
 
 
 MAX_STATE_BYTES = 8
-"""Total size of the states that may be decoded after gaps, in bytes for each byte of the file.
-
-`MAX_BYTES` are allowed in addition. A file stores a state compressed to a third of its size, so a
-genuine file stays below this limit. Without it, the replay of a forged file of 5 kB took 4 s.
-"""
+"""Total size of the states that may be decoded after gaps, in bytes per byte of the file.
+`MAX_BYTES` are allowed in addition. A genuine file stays below this limit. Without the limit, the
+replay of a forged file of 5 kB took 4 s."""
 
 
 class _Source:
@@ -158,9 +139,8 @@ class _Source:
     def state_errors(self) -> Iterator[None]:
         """Raise `RecordingError` if the block fails because the recorded state is incomplete.
 
-        Wrap every use of the robot in this context. The state may come from other code or a forged
-        file, so any part of the robot may be missing or of a wrong type. If the robot does not come
-        from the file, an error of the block is a defect of this version and is raised as it is.
+        Wrap every use of the robot in this context, because a forged state may lack any part. If
+        the robot is not from the file, an error of the block is a defect and is raised as it is.
         """
         try:
             yield
@@ -178,16 +158,11 @@ class _Source:
         number: int,
         tried: Callable[[Config], Config] | None = None,
     ) -> State | None:
-        """Decode the robot in the checkpoint `saved`, which was made just before the step `number`.
+        """Decode the robot in `saved` if it was saved just before the step `number`.
 
-        Return None if `saved` was made before another step, if this version cannot read the robot,
-        or if the states that were decoded after gaps exceed their limit in size.
-
-        Args:
-            saved: the last checkpoint that was read; None if there is none.
-            number: number of the next step.
-            tried: function that takes the configuration of the decoded robot, and returns the
-                configuration that replaces it. None keeps the configuration.
+        Return None if it was not, if this version cannot read the robot, or if the states decoded
+        after gaps exceed their limit in size. `tried` takes the configuration of the decoded robot,
+        and returns the configuration that replaces it.
         """
         if saved is None or saved.number != number:
             return None
@@ -207,8 +182,7 @@ class _Source:
 class RecordedRun(_Source):
     """The steps of a recording that can be replayed, and the robot as it was before each of them.
 
-    If steps are missing, the run goes on with the next state of the robot in the file. The steps
-    before that state are left out, because the robot before them is not known.
+    If steps are missing, the run goes on with the next state of the robot in the file.
     """
 
     def __init__(self, recording: Recording, other: Config | None = None) -> None:
@@ -227,12 +201,8 @@ class RecordedRun(_Source):
         self.skipped: Callable[[Step], None] = lambda step: None
         """Called with each step that can be read but not replayed."""
         self.copies = EventCopies(recording)
-        """Compares the events in the steps with their copies in the channel `events`."""
         self._next, self._state = _first_state(recording)
-        """Number of the step that `robot` can replay next, and the recorded robot.
-
-        `_state` is None if the replay begins with a new robot.
-        """
+        """Number of the step that `robot` can replay next; recorded robot, None for a new robot."""
         self.robot, self.memory = self._state or (Robot(self.config), Memory())
         """The robot with which to replay, and its guard's memory. Both are replaced after a gap."""
         if self._state is not None:
@@ -295,10 +265,7 @@ class RecordedRun(_Source):
         return gap
 
     def _resume(self, saved: Checkpoint | None, number: int) -> bool:
-        """Continue with the robot in `saved` if it is the robot just before the step `number`.
-
-        Returns whether the replay can continue.
-        """
+        """Continue with the robot in `saved` before the step `number`; return False if it fails."""
         other = self._other
         tried = None if other is None else partial(_with_changes, other, self._recorded)
         state = self._resumed(saved, number, tried)
@@ -312,8 +279,7 @@ class RecordedRun(_Source):
 def _with_changes(other: Config, recorded: Config, present: Config) -> Config:
     """Return `other` with the settings that changed from `recorded` to `present`.
 
-    If `other` does not permit these changes, return `other` itself, because a robot with that
-    configuration would have refused them.
+    If `other` forbids these changes, return `other`, because its robot would have refused them.
     """
     before = dict(flat(effective(recorded)))
     changes = {k: v for k, v in flat(effective(present)) if before.get(k) != v}
@@ -328,8 +294,7 @@ def replay_file(
 ) -> ReplayResult:
     """Replay a recording with the configuration `other`, or with its own if `other` is None.
 
-    Calls `progress` every `PROGRESS_STEPS` steps. Raises `RecordingError` if this version cannot
-    replay the recording.
+    Calls `progress` every `PROGRESS_STEPS` steps. Raises `RecordingError` if the replay fails.
     """
     run = RecordedRun(recording, other)
     with run.state_errors():
@@ -347,8 +312,7 @@ def replay_file(
 def _failed_step(recording: Recording, robot: Robot, last: int | None) -> str:
     """Run the step in which the daemon failed; return `ReplayResult.failed_step`.
 
-    `robot` is the replayed robot after the step with the number `last`. The failed step must be
-    the next one.
+    `robot` is the robot after the step with the number `last`. The failed step must be the next.
     """
     if recording.unfinished is None:
         return ""
@@ -369,8 +333,7 @@ def _failed_step(recording: Recording, robot: Robot, last: int | None) -> str:
 class DisplayReplay(_Source):
     """Replay of a recording for display.
 
-    After missing steps it goes on at once with the robot as it was before them. Until the next
-    state of the robot in the file, this robot may differ from the recorded one.
+    After missing steps, the replayed robot may be wrong until the next state in the file.
     """
 
     def __init__(self, recording: Recording) -> None:
@@ -397,7 +360,6 @@ class DisplayReplay(_Source):
     def steps(self) -> Iterator[tuple[Step, Outputs, Robot]]:
         """Yield each recorded step, its replayed outputs, and the robot after the step.
 
-        After a gap the robot may differ from the recorded one until the next state in the file.
         Raises `RecordingError` if the recorded state lacks a part that a step uses.
         """
         saved: Checkpoint | None = None
@@ -425,9 +387,8 @@ class DisplayReplay(_Source):
 def _first_state(recording: Recording) -> tuple[int, State | None]:
     """Return the number of the first step, and the recorded robot before that step.
 
-    Returns 0 and None if the recording has no state before its first step. Then the replay begins
-    with a new robot. Raises `RecordingError` if the state is damaged, or if this version cannot
-    read it.
+    Returns 0 and None if the recording has no state before its first step. Raises `RecordingError`
+    if the state is damaged, or if this version cannot read it.
     """
     for topic, _, data in recording.messages():
         if topic == "state":
@@ -451,11 +412,9 @@ def _foreign(recording: Recording, reason: str) -> RecordingError:
 class EventCopies:
     """Finds the first copy of an event that differs from the event of its step.
 
-    A file has each event twice: in its step, where the replay checks the event, and as a message of
-    the channel `events`, from which the summary of the recording is made.
-
-    Call `batch` for each batch of steps, `copy` for each message of the channel `events`, both in
-    the order of the file, and `end` after the last message.
+    A file has each event twice: in its step, and as a message of the channel `events`. Call `batch`
+    for each batch of steps and `copy` for each of these messages, in the order of the file, and
+    `end` after the last message.
     """
 
     def __init__(self, recording: Recording) -> None:
@@ -463,19 +422,14 @@ class EventCopies:
         """Sentence about the first copy that differs, or "" if all copies are equal."""
         self._recording = recording
         self._events: list[TimelineEntry] = []
-        """The events of the last batch of steps."""
         self._copies: list[TimelineEntry] = []
-        """The copies that followed the last batch."""
         self._number: int | None = None
         """Number of the step that follows the last batch."""
         self._damaged = 0
         """Number of damaged places before the last batch."""
 
     def batch(self, steps: list[Step]) -> None:
-        """Compare the copies of the previous batch, and store the events of a new batch of steps.
-
-        The messages that `copy` adds next are copies of the new batch's events.
-        """
+        """Compare the copies of the previous batch, and store the events of a new batch."""
         self._compare(last=False, follows=self._number in (None, steps[0].number))
         self._number, self._damaged = steps[-1].number + 1, self._recording.damaged
         self._events = [
@@ -493,11 +447,7 @@ class EventCopies:
             self._differs(str(error))
 
     def end(self) -> None:
-        """Compare the copies of the last batch.
-
-        If the file is finished and undamaged, also compare the summary in its end record with its
-        events.
-        """
+        """Compare the copies of the last batch, and in a whole file the summary at its end."""
         recording = self._recording
         self._compare(last=True)
         if self.difference or not recording.whole:
@@ -508,14 +458,10 @@ class EventCopies:
             self._differs(f'the end of the file says "{end.said}", and its events say "{said}"')
 
     def _compare(self, last: bool, follows: bool = True) -> None:
-        """Compare the copies with the events of the batch before them.
+        """Compare the copies with the events of their batch, unless damage may have mixed them up.
 
-        Copies may be missing at the end of a file that was cut off. If there is damage between this
-        batch and the next one, the copies may belong to a batch that cannot be read.
-
-        Args:
-            last: true for the copies of the last batch.
-            follows: true if no step is missing between this batch and the next one.
+        `last` is true for the last batch, whose copies may be missing if the file was cut off.
+        `follows` is true if no step is missing before the next batch.
         """
         recording = self._recording
         if recording.damaged > self._damaged or not follows:

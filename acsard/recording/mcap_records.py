@@ -9,9 +9,8 @@ while it grows:
 3. When the chunk is complete, it replaces this head by the true head.
 
 The reader does not need the head. Each zstd block holds its own length, and the sequence number of
-each message is the message's checksum. So the reader recovers every second that was written before
-a cut or a damaged place. After a damaged chunk or a record whose length is wrong, it searches for
-the next complete chunk.
+each message is the message's checksum. After a damaged chunk or a record whose length is wrong, the
+reader searches for the next complete chunk.
 """
 
 from __future__ import annotations
@@ -31,11 +30,7 @@ from mcap.records import Attachment, DataEnd, Footer, Header, McapRecord, Metada
 from zstandard import COMPRESSOBJ_FLUSH_BLOCK, ZstdCompressionParameters
 
 LEVEL = 9
-"""Compression level of zstd.
-
-The compression of ten seconds of steps takes 2 to 8 ms. The result is 13 to 16 % smaller than with
-level 3.
-"""
+"""zstd level. Ten seconds of steps take 2 to 8 ms, and are 13 to 16 % smaller than at level 3."""
 
 PARAMETERS = ZstdCompressionParameters.from_level(
     LEVEL, source_size=1 << 18, write_content_size=False
@@ -43,22 +38,13 @@ PARAMETERS = ZstdCompressionParameters.from_level(
 """Parameters of zstd for a chunk of 256 KiB. The compressor then needs 3 MB of memory."""
 
 LAST_BLOCK = b"\x01\0\0"
-"""The empty zstd block that ends a chunk.
-
-If a chunk was cut off after a whole block, this block completes it.
-"""
+"""The empty zstd block that ends a chunk. It completes a chunk that was cut off after a block."""
 
 MAX_CHUNK_BYTES = 1 << 23
-"""Largest uncompressed size of a chunk that is read, bytes.
-
-A recorder writes chunks of at most 1 MiB plus one message.
-"""
+"""Largest uncompressed chunk that is read, bytes. Recorders write up to 1 MiB and a message."""
 
 MAX_MESSAGE_BYTES = 1 << 22
-"""Largest size of a message that is read, bytes.
-
-A message with one second of steps and 20 commands has 16 000 bytes.
-"""
+"""Largest message that is read, bytes. One second of steps and 20 commands take 16 000 bytes."""
 
 _HEAD = struct.Struct("<BQQQQII4sQ")
 """Head of a chunk's record: opcode, length, first and last time, size and CRC-32 of the
@@ -81,7 +67,6 @@ _MESSAGE = struct.Struct("<BQHIQQ")
 """Head of a message's record: opcode, length, channel, sequence number, and the time twice."""
 
 MAX_DATA_BYTES = MAX_MESSAGE_BYTES - _MESSAGE.size
-"""Largest size of the data of a message that is read, in bytes."""
 
 _CHECKED = struct.Struct("<HQ")
 """Layout of a message's channel and time. The checksum covers these bytes, and then the data."""
@@ -95,10 +80,7 @@ _BLOCK_BYTES = 1 << 17
 """Largest size of a zstd block, compressed and uncompressed."""
 
 _BLOCK_EFFORT = 1 << 10
-"""Fixed part of the work of unpacking a block, in unpacked bytes.
-
-Unpacking an empty block takes about as long as unpacking 1 KiB of a large block.
-"""
+"""Fixed work per block, in unpacked bytes. An empty block takes about as long as 1 KiB of data."""
 
 _REPEATED = 1
 """Type of a zstd block that holds one byte, which is repeated."""
@@ -122,7 +104,6 @@ def _head(first_ns: int, last_ns: int, size: int, crc: int, length: int) -> byte
 
 
 GROWING_HEAD = _head(0, 0, 0, 0, _ENDLESS)
-"""Head of a chunk that still grows."""
 
 
 class GrowingChunk:
@@ -136,7 +117,6 @@ class GrowingChunk:
         self.first_ns, self._last_ns = _ENDLESS, 0
         """Earliest and latest wall-clock time of a message, ns since 1970."""
         self._out: list[bytes] = []
-        """Compressed bytes since the last `take`."""
 
     @property
     def has_unwritten(self) -> bool:
@@ -154,18 +134,12 @@ class GrowingChunk:
         self._out += [self._compressor.compress(head), self._compressor.compress(data)]
 
     def take(self) -> bytes:
-        """Return the compressed bytes of the messages since the last call of `take`.
-
-        The concatenated bytes of all calls hold all messages so far.
-        """
+        """Return the compressed bytes of the messages since the last call of `take`."""
         self._out.append(self._compressor.flush(COMPRESSOBJ_FLUSH_BLOCK))
         return self._taken()
 
     def end(self) -> tuple[bytes, bytes]:
-        """End the chunk. Return its last compressed bytes, and its true head.
-
-        The true head replaces `GROWING_HEAD` in the file.
-        """
+        """End the chunk. Return its last bytes, and the true head that replaces `GROWING_HEAD`."""
         self._out.append(self._compressor.flush())
         last = self._taken()
         return last, _head(self.first_ns, self._last_ns, self.size, self._crc, self._length)
@@ -186,7 +160,6 @@ class ReadChunk(NamedTuple):
     """Offset after the last block that ends with a complete message."""
     messages: list[Message]
     complete: bool
-    """True if the whole chunk can be read."""
     effort: int = 0
     """Work of reading the chunk: its unpacked bytes, plus `_BLOCK_EFFORT` for each block."""
 
@@ -214,10 +187,7 @@ def chunk_places(data: bytes, begin: int) -> Iterator[int]:
 
 
 def read_chunk(data: bytes, begin: int) -> ReadChunk | None:
-    """Read the chunk whose head begins at the offset `begin` of the file `data`.
-
-    Returns None if no chunk begins there.
-    """
+    """Read the chunk whose head begins at the offset `begin`. Returns None if there is none."""
     at = begin + _HEAD.size
     named = data.startswith(ZSTD, begin + _NAME_AT)
     if at > len(data) or not (named or data[begin] == Opcode.CHUNK):
@@ -252,9 +222,8 @@ def read_chunk(data: bytes, begin: int) -> ReadChunk | None:
 
 
 def _blocks(data: bytes, at: int) -> Iterator[tuple[int, bytes, bool]]:
-    """Yield each zstd block from the offset `at` on.
+    """Yield the end offset and the data of each zstd block, and whether it is the last block.
 
-    Yields the offset of the block's end, its uncompressed bytes, and whether it is the last block.
     Raises `ZstdError` for a damaged block.
     """
     begin = at + zstandard.frame_header_size(data[at : at + _LONGEST_FRAME_HEAD])
@@ -276,8 +245,8 @@ def _blocks(data: bytes, at: int) -> Iterator[tuple[int, bytes, bool]]:
 def _messages(data: bytearray) -> tuple[list[Message], int, int]:
     """Decode the complete messages at the beginning of the data.
 
-    Returns the messages, the number of their bytes, and the number of bytes that the next message
-    needs. The last number is greater than `MAX_MESSAGE_BYTES` if the next message is damaged.
+    Returns the messages, their size, and the size of the next message. The last number is greater
+    than `MAX_MESSAGE_BYTES` if the next message is damaged.
     """
     messages: list[Message] = []
     at = 0
@@ -303,7 +272,6 @@ DAMAGE = (
 """Exceptions that the MCAP library raises for bytes that are not valid MCAP."""
 
 MAGIC = b"\x89MCAP0\r\n"
-"""Magic bytes at the start of every MCAP file."""
 
 MAX_EFFORT = 256
 """Limit on the work of unpacking damaged chunks, in unpacked bytes for each byte of the file.
@@ -328,7 +296,6 @@ OTHERS = frozenset(Opcode) - READ.keys() - {Opcode.CHUNK}
 
 
 def encoded(*records: McapRecord) -> bytes:
-    """Return the bytes of records, one after the other."""
     builder = RecordBuilder()
     for record in records:
         record.write(builder)
@@ -341,23 +308,21 @@ class Found(NamedTuple):
     record: McapRecord | None
     """The record; None for a chunk and for damage."""
     chunk: ReadChunk | None
-    """The readable part of a chunk; None for other records."""
+    """The readable part of a chunk, even if the chunk is damaged; None for other records."""
     end: int
-    """Offset in the file, bytes, at which this item ends and the reader goes on."""
+    """Offset at which this item ends and the reader goes on, bytes."""
     damaged: bool = False
     """True for a damaged place. False for the incomplete end of a file that was cut off."""
 
     @property
     def messages(self) -> list[Message]:
-        """Messages of the chunk; empty for other records."""
         return self.chunk.messages if self.chunk else []
 
 
 def walk(data: bytes) -> Iterator[Found]:
     """Yield the records, chunks and damaged places of a file, up to its footer or its end.
 
-    If unpacking the damaged chunks takes more work than `MAX_EFFORT` allows, the rest of the file
-    is one damaged place.
+    If damaged chunks exceed `MAX_EFFORT`, the rest of the file is one damaged place.
     """
     at, stream, chunks = len(MAGIC), io.BytesIO(data), _Chunks(data)
     # If the first bytes of a finished file are damaged, its last bytes still identify it.
@@ -390,9 +355,8 @@ def walk(data: bytes) -> Iterator[Found]:
 
 
 def _read(stream: io.BytesIO, at: int, opcode: int, claimed: int, size: int) -> Found | None:
-    """Decode the record that begins at the offset `at`.
+    """Decode the record that begins at the offset `at`, up to `claimed` according to its length.
 
-    `claimed` is the end of the record according to its length, and `size` the size of the file.
     Returns None if the record is not one of `READ`, is damaged or is cut off.
     """
     read = READ.get(opcode)
@@ -420,9 +384,8 @@ def _is_intact(stream: io.BytesIO, at: int, end: int) -> bool:
 class _Chunks:
     """Reads chunks, and searches for the next complete chunk without searching a place twice.
 
-    In a hostile file the same blocks may belong to thousands of incomplete chunks, and each of
-    these chunks unpacks to megabytes. Therefore the work of unpacking incomplete chunks is limited
-    in proportion to the size of the file.
+    In a hostile file thousands of incomplete chunks may share the same blocks, and each unpacks to
+    megabytes. So the work for incomplete chunks is limited in proportion to the file's size.
     """
 
     def __init__(self, data: bytes) -> None:
@@ -430,9 +393,7 @@ class _Chunks:
         self._effort = MAX_CHUNK_BYTES + MAX_EFFORT * len(data)
         """Work that may still be spent on incomplete chunks, in unpacked bytes."""
         self._searched = 0
-        """Offset up to which `later` has searched."""
         self._found: int | None = None
-        """Offset of the chunk that `later` found last."""
 
     @property
     def spent(self) -> bool:
@@ -440,9 +401,9 @@ class _Chunks:
         return self._effort < 0
 
     def read(self, begin: int) -> ReadChunk | None:
-        """Read the chunk whose head begins at the offset `begin`; return None if there is none.
+        """Read the chunk that begins at the offset `begin`. Returns None if there is none.
 
-        The work of reading an incomplete or empty chunk counts towards the limit for the file.
+        The work for an incomplete or empty chunk counts towards the limit.
         """
         chunk = read_chunk(self._data, begin)
         if chunk is not None and not (chunk.complete and chunk.messages):
@@ -452,8 +413,7 @@ class _Chunks:
     def later(self, begin: int) -> int | None:
         """Return the offset of the first complete chunk from the offset `begin` on.
 
-        Returns None if no such chunk is found within the limit of work. `begin` must not decrease
-        from call to call.
+        Returns None if there is none within the limit of work. `begin` must never decrease.
         """
         if self._found is not None and self._found >= begin:
             return self._found

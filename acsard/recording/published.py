@@ -1,10 +1,9 @@
 """Rebuilds the messages that a robot published, while its recording is replayed.
 
-`Report`, which the daemon uses too, builds the messages as if a client had subscribed to every
-topic all the time. A recording does not hold the daemon's measurements of itself, so the rows of
-`diagnostics` with such measurements are omitted. The messages of `log` are the entries of
-`timeline.py`, as in `acsard recording show`. They include all events of the robot, and also entries
-that the robot does not publish, such as `drive` and `reason`.
+The daemon's `Report` builds them, as if a client had subscribed to every topic all the time. A
+recording does not hold the daemon's measurements of itself, so the rows of `diagnostics` with such
+measurements are omitted. The messages of `log` are the entries of `timeline.py`, which include
+entries that the robot does not publish, such as `drive` and `reason`.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ class Published(NamedTuple):
     source: str
     """Source of a received command; "" for a published message."""
     wall_ns: int
-    """Wall-clock time at which the message was published or received, ns since 1970."""
+    """Wall-clock time of publication or arrival, ns since 1970."""
     message: Any
 
 
@@ -49,19 +48,15 @@ class Publisher:
     def __init__(self, robot: Robot, started_ns: int) -> None:
         """Prepare for the first step.
 
-        Args:
-            robot: the robot that replays the steps.
-            started_ns: wall-clock time of the daemon's start, ns since 1970. The messages that
-                never change have this stamp.
+        Messages that never change have the stamp `started_ns`, the daemon's start in ns since 1970.
         """
         self.robot = robot
-        """The robot that replays the steps. Set it to another one after a gap."""
+        """The robot that replays the steps. After a gap it must be set to another one."""
         self._config = robot.config
         self._report = Report(robot.config, Instant(0, started_ns))
         self._wanted = self._wanted_keys()
         self._timeline = TimelineWriter(robot.config)
         self._now = Instant(0, started_ns)
-        """Time of the last step."""
         self._static: TFMessage | None = None
         self._static_due = True
         """True if `tf_static` must be built: at the first step, and when a setting has changed."""
@@ -91,14 +86,14 @@ class Publisher:
         yield from self.skip(step)
 
     def skip(self, step: Step) -> Iterator[Published]:
-        """Yield only the log lines of a step. The step need not have been replayed."""
+        """Yield only the log lines of a step, which need not have been replayed."""
         self._now = step.inputs.now
         yield from map(self._line, self._timeline.step(step))
 
     def end(self, ending: str = "") -> Iterator[Published]:
         """Yield the log lines after the last step.
 
-        `ending` says how the recording was cut off; it is "" if the daemon ended normally.
+        `ending` says how the recording was cut off, or is "" if the daemon ended normally.
         """
         yield from map(self._line, self._timeline.end(ending))
 
@@ -131,7 +126,6 @@ class Publisher:
 
 
 def _without_measurements(message: Any) -> Any:
-    """Return the message without the daemon's measurements of itself, which are not recorded."""
     match message:
         case RobotState():
             return replace(message, certificate_expiry="", certificate_days=None, latencies={})

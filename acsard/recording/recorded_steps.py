@@ -48,22 +48,19 @@ class Taken(NamedTuple):
 
 
 class Start(NamedTuple):
-    """State of the robot before step `number`, with which a new file can begin.
-
-    If no new file is necessary, the state is added to the current file as a checkpoint.
-    """
+    """State of the robot before step `number`: the start of a new file, or a checkpoint in one."""
 
     number: int
     state: bytes
     """The robot and its guard, encoded by `state.freeze`; empty for a new robot."""
     config: Config
-    """Configuration before step `number`. Settings may have changed since the daemon's start."""
+    """Configuration before step `number`, with the settings that have changed since the start."""
 
 
 def runs(items: list[Taken | Start]) -> Iterator[tuple[Start | None, list[Taken]]]:
     """Split the recorder's queue at each `Start`, and yield each `Start` with the steps after it.
 
-    The first group has the steps before the first `Start`, with None instead of a `Start`.
+    The first group has None instead of a `Start`.
     """
     start: Start | None = None
     steps: list[Taken] = []
@@ -87,12 +84,12 @@ class BlackBox(Protocol):
     ) -> None:
         """Record a finished step.
 
-        `sent` is the line that the daemon wrote to the serial port, or None if it wrote no line.
-        `robot` and `guard` are in their state after the step.
+        `sent` is the line that was written to the serial port, or None. `robot` and `guard` are in
+        their state after the step.
         """
 
     def died(self, inputs: Inputs) -> None:
-        """Record the inputs of the step in which the daemon failed. The failure ends the daemon."""
+        """Record the inputs of the step in which the daemon failed, just before the daemon ends."""
 
     @property
     def status(self) -> Recording:
@@ -105,7 +102,7 @@ class RecordedOutputs(Struct, frozen=True):
     line: bytes | None
     """Line that the robot decided to send, or None."""
     sent: bytes | None
-    """Line that the daemon wrote to the serial port, or None if it wrote no line."""
+    """Line that was written to the serial port, or None."""
     status: Status
     poses: tuple[Micropose, ...]
     """One pose for each feedback line that odometry accepted."""
@@ -113,10 +110,7 @@ class RecordedOutputs(Struct, frozen=True):
     checksum: int | None = None
     """CRC-32 of all exact poses and twists of the batch, in its last step; None in the others."""
     names: int | None = None
-    """CRC-32 of all `input_names` of the batch, in its last step.
-
-    None in the other steps, and in a batch that an older version recorded.
-    """
+    """CRC-32 of the batch's `input_names` in its last step; None elsewhere and in old files."""
 
 
 class Step(Struct, frozen=True):
@@ -158,9 +152,9 @@ def unfinished(data: bytes) -> Unfinished:
 
 
 def checksum(estimates: Sequence[Estimate], before: int) -> int:
-    """Return the CRC-32 of the poses, twists and wheel angles of estimates, with all their bits.
+    """Continue the CRC-32 `before` with the exact poses, twists and wheel angles of estimates.
 
-    The result continues `before`, the CRC-32 of the earlier estimates of the batch, or 0.
+    `before` is 0 at the beginning of a batch.
     """
     for e in estimates:
         pose, twist = e.pose, e.twist
@@ -170,10 +164,9 @@ def checksum(estimates: Sequence[Estimate], before: int) -> int:
 
 
 def input_names(inputs: Inputs, before: int) -> int:
-    """Return the CRC-32 of the names of the sources, senders and clients in the inputs of a step.
+    """Continue the CRC-32 `before` with the names of sources, senders and clients in the inputs.
 
-    The result continues `before`, the CRC-32 of the names in the earlier inputs of the batch.
-    `before` is 0 for the first step of a batch.
+    `before` is 0 at the beginning of a batch.
     """
     names = [
         *[name for command in inputs.commands for name in (command.source, command.sender)],
@@ -186,16 +179,14 @@ def input_names(inputs: Inputs, before: int) -> int:
 
 
 def count_superseded(commands: Sequence[Command]) -> int:
-    """Return the number of commands of a step that precede a newer one of the same sender."""
+    """Return how many commands of a step are followed by a newer command of the same sender."""
     return len(commands) - len({(command.source, command.sender) for command in commands})
 
 
 def status_of(outputs: Outputs) -> Status:
-    """Return the mode, reason, link and source of a step's outputs."""
     return outputs.mode, outputs.reason, outputs.link, outputs.source
 
 
 def micropose(estimate: Estimate) -> Micropose:
-    """Return the pose of an estimate, rounded to um and urad."""
     pose = estimate.pose
     return round(pose.x * MICRO), round(pose.y * MICRO), round(pose.yaw * MICRO)

@@ -1,10 +1,9 @@
 """The black box of a running daemon: records each step without delaying the control loop.
 
-The control loop puts references to the inputs and outputs of each step into a bounded queue. Once a
-second a thread takes all steps from the queue, adds them to the file as a block, and syncs the file
-to the disk. The log reports a disk that hangs for 3 s. If the queue is full, further steps are lost
-and counted. The recording then goes on in a new file that begins with the robot's state, so that
-the new file can be replayed.
+The control loop puts each step into a bounded queue. Once a second a thread writes the queued steps
+as a block, and syncs the file to the disk. If the queue is full, further steps are lost and
+counted. The recording then goes on in a new file that begins with the robot's state, so that the
+new file can be replayed.
 """
 
 from __future__ import annotations
@@ -24,21 +23,17 @@ from acsard.recording.state import freeze
 from acsard.recording.step_writer import Bug, StepWriter
 
 MAX_QUEUED_STEPS = 4096
-"""Largest number of steps in the queue.
-
-At 400 steps a second, a disk may hang for 10 s without a loss of steps.
-"""
+"""Largest number of queued steps. At 400 steps a second, the disk may hang for 10 s."""
 
 SLOW_NS = 3 * NS_PER_S
-"""Duration of a sync of the recording above which the log reports a hanging disk, ns."""
+"""Duration of a sync above which the log reports that the disk hangs, ns."""
 
 SLOW = "the disk has accepted nothing for 3 s"
 
 PAUSE_NS = NS_PER_S // 4
-"""An interval between two steps adds at most this time to the counted wait for the disk, ns.
+"""Longest time between two steps that counts as a wait for the disk, ns.
 
-If the interval is longer, this process did not run for a while. Then the recorder's thread did not
-run either, and the disk is not the cause.
+A longer interval counts only this much: the process was stopped, so the disk is not the cause.
 """
 
 FLUSH_S = 0.98
@@ -52,28 +47,22 @@ CLOSE_S, MARK_S = 0.5, 0.1
 
 
 class Recorder:
-    """The black box of a running daemon.
-
-    The control loop calls `step`, which never waits. A thread writes the steps to the disk.
-    """
+    """The black box of a running daemon. `step` never waits; a thread writes to the disk."""
 
     def __init__(
         self, config: Config, report: Callable[[Event], None], started_ns: int = 0
     ) -> None:
         """Start the thread.
 
-        Args:
-            config: the configuration at the daemon's start.
-            report: function that receives the recorder's own events. Only `step` calls it.
-            started_ns: wall-clock time of the daemon's start, ns since 1970. In an export, the
-                messages that never change have this stamp.
+        Only `step` calls `report`, with the recorder's own events. `started_ns` is the wall-clock
+        time of the daemon's start, ns since 1970. An export uses it as the stamp of messages that
+        never change.
         """
         self._queue: deque[Taken | Start] = deque()
         self._report = report
         self._events: deque[Event] = deque()
         """Events from the recorder's thread. `step` passes them to `report`."""
         self._number = 0
-        """Number of steps so far."""
         self._lost = 0
         """Number of steps lost because the queue was full."""
         self._full = False
@@ -84,13 +73,13 @@ class Recorder:
         self._slow = False
         """True from the report that the disk hangs until the report that it accepts data again."""
         self._lost_before = 0
-        """Number of steps that were lost before the disk hung."""
+        """Number of steps that were already lost when the disk began to hang."""
         self._failed_inputs: Inputs | None = None
-        """Inputs of the step in which the daemon failed; None if it did not fail in a step."""
+        """Inputs of the step in which the daemon failed, or None."""
         self._wants_state = False
         """True if the thread needs the robot's state for a new file or a checkpoint.
 
-        The thread sets this flag. `step` then queues the robot's state, and clears the flag.
+        The thread sets this flag. `step` queues the state and clears the flag.
         """
         self._writer = StepWriter(config, self._events.append, self._request_state, started_ns)
         self._over = threading.Event()
@@ -100,7 +89,7 @@ class Recorder:
     # These methods run in the control loop's thread.
 
     def begins(self, robot: Robot, guard: Guard) -> None:
-        """Begin the first file with the state of this robot and its guard.
+        """Record the state of the robot and its guard before the first step.
 
         Without this call, a replay of the first file begins with a new robot and a new guard.
         """
@@ -111,8 +100,8 @@ class Recorder:
     ) -> None:
         """Record a finished step.
 
-        `sent` is the line that the daemon wrote to the serial port, or None if it wrote no line.
-        `robot` and `guard` are in their state after the step.
+        `sent` is the line that was written to the serial port, or None. `robot` and `guard` are in
+        their state after the step.
         """
         self._number += 1
         if self._events:
@@ -172,12 +161,11 @@ class Recorder:
             self._slow, self._lost_before = True, self._lost
 
     def died(self, inputs: Inputs) -> None:
-        """Record the inputs of the step in which the daemon failed. The failure ends the daemon."""
+        """Record the inputs of the step in which the daemon failed, just before the daemon ends."""
         self._failed_inputs = inputs
 
     @property
     def status(self) -> Recording:
-        """Status of the recording, for `state` and `diagnostics`."""
         trouble = self._writer.trouble or (SLOW if self._slow else "")
         if self._full:
             trouble = "the disk is too slow"
@@ -191,12 +179,8 @@ class Recorder:
     def close(self, error: BaseException | None = None) -> None:
         """Write the last steps and the end of the file within `CLOSE_S`.
 
-        If the disk is too slow for this, write a marker that says so. After a failure of the daemon
-        no marker is written.
-
-        `error` is the exception that ends the daemon, or None for an ordinary end. A
-        `BaseException` that is not an `Exception`, such as a `KeyboardInterrupt`, counts as an
-        ordinary end too.
+        If the disk is too slow, write a marker that says so, unless the daemon failed with an
+        `Exception`. An `error` that is None or a `KeyboardInterrupt` is an ordinary end.
         """
         while isinstance(error, BaseExceptionGroup):
             error = error.exceptions[0]

@@ -21,32 +21,26 @@ from acsard.recording.file import EndRecordBuilder, Index, Recording, event_of, 
 from acsard.recording.mcap_records import LAST_BLOCK, MAGIC, chunk_places, encoded, walk
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
-"""Error numbers of a full disk."""
 
 NOTHING_BYTES = 64 << 10
 """Largest size of a file that is deleted if it has no readable data, bytes.
 
-A larger file has more than a header and one second of steps. It is never deleted, even if its data
-is unreadable.
+A larger file has more than a header and one second of steps, so it is never deleted.
 """
 
 
 def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
-    """Make a finished file of a recording that was cut off.
+    """Make the finished file `whole` of the recording `part`, which was cut off.
 
-    A file that holds no data is deleted. A file that cannot be read is only renamed.
+    A file without data is deleted. A file that cannot be read is only renamed. Returns a message
+    for the log, or "" if the recovery succeeded completely. Raises `OSError` if the disk refuses to
+    read or write.
 
     Args:
         part: the file that was cut off; it is removed or renamed.
         whole: path of the finished file.
         cut: why the file was cut off, a key of `CUTS`.
         room: true if the disk has room for a copy.
-
-    Returns:
-        A message for the log, or "" if the recovery succeeded completely.
-
-    Raises:
-        OSError: the disk refuses to read or write.
     """
     before, message = part.stat(), ""
     try:
@@ -81,7 +75,7 @@ def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
 
 
 def _has_configuration(part: Path) -> bool:
-    """Return whether the file contains the configuration. Otherwise `Recording` refuses it."""
+    """Return whether the file has a configuration, without which `Recording` refuses it."""
     return any(isinstance(place.record, Attachment) for place in walk(part.read_bytes()))
 
 
@@ -108,11 +102,9 @@ def _copy(recording: Recording, part: Path, whole: Path, cut: str) -> bool:
 def _finish_in_place(recording: Recording, part: Path, cut: str) -> bool:
     """Write the end of the file after its last readable second, over the incomplete data there.
 
-    Also write the true head of each chunk that still has the head of a growing chunk. If a power
-    cut interrupted an earlier recovery after it had written the end, write only the heads.
-
-    Returns False if the disk has no room. Then the file is unchanged. No recorded second is removed
-    to gain room: some disks do not give the room back, and then everything would be lost.
+    Also write the true heads of chunks that still have a `GROWING_HEAD`. Returns False if the disk
+    has no room; the file is then unchanged. No recorded second is removed to gain room, because
+    some disks do not give the room back.
     """
     builder = EndRecordBuilder(recording.about)
     for topic, wall_ns, data in recording.messages():
@@ -141,10 +133,9 @@ def _finish_in_place(recording: Recording, part: Path, cut: str) -> bool:
 
 
 def _writes(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], int]:
-    """Return the writes that finish a file, each with its offset, and the file's new size.
+    """Return the writes (offset and bytes) that finish the file `before`, and its new size.
 
-    `before` is the present content of the file, and `last` is the end record to write. The end of
-    the file comes first, because the disk may have no room for it. The heads of chunks follow.
+    The end of the file comes first, because the disk may have no room for it.
     """
     heads: list[tuple[int, bytes]] = []
     chunk, index = None, Index()
@@ -175,7 +166,7 @@ def _writes(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], in
 
 
 def _put(stream: FileIO, at: int, data: bytes) -> None:
-    """Write `data` at the offset `at` and sync it. An `OSError` may leave a part of it written."""
+    """Write `data` at the offset `at` and sync it. After an `OSError` a part may be written."""
     stream.seek(at)
     while data:
         data = data[stream.write(data) :]
@@ -183,7 +174,7 @@ def _put(stream: FileIO, at: int, data: bytes) -> None:
 
 
 def _end(last: EndRecord, index: Index, at: int) -> bytes:
-    """Return the end of an MCAP file with the end record `last`, to be written at the offset `at`.
+    """Return the end of an MCAP file, to be written at the offset `at`.
 
     The summary section omits the copy of the schema and the channels, because the disk may be
     nearly full. It has the statistics, because some readers treat a file without them as empty.

@@ -1,8 +1,8 @@
 """Replays steps: runs `Robot.step` over the recorded inputs and compares the outputs.
 
-A robot's behaviour depends only on its inputs and its configuration. Therefore the same code with
-the same configuration reproduces every line, mode and pose. With other code or another
-configuration, the differences show how the robot would have behaved.
+A robot's behaviour depends only on its inputs and its configuration. So the same code with the same
+configuration reproduces every line, mode and pose. With other code or another configuration, the
+differences show how the robot would have behaved.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ Output = Literal[
 
 `line` is the line that the robot decided to send, and `sent line` the line after the check by the
 guard. `event` is the name, level, kind or count of an event, and `client` the name of the client in
-an event. `input names` are the names in the inputs of a batch of steps. They are compared by a
-checksum of the whole batch, so a difference is reported at the last step of the batch.
+an event. `input names` are compared by a checksum of the whole batch, so a difference is reported
+at the last step of the batch.
 """
 
 WORDING: frozenset[Output] = frozenset({"reason", "event text"})
@@ -65,7 +65,6 @@ class Difference(Struct, frozen=True):
     number: int
     at: Instant
     what: tuple[Output, ...]
-    """The outputs that differ."""
     recorded: RecordedOutputs
     replayed: RecordedOutputs
     trip: str
@@ -77,7 +76,7 @@ class Comparison(Struct):
 
     steps: int = 0
     lines: int = 0
-    """Number of steps that have a line to the board in the recording, in the replay or in both."""
+    """Number of steps with a recorded line, a replayed line or both."""
     lines_same: int = 0
     poses: int = 0
     poses_same: int = 0
@@ -116,8 +115,7 @@ class Comparison(Struct):
 def replay_step(robot: Robot, step: Step) -> Outputs:
     """Run a recorded step on the robot, and return its outputs.
 
-    Also increase the robot's counters of sent lines, superseded lines and superseded commands, as
-    the daemon's control loop did in the recorded step.
+    Also update the robot's counters of lines and commands, as the daemon's control loop did.
     """
     recorded, inputs = step.recorded, step.inputs
     if superseded := count_superseded(inputs.commands):
@@ -136,17 +134,13 @@ class Replay:
     def __init__(
         self, config: Config, robot: Robot | None = None, memory: Memory | None = None
     ) -> None:
-        """Start with `robot` and its guard's `memory`.
-
-        If `robot` is None, start with a new robot of `config`.
-        """
+        """Start with `robot` and its guard's `memory`. None means a new robot of `config`."""
         self.outputs: Outputs | None = None
         """Outputs of the last replayed step; None before the first step."""
         self.comparison = Comparison()
         self.resume(robot or Robot(config), memory)
         self._checksum = self._names = 0
         self._pose: Micropose = (0, 0, 0)
-        """The last replayed pose."""
 
     def resume(self, robot: Robot, memory: Memory | None) -> None:
         """Continue with another robot and the memory of its guard, for example after a gap."""
@@ -155,11 +149,7 @@ class Replay:
         self._guard = Guard(robot.session.codec.stop, robot.config, memory)
 
     def step(self, step: Step) -> Difference | None:
-        """Replay a step.
-
-        Returns the difference between the replayed and the recorded outputs, or None if all outputs
-        are equal.
-        """
+        """Replay a step. Return how the outputs differ from the recorded ones, or None."""
         if step.begins:
             self._checksum = self._names = 0
         outputs = self.outputs = replay_step(self.robot, step)
@@ -183,10 +173,6 @@ class Replay:
         return difference
 
     def _keep(self, difference: Difference) -> None:
-        """Store the difference if it is the first one, the first of an output, or the first fault.
-
-        A fault counts only if the recorded robot is not in fault at that step.
-        """
         comparison = self.comparison
         comparison.first = comparison.first or difference
         for output in difference.what:
@@ -253,7 +239,6 @@ class Replay:
 def _different_parts(
     replayed: tuple[Event, ...], recorded: tuple[Event, ...]
 ) -> tuple[Output, ...]:
-    """Return the names of the outputs in which the replayed and the recorded events differ."""
     parts: tuple[tuple[Output, Callable[[Event], object]], ...] = (
         ("event", lambda event: (event.name, event.level, event.kind, event.count, event.news)),
         ("client", lambda event: event.by),

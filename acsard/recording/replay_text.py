@@ -25,7 +25,7 @@ MAX_KEYS = 8
 
 
 def verdict(comparison: Comparison) -> str:
-    """Return the result of a replay in one line."""
+    """Describe the result of a replay in one line."""
     c = comparison
     shares = (
         ("poses", c.poses_same, c.poses),
@@ -46,10 +46,7 @@ def _share(same: int, total: int) -> str:
 
 
 def explain_verdict(other: bool) -> str:
-    """Explain the figures of `verdict`.
-
-    `other` is true if the replay used another configuration than the recorded one.
-    """
+    """Explain the figures of `verdict`. `other`: the configuration is not the recorded one."""
     computed = "with that configuration" if other else "by this version"
     return (
         "(The replay computes its outputs "
@@ -61,9 +58,9 @@ def explain_verdict(other: bool) -> str:
 
 
 def describe_gaps(gaps: Sequence[Gap], how: str) -> str:
-    """Describe in a sentence how much the gaps leave out, or return "" if there is no gap.
+    """Describe how much the gaps leave out, or return "" if there is no gap.
 
-    The sentence begins with `how`, which says what the gaps prevented, for example "not compared".
+    The sentence begins with `how`, for example "not compared".
     """
     if not gaps:
         return ""
@@ -85,7 +82,7 @@ def describe_gaps(gaps: Sequence[Gap], how: str) -> str:
 
 
 def describe_difference(difference: Difference, began_ns: int) -> list[str]:
-    """Return lines of text with the recorded and the replayed outputs of the first differing step.
+    """Return lines with the recorded and the replayed outputs of the first step that differs.
 
     `began_ns` is the monotonic time at which the recording began, ns.
     """
@@ -122,9 +119,7 @@ def explain_settings(
 ) -> list[str]:
     """Explain in lines of text why another configuration leads to other results.
 
-    The text names the changed settings, the first line to the board that differs because of those
-    settings, and a new fault. It also warns that the recorded wheels did not obey the other
-    configuration. `began_ns` is the monotonic time at which the recording began, ns.
+    `began_ns` is the monotonic time at which the recording began, ns.
     """
     before, after = (dict(flat(effective(config))) for config in (recorded, other))
     keys = [key for key in before | after if before.get(key) != after.get(key)]

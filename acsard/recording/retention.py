@@ -1,13 +1,9 @@
 """Decides which recordings are deleted, and which are retained because of an incident.
 
 A recording is protected if an incident, such as a fault, happened in it or within a minute of it.
-Protected recordings are deleted last. The total size of all recordings is limited, and a part of
-the disk (`Disk.spare`) is left to other programs. If less than that part is free, old unprotected
-recordings are deleted, but not the newest recording. Protected recordings and the newest recording
-are deleted only if less than a fifth of `Disk.spare` is free, or if the limit of the total size is
-exceeded.
-
-`ClockWatch` decides whether the wall clock can be trusted for the age of a recording.
+If less than `Disk.spare` is free, old unprotected recordings are deleted, but not the newest
+recording. Protected recordings and the newest recording are deleted only if less than a fifth of
+`Disk.spare` is free, or if the limit of the total size is exceeded.
 """
 
 from __future__ import annotations
@@ -22,23 +18,16 @@ from acsard.core.values import NS_PER_S, Instant
 File = TypeVar("File")
 
 Kind = Literal["plain", "near", "kept"]
-"""Retention class of a recording.
-
-An incident happened in a `kept` recording. A `near` recording was written within a minute of an
-incident. All others are `plain`.
-"""
+"""Whether an incident is in the recording (`kept`), within a minute of it (`near`), or neither."""
 
 AROUND_NS = 60 * NS_PER_S
 """Time before and after an incident within which recordings are retained, ns."""
 
 KEPT_FILES = 50
-"""Largest number of `kept` recordings that are protected. Older ones count as unprotected."""
+"""Largest number of `kept` recordings that are protected."""
 
 FILES = 100
-"""A recording file may have at most the allowed total size divided by this number.
-
-The 50 protected files then take at most about half of the total size.
-"""
+"""A file may have 1/`FILES` of the total size, so 50 protected files take about half of it."""
 
 LEAST_BYTES = 100_000
 """Size up to which a recording file may grow even if the disk is nearly full, bytes."""
@@ -72,13 +61,10 @@ class Disk(NamedTuple):
 
     @property
     def low(self) -> bool:
-        """True if less than `spare` is free."""
         return self.free < self.spare
 
 
 class Ended(NamedTuple):
-    """A finished recording."""
-
     name: str
     number: int
     kind: Kind
@@ -96,16 +82,13 @@ class Bounds(NamedTuple):
     size: int
     """Largest total size in bytes."""
     oldest_s: float
-    """Recordings that ended before this wall-clock time are too old, s since 1970.
-
-    It is -inf if the wall clock is not trusted.
-    """
+    """Recordings that ended earlier are too old, s since 1970; -inf if the clock is not trusted."""
 
 
 def share(bound: int, own: int, disk: Disk) -> int:
     """Return how large one recording file may become, bytes.
 
-    `bound` is the largest total size of all recordings, and `own` is their present total size.
+    `bound` is the limit of the total size of all recordings, and `own` is their present total size.
     """
     return max(LEAST_BYTES, min(bound, own + disk.free - disk.spare) // FILES)
 
@@ -115,16 +98,13 @@ def to_delete(
 ) -> set[str]:
     """Return the names of the recordings to delete, so that one more file fits.
 
-    Args:
-        ended: the recordings in the order of their numbers.
-        bounds: limits of all recordings together.
-        disk: size and free space of the disk.
-        freed: None if the disk accepts data. Otherwise the disk refuses to write, although it may
-            report free space, and `freed` is the number of bytes that were already deleted in vain:
+    `ended` is in the order of its numbers. `freed` is None if the disk accepts data. Otherwise the
+    disk refuses to write, although it may report free space, and `freed` is the number of bytes
+    that were already deleted in vain:
 
-            - 0: delete at least one recording, even a protected one.
-            - less than `LEAST_BYTES`: delete one more recording, but not a protected one.
-            - more: delete nothing for this reason.
+    - 0: delete at least one recording, even a protected one.
+    - less than `LEAST_BYTES`: delete one more recording, but not a protected one.
+    - more: delete nothing for this reason.
     """
     protected = _protected(ended)
     plain = [file for file in ended if file.name not in protected]
@@ -176,10 +156,7 @@ class ClockWatch(Struct):
     """Detects jumps of the wall clock. The clock is trusted `STEADY_NS` after the last jump."""
 
     _since_ns: int | None = None
-    """Monotonic time of the last jump, or of the first call of `jump_ns`, ns.
-
-    None before the first call of `jump_ns`.
-    """
+    """Monotonic time of the last jump or of the first call of `jump_ns`, ns; None before it."""
     _ahead_ns: int = 0
     """Offset of the wall clock from the monotonic clock at the last call of `jump_ns`, ns."""
 
@@ -199,10 +176,7 @@ class ClockWatch(Struct):
 
 
 class IncidentWindow(Generic[File]):
-    """Finds the recording files within a minute of an incident, while the recording goes on.
-
-    All times are ns of the monotonic clock.
-    """
+    """Finds the files within a minute of an incident. All times are ns of the monotonic clock."""
 
     def __init__(self) -> None:
         self.kind: Kind = "plain"
@@ -212,14 +186,13 @@ class IncidentWindow(Generic[File]):
         self._happened_ns = -AROUND_NS
 
     def begin(self, now_ns: int) -> None:
-        """Register the beginning of a new file at the monotonic time `now_ns`, ns."""
+        """Register the beginning of a new file."""
         self.kind = "near" if now_ns - self._happened_ns < AROUND_NS else "plain"
 
     def happened(self, now_ns: int) -> list[File]:
-        """Register an incident at the monotonic time `now_ns`, ns. The current file becomes `kept`.
+        """Register an incident in the current file, which becomes `kept`.
 
-        Returns the plain files that ended less than a minute before the incident. The caller must
-        retain them too.
+        Returns the earlier plain files that the caller must retain too.
         """
         self.kind, self._happened_ns = "kept", now_ns
         close = [file for file, ended_ns in self._recent if now_ns - ended_ns < AROUND_NS]
@@ -227,24 +200,18 @@ class IncidentWindow(Generic[File]):
         return close
 
     def end(self, file: File, last_ns: int) -> None:
-        """Register the end of the current file as `file`.
-
-        `last_ns` is the monotonic time of its last step, ns.
-        """
+        """Register the end of the current file; `last_ns` is the time of its last step."""
         self._recent = [(older, ns) for older, ns in self._recent if last_ns - ns < AROUND_NS]
         if self.kind == "plain":
             self._recent.append((file, last_ns))
 
     def earlier(self, file: File, kind: Kind, ended_ns: int) -> None:
-        """Register a file of the previous run of the daemon.
-
-        `kind` is its retention class, and `ended_ns` the monotonic time of its end, ns.
-        """
+        """Register a file of the previous run of the daemon, with the time of its end."""
         if kind == "plain":
             self._recent.append((file, ended_ns))
         elif kind == "kept":
             self.earlier_happened(ended_ns)
 
     def earlier_happened(self, at_ns: int) -> None:
-        """Register an incident or crash of the previous run at the monotonic time `at_ns`, ns."""
+        """Register an incident or crash of the previous run."""
         self._happened_ns = max(self._happened_ns, at_ns)

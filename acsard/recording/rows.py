@@ -1,9 +1,8 @@
 """Encodes steps as rows, in batches of about one second, and decodes them.
 
 A row is one step. Its times and poses are differences from earlier ones. Similar steps therefore
-give equal bytes, which compress well. Each batch can be decoded alone, and decoding returns every
-`Step` exactly as it was encoded. A file may come from a stranger, so `decode` refuses a batch with
-values that no daemon records.
+give equal bytes, which compress well. Each batch can be decoded alone. A file may come from a
+stranger, so `decode` refuses a batch with values that no daemon records.
 
 If you change one of these structs, change `FORMAT` as well.
 """
@@ -56,7 +55,7 @@ A monotonic time may be up to twice as large.
 MAX_OFFSET_NS = 1 << 62
 """Bound on the offset of the wall clock from the monotonic clock, ns. Clocks reach it in 2116.
 
-The sum of such an offset and a monotonic time fits in 64 bits.
+The offset plus a monotonic time fits in 64 bits.
 """
 
 
@@ -68,7 +67,6 @@ class Rare(Struct, frozen=True, omit_defaults=True):
     """Values that most steps do not have.
 
     None in `opened`, `trouble` or `status` means that the value of the previous row still applies.
-    `guard_trip` says why the guard replaced the line of the previous step, or is "".
     """
 
     opened: int | None = None
@@ -107,10 +105,7 @@ class Row(Struct, frozen=True, array_like=True):
     shutting_down: bool
     superseded: bool
     now: int
-    """Time since the last earlier row of the batch whose `tick` is true.
-
-    If there is no such row, it is the time since `Batch.mono_ns`.
-    """
+    """Time since the last earlier row with a `tick`, or since `Batch.mono_ns`."""
     offset: int
     """Offset of the wall clock from the monotonic clock, minus `Batch.offset_ns`."""
     reads: tuple[Read, ...]
@@ -137,15 +132,10 @@ class Batch(Struct, frozen=True, array_like=True):
     checksum: int
     """CRC-32 of all estimates (pose, twist and wheel angles) of the batch."""
     names: int | None = None
-    """CRC-32 of all names of sources, senders and clients in the inputs of the batch.
-
-    None if an older version recorded the batch.
-    """
+    """CRC-32 of all `input_names` of the batch; None if an older version recorded it."""
 
 
 class _First(Struct, frozen=True, array_like=True):
-    """The part of a batch that `first_of` decodes."""
-
     number: int
 
 
@@ -195,10 +185,7 @@ def encode(first: int, taken: Sequence[Taken]) -> bytes:
 
 
 def _times(taken: Sequence[Taken], mono_ns: int, offset_ns: int) -> Iterator[list[int]]:
-    """Yield the `now` and `offset` of each row, then the `age` and `offset` of its reads, in ns.
-
-    `mono_ns` and `offset_ns` are the fields of the `Batch`.
-    """
+    """Yield the `now` and `offset` of each row, then the `age` and `offset` of its reads, in ns."""
     tick_ns = mono_ns
     for inputs, _, _ in taken:
         now = inputs.now
@@ -317,10 +304,7 @@ def _sent(row: Row) -> bytes | None:
 
 
 def _instant(batch: Batch, mono_ns: int, offset: int) -> Instant:
-    """Return the instant at `mono_ns`; raise `ValueError` if one of its times is out of range.
-
-    `offset` is `Row.offset` or `Read.offset`.
-    """
+    """Return the instant at `mono_ns`. Raises `ValueError` if one of its times is out of range."""
     ahead_ns = batch.offset_ns + offset * batch.unit
     if abs(mono_ns) >= 2 * MAX_TIME_NS or abs(ahead_ns) >= MAX_OFFSET_NS:
         raise ValueError("a time is out of range")

@@ -25,8 +25,7 @@ MARGIN_S = 60.0
 """Tolerance for the times in an end record, s.
 
 The end record gives the time at which the last message begins. If the disk is slow, this message
-may hold many seconds of steps. Therefore a file is also read if it lies outside the searched range
-by at most this time. Consecutive files of one series must also be less than this time apart.
+may hold many seconds of steps. Consecutive files of a series are also less than this time apart.
 """
 
 GAP_S = 2.0
@@ -42,10 +41,9 @@ class Series(Recording):
         self.paths = list(paths)
 
     def messages(self) -> Iterator[tuple[Topic, int, bytes]]:
-        """Yield the topic, the wall-clock time in ns since 1970 and the bytes of each message.
+        """Yield the topic, wall-clock time (ns since 1970) and bytes of each message of all files.
 
-        The messages of all files come in order. `ended`, `cut`, `why` and `unfinished` are those of
-        the last file, and `damaged` counts the damaged places of all files.
+        `damaged` counts all files. `ended`, `cut`, `why` and `unfinished` describe the last file.
         """
         self.damaged, self.ended, self.cut, self.why = 0, False, "", ""
         self.unfinished = None
@@ -92,9 +90,8 @@ class _Piece(NamedTuple):
 def search(files: Sequence[Path], first: float, last: float) -> Search:
     """Find the recordings that have steps between the times `first` and `last`, s since 1970.
 
-    `files` are the recordings of a directory, oldest first. If a drive was under way at the
-    beginning of a found file, the files that hold the earlier part of the drive are read too.
-    Raises `NothingRecordedError` if no file has a step between these times.
+    `files` are sorted, oldest first. If a drive was under way at the beginning of a found file, the
+    files with its earlier part are read too. Raises `NothingRecordedError` if nothing is found.
     """
     result, pieces = Search(), list[_Piece]()
     chosen: dict[int, Contents] = {}
@@ -138,11 +135,7 @@ def _gaps(pieces: Sequence[_Piece], first: float, last: float) -> list[tuple[flo
 
 
 def _groups(files: Sequence[Path], chosen: dict[int, Contents]) -> list[list[int]]:
-    """Return the indices in `files` of the chosen files, grouped into series.
-
-    If a drive is under way at the beginning of a group, the group also has the files before it
-    that contain the beginning of the drive.
-    """
+    """Return the indices of the chosen files and their `_earlier` files, grouped into series."""
     groups: list[list[int]] = []
     for number, contents in sorted(chosen.items()):
         if groups and number - 1 in chosen and _continues(chosen[number - 1], contents):
@@ -153,11 +146,7 @@ def _groups(files: Sequence[Path], chosen: dict[int, Contents]) -> list[list[int
 
 
 def _earlier(files: Sequence[Path], number: int, contents: Contents) -> list[int]:
-    """Return the indices of the files that contain the earlier part of an unfinished drive.
-
-    The drive is under way at the beginning of the file with the index `number`, whose contents are
-    `contents`. If no drive is under way there, the list is empty.
-    """
+    """Return the indices of earlier files with the drive that is under way as this file begins."""
     found: list[int] = []
     while number > 0 and contents.first.recorded.status[0] == "driving":
         number -= 1
@@ -195,7 +184,7 @@ def _present(path: Path) -> Path:
 
 
 def _nearest(pieces: Sequence[_Piece], first: float, last: float) -> str:
-    """Return a sentence which says that nothing was recorded, and names the nearest recordings."""
+    """Return a sentence with the nearest recordings, which says that nothing was recorded."""
     before = max([p for p in pieces if p.end < first], key=lambda p: p.end, default=None)
     after = min([p for p in pieces if p.begin > last], key=lambda p: p.begin, default=None)
     text = f"nothing was recorded {in_words(first, last)}"

@@ -3,11 +3,8 @@
 A file that begins during a drive begins with an encoded robot. In every file further ones follow
 about every 20 s, so that a replay can go on after a damaged place.
 
-`freeze` uses pickle, which encodes a robot in a fraction of a millisecond. `thaw` does not use
-pickle, because a forged file could run code through it. It uses `unpickling.py`, which makes only
-plain values and the robot's own parts.
-
-With `adopt`, a drive can be replayed from its middle with another configuration.
+`freeze` uses pickle, which takes a fraction of a millisecond. `thaw` uses `unpickling.py` instead,
+because a forged file could run code through pickle.
 """
 
 from __future__ import annotations
@@ -33,10 +30,7 @@ PART_MODULES = (
     "acsard.core.values", "acsard.core.robot", "acsard.core.guard", "acsard.core.config.settings",
     "acsard.core.motion.", "acsard.core.link.",
 )  # fmt: skip
-"""Modules and packages (with a final dot) that define the parts of a robot.
-
-The constructors of their classes have no effects outside the new object.
-"""
+"""Modules and packages (with a final dot) of robot parts. The constructors have no side effects."""
 
 OTHER_PARTS: dict[tuple[str, str], type] = {
     ("collections", "Counter"): Counter,
@@ -65,10 +59,7 @@ class StateError(AcsardError):
 
 
 class State(NamedTuple):
-    """A robot and the memory of its guard.
-
-    The outputs of the next steps depend only on these two and on the inputs of those steps.
-    """
+    """A robot and the memory of its guard, which determine how it reacts to the next inputs."""
 
     robot: Robot
     memory: Memory
@@ -83,7 +74,6 @@ class Checkpoint(Struct, frozen=True, array_like=True):
     """The robot and its guard's memory, encoded by `freeze`."""
 
     def encode(self) -> bytes:
-        """Encode the checkpoint as a message of the channel `state`."""
         return msgspec.msgpack.encode(self)
 
 
@@ -131,11 +121,10 @@ def short(error: Exception) -> str:
 
 
 def part_class(module: str, name: str) -> type:
-    """Return the class `name` of a module that defines parts of a robot.
+    """Return the class `name` that the loaded module `module` defines as a part of a robot.
 
-    The module must be loaded already, because this function imports nothing. The class must be
-    defined in that module under that name. Raises `ValueError` for every other name, such as a
-    function, a class that the module imports, or an attribute of an attribute.
+    Raises `ValueError` for every other name, such as a function, a class that the module imports,
+    or an attribute of an attribute. This function imports nothing.
     """
     if (module, name) in OTHER_PARTS:
         return OTHER_PARTS[module, name]
@@ -154,9 +143,8 @@ PLAIN = (bool, int, float, str, bytes, type(None))
 def adopt(robot: Robot, begun: Robot, other: Robot) -> None:
     """Apply another configuration to the recorded robot `robot`, in place.
 
-    The three robots are compared attribute by attribute. An attribute of `robot` that equals the
-    attribute of `begun` is replaced by the attribute of `other`. An attribute that the drive has
-    changed keeps its value. The classes of the robot need no code for this.
+    The three robots are compared attribute by attribute. An attribute of `robot` that equals that
+    of `begun` gets the value of `other`. An attribute that the drive has changed keeps its value.
 
     Args:
         robot: the recorded robot.
@@ -171,16 +159,10 @@ class _Walk:
 
     def __init__(self) -> None:
         self._visited: dict[int, Any] = {}
-        """Maps the `id` of each visited object to the object.
-
-        The reference keeps the object alive, so that its `id` stays unique.
-        """
+        """Maps `id` to each visited object, and keeps it alive so that its `id` stays unique."""
 
     def into(self, now: Any, begun: Any, other: Any) -> None:
-        """Merge the attributes of the object `now` in place.
-
-        `now`, `begun` and `other` are the corresponding objects of the three robots in `adopt`.
-        """
+        """Merge the attributes of the object `now` of the recorded robot in place."""
         if id(now) in self._visited:
             return
         self._visited[id(now)] = now
@@ -197,10 +179,7 @@ class _Walk:
                 setattr(now, name, merged)
 
     def merged(self, now: Any, begun: Any, other: Any) -> Any:
-        """Return the merged value of an attribute: `now`, perhaps with changed parts, or `other`.
-
-        `now`, `begun` and `other` are the values of the attribute in the three robots in `adopt`.
-        """
+        """Return the merged value: `now`, perhaps with changed parts, or `other`."""
         if type(now) is not type(other):
             return other if _same(now, begun) else now
         match now:

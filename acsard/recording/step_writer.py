@@ -1,9 +1,8 @@
 """The recorder's thread: writes steps to the current file, and reacts to errors of the disk.
 
-One thread calls `StepWriter.write` about once a second. That call writes and syncs the steps that
-have arrived, begins and ends files, and marks the files around an incident so that they are deleted
-last. If the disk refuses to write, the steps of that call are lost and counted. The writer then
-pauses for `RETRY_ROUNDS` calls. After the pause it begins a new file with the robot's state.
+One thread calls `StepWriter.write` about once a second. If the disk refuses to write, the steps of
+that call are lost and counted. The writer then pauses for `RETRY_ROUNDS` calls. After the pause it
+begins a new file with the robot's state.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from acsard.recording.state import Checkpoint
 from acsard.recording.timeline import entry_of
 
 RETRY_ROUNDS = 5
-"""Number of calls of `write`, about one each second, that pass without a write after an error."""
+"""Number of calls of `write`, about one each second, for which the writer pauses after an error."""
 
 BATCH = 256
 """Largest number of steps in one message. A second has fewer, unless many commands arrive."""
@@ -39,13 +38,11 @@ BATCH = 256
 CHECKPOINT_NS = 18 * NS_PER_S + NS_PER_S // 2
 """Time from a checkpoint, the robot's state in a file, to the request for the next one, ns.
 
-This is about two chunks of steps, so that after damage to a chunk a replay lacks at most 20 s. A
-checkpoint takes 0.6 ms of the control loop's step, after the loop has written its line to the port.
-In the file it takes 6 kB at rest and 13 kB while driving.
+After damage to a chunk, a replay lacks at most 20 s. A checkpoint takes 0.6 ms of the control
+loop's step, after the loop has written its line. It has 6 kB at rest and 13 kB while driving.
 """
 
 MAX_FILE_NS = 3600 * NS_PER_S
-"""Longest time that one file may cover, ns."""
 
 INCIDENTS = frozenset({
     "fault", "stop", "emergency_stop", "bumper_pressed", "battery_stop", "link_down", "link_stale",
@@ -62,7 +59,7 @@ class Bug(NamedTuple):
     at: Instant | None
     """Instant of the step that failed; None if the daemon failed outside a step."""
     unfinished: bytes
-    """Encoded inputs of the step that failed; empty if there are none or they cannot be encoded."""
+    """Encoded inputs of the step that failed; empty if they do not exist or cannot be encoded."""
 
 
 class StepWriter:
@@ -79,8 +76,8 @@ class StepWriter:
 
         Args:
             config: the configuration at the daemon's start.
-            report: function that receives each event for the log.
-            request_state: function that asks the control loop to queue the robot's state (`Start`).
+            report: receives each event for the log.
+            request_state: asks the control loop to queue the robot's state (`Start`).
             started_ns: wall-clock time of the daemon's start, ns since 1970.
         """
         self._started_ns = started_ns
@@ -92,49 +89,40 @@ class StepWriter:
         self.syncs = 0
         """Number of syncs begun plus number of syncs ended. It is odd during a sync."""
         self._lost_before = 0
-        """Number of steps that were lost before the present trouble began."""
+        """Value of `lost` before the present trouble began."""
         self._safe_ns: int | None = None
         """Monotonic time of the last step that a sync has brought to the disk, ns, or None."""
         self._config, self._report, self._request_state = config, report, request_state
         self._ring: Ring | None = None
         self._writing: Writing | None = None
         self._start: Start | None = Start(0, b"", config)
-        """State of the robot with which the next file begins.
-
-        It is None once a file has begun with it, and after steps were lost. Then the writer
-        requests a new `Start` before it begins a file.
-        """
+        """State of the robot for the beginning of the next file; None if it must be requested."""
         self._incidents = IncidentWindow[Path]()
         self._number = self._began_ns = self._state_ns = 0
         self._last = Instant(0, 0)
         self._reported = False
-        """True once the log has the event which says that the recording works."""
+        """True once the log says that the recording works."""
         self._refused = False
         """True if the last write failed because the disk was full."""
         self._looked_back = False
-        """True once the files of the previous run of the daemon have been examined."""
         self._run = Run()
         self._cut_ns: int | None = None
-        """Wall-clock time at which a crash cut off the previous run's file, ns since 1970.
+        """Time at which a crash cut off the previous run's file, ns since 1970.
 
-        It is set when that file is recovered, and cleared when this run begins its first file.
+        None if there was no crash, and as soon as this run has begun a file.
         """
         self.bug: Bug | None = None
         """The failure that ends the daemon; only the last call of `write` reads it."""
         self._pause = 0
         self._handed = self._safe = 0
-        """Counts of steps in the present call of `write`.
+        """`_handed` counts the steps of this call of `write` that were written or are lost.
 
-        `_handed` counts the steps that were written to the file or counted as lost. `_safe` counts
-        those of them that are synced or counted as lost. If the disk refuses to write, all other
-        steps of the call are lost.
+        `_safe` counts those of them that are synced or lost. If the disk refuses to write, the
+        steps that are not safe are lost.
         """
 
     def write(self, items: list[Taken | Start], over: bool) -> None:
-        """Write the items that have arrived, or count their steps as lost.
-
-        `over` is true for the last call, which finishes the file.
-        """
+        """Write the items, or count their steps as lost. `over` is true for the last call."""
         self._handed = self._safe = 0
         try:
             if self._pause == 0 or over:
@@ -154,10 +142,9 @@ class StepWriter:
             self._request_state()
 
     def mark_cut(self, cut: Literal["late", "disk"]) -> None:
-        """Mark the unfinished file with the cause `cut`.
+        """Mark the unfinished file with the cause `cut`, so that it does not count as a crash.
 
-        Without the marker, the next start treats the file as cut off by a crash. Another thread may
-        call this method while `write` waits for the disk.
+        Another thread may call this method while `write` waits for the disk.
         """
         writing = self._writing
         if writing is not None:
@@ -173,11 +160,7 @@ class StepWriter:
         return ring
 
     def _write_group(self, ring: Ring, start: Start | None, steps: list[Taken]) -> None:
-        """Write steps to the current file, after the robot's state if `start` is not None.
-
-        A new file begins with `start` if there is no current file, if steps are missing before
-        `start`, or if the current file is long enough.
-        """
+        """Write steps to the current file, or to a new file that begins with `start`."""
         if start is not None and self._writing is not None and self._goes_on(ring, start):
             self._add_checkpoint(self._writing, start, self._last)
         elif start is not None:
@@ -247,10 +230,7 @@ class StepWriter:
         self._add_checkpoint(self._writing, start, now)
 
     def _look_back(self, ring: Ring, now: Instant) -> None:
-        """Register the files of the previous run of the daemon.
-
-        Then an incident in one run also protects files of the other run within a minute of it.
-        """
+        """Register the files of the previous run, so that incidents protect files of both runs."""
         for path, kind, ended_ns in ring.just_ended(now):
             self._incidents.earlier(path, kind, ended_ns)
         self._looked_back = True

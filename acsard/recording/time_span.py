@@ -74,7 +74,7 @@ class TimeError(AcsardError):
 def parse_when(text: str, now_s: float) -> When:
     """Parse a time that a person typed; `now_s` is the present time, s since 1970.
 
-    Raises `TimeError` with a text that says how to write a time.
+    Raises `TimeError` with advice on how to write a time.
     """
     words = re.sub(r"(?<=\d)t(?=\d)", " ", " ".join(text.lower().split()))
     if re.fullmatch(r"\d+(\.\d+)?", words):
@@ -125,7 +125,7 @@ def _date(words: str, text: str, now_s: float) -> tuple[int, int, int]:
 def _moment(date: tuple[int, int, int], when: TimeOfDay = MIDNIGHT, days: int = 0) -> float:
     """Return the local time `when`, `days` days after a date, in s since 1970.
 
-    The day of the month may be less than 1 or beyond the end of the month.
+    The day of the month may be out of range.
     """
     year, month, day = date
     whole = (year, month, day + days, when.hours, when.minutes, 0, 0, 0, -1)
@@ -224,7 +224,7 @@ def _seconds(when: When, found: list[Stretch], end: bool) -> float:
 def part_between(found: list[Stretch], first: float, last: float) -> Span | None:
     """Return the part of a recording between the times `first` and `last`, s since 1970.
 
-    `found` are the stretches of the recording. Returns None if none of them overlaps that range.
+    Returns None if no stretch of the recording overlaps that range.
     """
     inside = [one for one in found if one.begin <= last and first <= one.end]
     if not inside:

@@ -1,9 +1,8 @@
 """Describes a recording as a timeline of short texts.
 
 The timeline has an entry for each event of the log, and further entries, such as one for each
-drive. A drive is a time in mode `driving`; its entry gives the distance and the duration. The same
-entries are in the output of `acsard recording show`, in that of `acsard recording report`, and in
-the exported `log`.
+drive, a time in mode `driving`. The same entries are in the output of `acsard recording show` and
+`acsard recording report`, and in the exported `log`.
 """
 
 from __future__ import annotations
@@ -31,17 +30,13 @@ FURTHEST_S = 2**63 / 1e9
 
 
 REASON_NS = NS_PER_S
-"""Shortest time between two entries about a changed reason of the robot's mode, ns.
+"""Shortest time between two entries about the mode's reason, waiting senders or the board, ns.
 
-Without this limit, two sources that alternate in every step would fill the timeline. Entries about
-waiting senders and about the board have the same limit.
+Otherwise two sources that alternate in every step would fill the timeline.
 """
 
 POSE_NS = NS_PER_S
-"""Longest time, ns, for which the entry `continues` waits for the first pose.
-
-Without a link to the board there is no pose.
-"""
+"""Longest time for which `continues` waits for a pose, ns. Without a link there is no pose."""
 
 SET_NS = 5 * NS_PER_S
 """Smallest change of the wall clock against the monotonic clock that gives an entry `clock`, ns."""
@@ -49,27 +44,20 @@ SET_NS = 5 * NS_PER_S
 WAITS_NS = NS_PER_S
 """Time for which a sender sends speeds without effect before the timeline mentions it, ns.
 
-When an operator changes from one sender to another, both may send for a moment. That is shorter
-than this time, so the timeline does not mention it.
+When an operator changes senders, both may send for a moment that is shorter than this.
 """
 
 SILENT_NS = NS_PER_S
 """Pause of a waiting sender, ns, after which its waiting time restarts at 0."""
 
 MAX_IDENTITY_BYTES = 256
-"""Largest length of a line with which a microcontroller names itself, bytes.
-
-The firmware's line has 150 bytes.
-"""
+"""Largest line with which a microcontroller names itself, bytes. The firmware's line has 150."""
 
 MAX_WAITING = 16
 """Largest number of waiting senders that are watched. A stranger may send under many names."""
 
 NUMBER = re.compile(r"\b\d+(\.\d+)?\b")
-"""Pattern that finds a number, but not a digit in a name.
-
-Reasons of a mode that differ only in numbers, such as a duration, count as one reason.
-"""
+"""Matches a number, but not a digit in a name. Reasons that differ only in numbers are equal."""
 
 
 class TimelineEntry(Struct, frozen=True, omit_defaults=True):
@@ -122,10 +110,7 @@ class LinkLosses:
         """Names of the events about a lost link since the link was last up."""
 
     def repeated(self, name: str) -> bool:
-        """Register an event by its name.
-
-        Returns whether it repeats an event about the same loss of the link.
-        """
+        """Register an event. Return whether it repeats an event about the same loss of the link."""
         if name == "link_up":
             self._names.clear()
         if name not in ("link_down", "link_booting", "link_stale", "link_late"):
@@ -142,16 +127,12 @@ class ReasonChanges:
         self._mode = self._reason = ""
         """The last mode and reason that the timeline shows. The reason has `#` for each number."""
         self._reported_ns = -REASON_NS
-        """Monotonic time of the last entry, ns.
-
-        A change to the mode `waiting` counts as an entry, and so does an event with the reason for
-        waiting.
-        """
+        """Monotonic time of the last entry, or of the last report that the robot waits, ns."""
         self._sender = ("", "")
         """The last source that the robot followed, and the last sender on that source."""
 
     def step(self, step: Step) -> Iterator[TimelineEntry]:
-        """Yield an entry if the reason changed, the mode is the same, and no event has that reason.
+        """Yield an entry if the reason changed, but neither the mode nor an event shows that.
 
         There is no entry while the robot drives, and at most one entry each second.
         """
@@ -181,16 +162,14 @@ _IDENTITY = re.compile(re.escape(IDENTITY) + rb"([^\r\n]*)[\r\n]")
 class BoardIdentity:
     """Detects the line with which a microcontroller names itself.
 
-    The board sends this line after its start, and when the daemon asks for it. The robot reports
-    the line as an event only if the link was up. If a board restarts slowly, the link is lost
-    before the line arrives, and only the line explains why the board was silent.
+    The board sends this line after its start, and when asked. The robot reports it as an event only
+    if the link was up. After a slow restart only this line explains why the board was silent.
     """
 
     def __init__(self) -> None:
         self._data = b""
         """The last received bytes, if they may be the beginning of the board's line."""
         self._reported_ns = -REASON_NS
-        """Monotonic time of the last entry."""
 
     def step(self, step: Step) -> Iterator[TimelineEntry]:
         """Yield an entry if the board's line has arrived, at most one each second."""
@@ -235,7 +214,6 @@ class WaitingSenders:
         """Source and sender that the robot follows, as in the event `commander`."""
         self._waiting: dict[tuple[str, str], _Waiting] = {}
         self._reported_ns = -REASON_NS
-        """Monotonic time of the last entry."""
 
     def step(self, step: Step) -> Iterator[TimelineEntry]:
         """Yield one entry for each wait of a sender, once the wait has lasted for `WAITS_NS`."""
@@ -285,10 +263,9 @@ class WaitingSenders:
         return self._commander.startswith(f"{source} (") and ", " not in self._commander
 
     def _why(self, waiting: str, followed: str) -> str:
-        """Return why the robot follows the source `followed` and not the source `waiting`.
+        """Return why the robot follows the source `followed` and not `waiting`, or "" if unknown.
 
-        Returns "" if one of the sources is unknown, so that its priority is not known. Also returns
-        "" if `waiting` has the higher priority, because the robot then refuses its commands.
+        It is also "" if `waiting` has the higher priority, because the robot then refuses it.
         """
         one, other = self._priorities.get(waiting), self._priorities.get(followed)
         if one is None or other is None or one > other:
@@ -304,23 +281,18 @@ class TimelineWriter:
     """Makes the timeline of a recording from its steps."""
 
     def __init__(self, config: Config | None = None) -> None:
-        """Prepare for the first step.
-
-        `config` gives the priorities of the sources. If it is None, there are no `waits` entries.
-        """
+        """Prepare for the first step. Without `config` there are no `waits` entries."""
         sources = config.commands.sources if config is not None else ()
         self._number: int | None = None
         self._pose: tuple[int, int, int] | None = None
         self._began_ns: int | None = None
         """Monotonic time at which the present drive began, ns; None between drives."""
         self._distance_m = 0.0
-        """Distance of the present drive, m."""
         self._sources: list[str] = []
         """The sources that commanded the present drive, in the order in which they began."""
         self._since = ""
         """Words for the entry of a drive that began before this recording; "" for other drives."""
         self._now: Instant | None = None
-        """Time of the last step."""
         self._shutting_down = False
         self._continued: Step | None = None
         """First step of a recording that continues another one; None once its entry is made."""
@@ -417,10 +389,7 @@ class TimelineWriter:
             self._began_ns = None
 
     def end(self, ending: str = "") -> Iterator[TimelineEntry]:
-        """Yield the entries after the last step: an unfinished drive, and `ending` if it is not "".
-
-        `ending` says how the recording was cut off; it is "" if the daemon ended normally.
-        """
+        """Yield the entries after the last step: an unfinished drive, and `ending` if not ""."""
         yield from self._continues()
         if self._now is None:
             return
@@ -451,11 +420,7 @@ INCIDENTS = {
     "wheel_fault": "wheel fault",
     "link_up": "",
 }
-"""Maps the name of an event to its word in the summary of a recording.
-
-`link_up` is not counted and has no word. It is in the table because `summary` needs it to count
-the next loss of the link as a new loss.
-"""
+"""Words for the events in a summary. `link_up` has none: it only separates losses of the link."""
 
 
 SERIOUS = re.compile(r"(^|, )\d+ (emergency stop|bumper hit|battery stop|stop|fault)s?\b")
@@ -469,10 +434,9 @@ def is_serious(text: str) -> bool:
 
 
 def summary(events: Iterable[TimelineEntry], starts: bool = False) -> str:
-    """Summarize the events of a recording in a few words.
+    """Count the incidents of a recording in words, and name the clients that stopped the robot.
 
-    The summary counts each kind of incident and names the clients that stopped the robot. If the
-    recording includes the daemon's start, `starts` is true and the summary begins with "start".
+    If `starts` is true, the recording includes the daemon's start.
     """
     counts: Counter[str] = Counter()
     stopped: list[str] = []

@@ -1,9 +1,8 @@
 """Rebuilds a pickled `Robot`, and nothing else, even if a stranger wrote the bytes.
 
-A recording may come from a stranger, and Python's own unpickler obeys its bytes: it calls
-functions, imports modules, changes classes, and nests objects without limit. This reader knows only
-the opcodes that a pickled robot consists of. It calls only constructors of plain data, and checks
-each part when it makes the part:
+Python's own unpickler obeys its bytes: it calls functions, imports modules, changes classes, and
+nests objects without limit. This reader knows only the opcodes that a pickled robot consists of. It
+calls only constructors of plain data, and checks each part when it makes the part:
 
     a number, text, bytes    a number has at most 128 bits
     a list, a tuple ...      depth and size are limited; a part that occurs twice counts twice
@@ -11,11 +10,10 @@ each part when it makes the part:
     any other object         made without its constructor, then given attributes; no attribute
                              hides an attribute of the class
 
-A list of allowed classes in `Unpickler.find_class` is not enough. Forged bytes did harm with only
-the classes that `state.py` allows. Nested tuples as keys, keys with equal hashes, and copies of one
-dict each took more than 3 s of processor time. A few bytes allocated more than 2 GB. One attack
-changed the class of the robot for the whole process. The commands that read a recording have no
-limits of time or memory that would stop such an attack.
+A list of allowed classes in `Unpickler.find_class` is not enough. With only the classes that
+`state.py` allows, forged bytes took more than 3 s of processor time (nested tuples as keys, keys
+with equal hashes, copies of one dict), allocated more than 2 GB, or changed the class of the robot
+for the whole process.
 
 Once the bytes refer to an earlier part, that part cannot grow any more. Therefore no part contains
 itself, and the depth and the size of every part are exact.
@@ -33,10 +31,7 @@ import msgspec
 from msgspec import Struct
 
 MAX_BYTES = 1 << 20
-"""Largest size of a pickled robot, bytes.
-
-A robot takes 12 000 to 40 000 bytes, or a few times as much with many command senders.
-"""
+"""Largest size of a pickled robot, bytes. A robot has 12 000 to 40 000, more with many senders."""
 
 MAX_OPCODES = 1 << 17
 
@@ -44,10 +39,7 @@ MAX_PARTS = 1 << 19
 """Largest number of values in a robot. A value that occurs several times counts each time."""
 
 MAX_COPIED = 4 * MAX_PARTS
-"""Largest number of values that are copied while parts are made.
-
-Without this limit a few bytes could copy the same part again and again.
-"""
+"""Largest number of copied values. Otherwise a few bytes could copy a part again and again."""
 
 MAX_KEY = 2**61 - 1
 """Bound on the absolute value of an integer that is used as a key.
@@ -65,9 +57,9 @@ MAX_KEY_PARTS = 4
 """Largest number of elements of a tuple that is used as a key."""
 
 FindClass = Callable[[str, str], type]
-"""Function that takes the name of a module and the name of a class, and returns the class.
+"""Takes the names of a module and a class, and returns the class.
 
-It raises `ValueError` for a class that is not a part of a robot.
+Raises `ValueError` for a class that is not a part of a robot.
 """
 
 ARGUMENTS = {
@@ -90,10 +82,9 @@ SIMPLE = (str, int, float, bool, bytes, type(None))
 
 
 def unpickle(data: bytes, find: FindClass) -> object:
-    """Return the object that the bytes describe.
+    """Return the object that the bytes describe; `find` looks up the classes.
 
-    `find` looks up the classes. Raises `ValueError` with the reason if the bytes are damaged or
-    contain anything that the state of a robot never contains.
+    Raises `ValueError` if the bytes are damaged or contain anything that a robot never contains.
     """
     if len(data) > MAX_BYTES:
         raise ValueError(f"it has {len(data)} bytes, more than any robot")
@@ -125,7 +116,7 @@ class _Entry:
         """True once an opcode has referred to the value. Then it cannot grow any more."""
 
     def holds(self, parts: Sequence[_Entry]) -> None:
-        """Update the depth and the size for new parts of this value.
+        """Add the depth and the size of new parts to this value.
 
         Raises `ValueError` if a limit is exceeded, or if the value is closed.
         """
@@ -151,9 +142,7 @@ class _Machine:
         self._marks: list[int] = []
         """Heights of the stack at the `MARK` opcodes."""
         self._memo: list[_Entry] = []
-        """Values that later opcodes may refer to."""
         self._copied = 0
-        """Number of values copied so far."""
 
     def result(self) -> object:
         """Return the only value on the stack; raise `ValueError` if there is not exactly one."""
@@ -162,7 +151,7 @@ class _Machine:
         return self._stack[0].value
 
     def do(self, name: str, argument: Any) -> None:
-        """Execute the opcode `name` with its argument from the bytes.
+        """Execute the opcode `name`.
 
         Raises `ValueError` for a forbidden opcode, or the exception that damaged operands cause.
         """
@@ -200,7 +189,6 @@ class _Machine:
         self._stack.append(entry)
 
     def _top(self, count: int) -> list[_Entry]:
-        """Pop and return the last `count` values of the stack."""
         if len(self._stack) < count:
             raise IndexError("its stack is empty")
         taken = self._stack[-count:]
@@ -215,10 +203,7 @@ class _Machine:
         return taken
 
     def _copies(self, entry: _Entry) -> None:
-        """Count the values of `entry` as copied, because they are copied into a new part.
-
-        Raises `ValueError` if more than `MAX_COPIED` values have been copied.
-        """
+        """Count the values of `entry` as copied. Raises `ValueError` above `MAX_COPIED`."""
         self._copied += entry.size
         if self._copied > MAX_COPIED:
             raise ValueError("it has more parts than any robot")
@@ -342,9 +327,7 @@ OPCODES: dict[str, Callable[[_Machine], None]] = {
     "NEWOBJ": _Machine.make_bare,
     "BUILD": _Machine.set_attributes,
 }
-"""Maps an opcode to the method that executes it. `ARGUMENTS`, `VALUES`, `CONTAINERS` and `TUPLES`
-have the simpler opcodes.
-"""
+"""The method of each opcode that is not in `ARGUMENTS`, `VALUES`, `CONTAINERS` or `TUPLES`."""
 
 
 def _keys(entries: Sequence[_Entry]) -> None:
@@ -361,15 +344,14 @@ def _keys(entries: Sequence[_Entry]) -> None:
 def _is_part(kind: Any) -> bool:
     """Return whether objects of the class `kind` can be rebuilt from their attributes alone.
 
-    The class must not define `__new__`, `__reduce_ex__` or `__setstate__`, whose code would have
-    to run for this.
+    The class must not define `__new__`, `__reduce_ex__` or `__setstate__`.
     """
     plain = kind.__new__ is object.__new__ and kind.__reduce_ex__ is object.__reduce_ex__
     return plain and kind.__module__ != "builtins" and not hasattr(kind, "__setstate__")
 
 
 def _made(kind: type, given: tuple[Any, ...]) -> object:
-    """Make an object of a class from the arguments of its constructor.
+    """Make an object from the arguments of its constructor.
 
     Raises `ValueError` or `TypeError` if the arguments do not suit the class.
     """

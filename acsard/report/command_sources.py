@@ -16,9 +16,8 @@ from acsard.recording.recorded_steps import Step
 STATES = ("refused", "waits", "sends", "drives")
 """States of a command source that is not silent.
 
-In the state `sends` the robot accepts the source's commands, but the source does not drive. The
-reason of the robot's mode says why. If short spans of time are merged, the state that comes first
-in this list is kept.
+In the state `sends` the robot accepts the source's commands, but the source does not drive. If
+short spans of time are merged, the state that comes first here is kept.
 """
 
 MOVES = ("ready", "driving")
@@ -60,7 +59,7 @@ class CommandSources:
     def take_commands(self, step: Step, t: float, robot: Robot) -> bool:
         """Process the commands of a step at time `t`, s. `robot` is the robot after the step.
 
-        Returns whether a refusal of a source was added or extended.
+        Returns whether a refusal was added or extended.
         """
         commands, before = step.inputs.commands, dict(self._refused)
         for command in commands:

@@ -1,6 +1,6 @@
 """Draws the data of a report: the path of the robot, and all other data over time.
 
-Times in the pictures are local times in ms since 1970, because plotly knows no time zones.
+Times in the pictures are local times in ms since 1970, because plotly does not know time zones.
 """
 
 from __future__ import annotations
@@ -48,10 +48,7 @@ class Line(NamedTuple):
     width: float = 1.6
     """Line width, px."""
     values: Sequence[float] = ()
-    """Values that the page shows when the user points at the curve.
-
-    If it is (), the page shows the values of `points`.
-    """
+    """Values that the page shows at the pointer. If it is (), the page shows those of `points`."""
 
 
 GAP_PX = 30
@@ -61,10 +58,7 @@ LEAST_LINEAR, LEAST_ANGULAR = 0.1, 0.2
 """Smallest span of the speed scales, m/s and rad/s, for a robot that never moves."""
 
 BENEATH = 3.4
-"""Width of a curve that another curve nearly covers, px.
-
-The wider curve stays visible on both sides of the other one.
-"""
+"""Width of a curve that another curve nearly covers, px. It stays visible on both sides."""
 
 
 class Clip(NamedTuple):
@@ -79,16 +73,13 @@ class Clip(NamedTuple):
 
 
 MARKS_APART = 0.02
-"""Smallest distance between two marks where a curve leaves its diagram.
-
-It is a fraction of the diagram's width.
-"""
+"""Smallest distance between two marks of excursions, as a fraction of the diagram's width."""
 
 HEADROOM = 0.5
-"""Room for commanded speeds above and below the limited and measured speeds.
+"""Room for commanded speeds above and below the other speeds, as a fraction of their span.
 
-It is a fraction of the span of the limited and measured speeds. A command that the robot reaches
-after a ramp stays visible, but a command of 99 m/s does not flatten the other curves.
+A command that the robot reaches after a ramp stays visible, but a command of 99 m/s does not
+flatten the other curves.
 """
 
 
@@ -100,8 +91,8 @@ def clipped(
     Args:
         points: the curve; NaN interrupts it.
         others: the curves that determine the scale, with `HEADROOM` added.
-        least: smallest span of the scale, for a robot that does not move.
-        gap: time, s, within which a second excursion beyond the same edge belongs to the first.
+        least: smallest span of the scale.
+        gap: longest time between excursions beyond the same edge that count as one, s.
     """
     values = [0.0, *(p.value for curve in others for p in curve if math.isfinite(p.value))]
     room = HEADROOM * max(max(values) - min(values), least)
@@ -147,7 +138,6 @@ class BandStyle(NamedTuple):
 
     @property
     def meaning(self) -> str:
-        """Text of the style in the legend."""
         return f"{self.source} {self.kind}".strip()
 
     def of(self, row: Row) -> list[Span]:
@@ -195,7 +185,6 @@ NOTED = {
 
 
 def path_figure(data: ReportData) -> Figure:
-    """Draw the path with its events."""
     places = data.path.places()
     keys: list[Key] = []
     traces: list[Trace] = []
@@ -283,14 +272,12 @@ class TimeFigures:
         self._zero_ms = 1000 * ((data.began or 0.0) + offset_s)
 
     def all(self) -> list[Figure]:
-        """Return all pictures in the order of the page."""
         return [
             path_figure(self._data), self.speeds(), self.sources(), self.events(), self.wheels(),
             self.serial(), self.loop(),
         ]  # fmt: skip
 
     def speeds(self) -> Figure:
-        """Draw the commanded, limited and measured speeds."""
         data, parts = self._data, list[Part]()
         gap = MARKS_APART * data.seconds
         for title, curves, least in (
@@ -326,7 +313,6 @@ class TimeFigures:
         return self._stack("speeds", "Speed", caption, parts, 210)
 
     def wheels(self) -> Figure:
-        """Draw the commanded and measured speed of each wheel."""
         curves = zip(WHEELS, self._data.commanded_wheels, self._data.measured_wheels, strict=True)
         parts = [
             Part(
@@ -342,7 +328,6 @@ class TimeFigures:
         return self._stack("wheels", "The four wheels", caption, parts, 150)
 
     def serial(self) -> Figure:
-        """Draw the number of sent, answered and lost lines per second."""
         counts = self._data.serial
         bad = [Line("dropped", COLOURS["error"], counts.dropped.curve.points(), "hvh")]
         if not self._data.config.mcu.reply_period:
@@ -364,7 +349,6 @@ class TimeFigures:
         return self._stack("link", "The serial line", caption, parts, 170)
 
     def loop(self) -> Figure:
-        """Draw how late the control loop ran each period."""
         late = Line("late", LIMITED, self._data.lateness.points(), "hv")
         caption = (
             "Delay of each period's step after the time when the period was due, compared with "
@@ -373,7 +357,6 @@ class TimeFigures:
         return self._stack("loop", "The control loop", caption, [Part("late, ms", [late])], 200)
 
     def sources(self) -> Figure:
-        """Draw mode, link and sources as bands."""
         data, silent = self._data, list[str]()
         rows: list[Row] = [
             ("mode", data.modes.spans()),
@@ -472,10 +455,7 @@ class TimeFigures:
         return layout() | {"xaxis": axis, "margin": {"l": 44, "r": 12, "t": 8, "b": 44}}
 
     def _stack(self, name: str, title: str, caption: str, parts: list[Part], px: int) -> Figure:
-        """Draw the parts one below the other, with one time axis and one legend.
-
-        `px` is the height of one part.
-        """
+        """Draw the parts, each `px` high, below each other with one time axis and one legend."""
         traces, notes = list[Trace](), list[dict[str, Any]]()
         axes = self._timed()
         axes["margin"] |= {"t": GAP_PX}
@@ -522,11 +502,7 @@ class TimeFigures:
 
 
 def _hover(name: str, values: Sequence[float]) -> dict[str, Any]:
-    """Return plotly's settings of the text that it shows at the pointer.
-
-    The text consists of the name of the curve, the time, and one of `values`. If `values` is empty,
-    the text has the y coordinate of the point instead.
-    """
+    """Return plotly's hover text: the curve's name, the time, and one of `values` or else y."""
     shown = "customdata" if values else "y"
     text = f"{name} %{{{shown}:.3~f}}<br>%{{x|%H:%M:%S.%L}}<extra></extra>"
     return {"hovertemplate": text} | ({"customdata": numbers(values)} if values else {})

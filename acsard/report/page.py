@@ -137,8 +137,7 @@ def page(
 ) -> str:
     """Return the report as the text of one HTML file.
 
-    `library` is the code of plotly, `clock` formats the times, and `offset_s` is the offset of the
-    local time from UTC, s.
+    `library` is the code of plotly, and `offset_s` is the offset of the local time from UTC, s.
     """
     figures = TimeFigures(data, offset_s).all()
     title = escaped(f"{origin.robot}, {clock(data.began or 0.0, True)}")
@@ -178,16 +177,10 @@ def page(
 def drawn(
     recording: Recording, library: str, span: Span = WHOLE, progress: Progress = no_progress
 ) -> tuple[str, list[str]]:
-    """Replay a part of a recording, and return the text of its report and the notes in it.
+    """Replay a part of a recording. Return the text of its report and the notes in it.
 
-    Args:
-        recording: the recording.
-        library: the code of plotly.
-        span: the part of the recording to draw.
-        progress: called with the wall-clock time that the replay has reached, ns since 1970.
-
-    Raises:
-        RecordingError: the part has no step.
+    `library` is the code of plotly. `progress` is called with the wall-clock time that the replay
+    has reached, ns since 1970. Raises `RecordingError` if the part has no step.
     """
     about, replayed = recording.about, DisplayReplay(recording)
     began = about.wall_ns / NS_PER_S

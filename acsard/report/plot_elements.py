@@ -118,10 +118,7 @@ def layout() -> dict[str, Any]:
 
 
 def note(text: str, x: float, y: float) -> dict[str, Any]:
-    """Return a heading in a picture.
-
-    `x` is a fraction of the picture's width from 0 to 1, and `y` is a value on its y axis.
-    """
+    """Return a heading at `x`, a fraction of the picture's width, and at `y` on its y axis."""
     return {
         "text": label(text), "x": x, "y": y, "xref": "paper", "yref": "y", "xanchor": "left",
         "yanchor": "middle", "showarrow": False, "font": {"size": 13},

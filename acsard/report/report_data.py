@@ -1,7 +1,8 @@
 """Collects the data of a report from a recording, step by step.
 
 The mode, the reasons, the path, the events and the driving source come from the recording. The
-commanded, limited and measured speeds come from a robot that replays the recorded inputs.
+commanded, limited and measured speeds come from a robot that replays the recorded inputs. The data
+are thinned as they arrive, so a day takes no more memory than a minute.
 """
 
 from __future__ import annotations
@@ -31,11 +32,7 @@ LINKS = ("down", "stale", "booting", "up")
 """States of the serial link. If short spans are merged, the state that comes first is kept."""
 
 MAX_EVENT_TEXT = 1000
-"""Largest number of characters that are kept of an event's text.
-
-A recording from a stranger may have longer texts. The longest text of the daemon itself, that of
-`continues` with the reason of a fault, has 308 characters.
-"""
+"""Largest number of characters that are kept of an event's text. The daemon's longest has 308."""
 
 FIRST, LAST = 30, 30
 """Number of events of each name that are kept: the first ones, and the last ones."""
@@ -60,7 +57,6 @@ class Mark(Struct, frozen=True):
 
     @property
     def words(self) -> str:
-        """The text, with the number of events if there are several."""
         return f"{self.text}{how_often(self.text, self.count)}"
 
 
@@ -72,11 +68,9 @@ class Marks:
         self._last: dict[str, deque[tuple[int, Mark]]] = {}
         """The last events of each name, each with its number in the order of all events."""
         self._count = 0
-        """Number of calls of `add`."""
         self.counts: Counter[str] = Counter()
         """Number of events of each name. A mark for several equal events counts as all of them."""
         self.left_out = 0
-        """Number of marks that were dropped."""
 
     def add(self, mark: Mark) -> None:
         """Add an event. If `FIRST` + `LAST` events of its name are kept, drop one in the middle."""
@@ -92,7 +86,6 @@ class Marks:
         last.append(row)
 
     def all(self) -> list[Mark]:
-        """Return the kept events in the order in which they were added."""
         rows = [row for kept in (self._first, self._last) for rows in kept.values() for row in rows]
         return [mark for _, mark in sorted(rows, key=lambda row: row[0])]
 
@@ -107,16 +100,14 @@ class Driven(Struct):
 class Lateness:
     """Measures how late the daemon ran the step of each control period.
 
-    The recording gives the number of missed periods, so each period's number is known. The time at
-    which a period was due is then known except for a constant offset. The offset is chosen so that
-    the smallest delay is 0.
+    The recording gives the number of missed periods, and so the number of each period. The times at
+    which periods were due are then known up to an offset, which makes the smallest delay 0.
     """
 
     def __init__(self, rate_hz: float) -> None:
         self._period_ns = int(NS_PER_S / rate_hz)
         self._curve = Curve()
         self._number = 0
-        """Number of the last period."""
         self._ahead = 0
         """Number of lines that `at_once` has counted since the last period."""
         self._began_ns: int | None = None
@@ -130,11 +121,10 @@ class Lateness:
         self._ahead += 1
 
     def tick(self, t: float, now_ns: int, missed: int, known: bool) -> None:
-        """Process the step of a control period.
+        """Process the step of a control period at `t`, s, and at the monotonic time `now_ns`, ns.
 
-        `t` (s) and `now_ns` (monotonic, ns) are the time of the step, and `missed` is the number of
-        periods since the previous tick that had no step. `known` is False if the recording lacks
-        steps before this one. The number of the period is then computed from the clock.
+        `missed` is the number of periods without a step since the last tick. `known` is False if
+        the recording lacks steps before this one. Then the clock gives the number of the period.
         """
         period_ns, began_ns = self._period_ns, self._began_ns
         if began_ns is None:
@@ -161,7 +151,6 @@ class Lateness:
 
     @property
     def most_ms(self) -> float:
-        """Largest delay of a period, ms."""
         return max([point.value for point in self.points()], default=0.0)
 
 
@@ -195,17 +184,13 @@ class SerialCounts:
         self._outstanding: int | None = None
         """Smallest number of unanswered lines at any step of this second.
 
-        At other steps the answer to the newest line may still be under way. Therefore only the
-        smallest number tells how many answers are lost.
+        At other steps the answer to the newest line may still be under way.
         """
         self._lost: int | None = None
         """Largest `_outstanding` of the earlier seconds: the answers lost before this second."""
 
     def step(self, t: float, sent: bool, counters: Mapping[str, int]) -> None:
-        """Process a step at time `t`, s.
-
-        `sent` is true if the step sent a line. `counters` are the robot's counters after the step.
-        """
+        """Process a step at time `t`, s; `counters` are the robot's counters after the step."""
         received = self._now = _received(counters)
         if self._second is None:
             self._second, self._before, self._base = int(t), received, sum(received)
@@ -218,10 +203,7 @@ class SerialCounts:
         self._sent += sent
 
     def _end(self, received: tuple[int, int]) -> None:
-        """Finish the present second. The next step may be many seconds later.
-
-        `received` is the number of good and dropped lines since the daemon's start.
-        """
+        """Finish the present second. The next step may be many seconds later."""
         t = float(self._second or 0) + 0.5
         good, dropped = (now - then for now, then in zip(received, self._before, strict=True))
         outstanding = self._outstanding or 0
@@ -234,16 +216,12 @@ class SerialCounts:
         self._sent, self._before, self._lost, self._outstanding = 0, received, lost, None
 
     def end(self) -> None:
-        """Finish the last second."""
         if self._second is not None:
             self._end(self._now)
 
 
 def _received(counters: Mapping[str, int]) -> tuple[int, int]:
-    """Return the number of accepted and of dropped lines.
-
-    The counter `lines` includes implausible lines, but they count as dropped here.
-    """
+    """Return the number of accepted and of dropped lines. Implausible lines count as dropped."""
     bad = sum(count for name, count in counters.items() if name.startswith("line_"))
     return counters.get("lines", 0) - counters.get("line_implausible", 0), bad
 
@@ -256,7 +234,7 @@ class ReportData:
     ) -> None:
         """Collect the steps between the wall-clock times `begin` and `end`, s since 1970.
 
-        None means no limit. `config` is the configuration at the beginning of the recording.
+        None means no limit.
         """
         self._window = (-math.inf if begin is None else begin, math.inf if end is None else end)
         self.config = config
@@ -279,7 +257,7 @@ class ReportData:
         self.ended = 0.0
         """Wall-clock time of the last collected step, s since 1970."""
         self.seconds = self.metres = 0.0
-        """Duration of the collected steps, and distance that the robot drove in them."""
+        """Duration of the collected steps, s, and distance that the robot drove in them, m."""
         self.driven: dict[str, Driven] = {}
         """Maps each source to the time and the distance for which it drove the robot."""
         self.fastest = Twist()
@@ -292,7 +270,6 @@ class ReportData:
         self._wall = -math.inf
         """Wall-clock time of the first step plus the monotonic time since then, s since 1970."""
         self._number: int | None = None
-        """Number of the last step."""
         self._place: Place | None = None
         self._jumps = True
         """True if the next pose does not continue the path, because a request set the pose."""
@@ -394,7 +371,7 @@ class ReportData:
     def _add_sent(self, curve: Curve, step: Step, t: float, speed: float) -> None:
         """Add a speed to a curve if the step sent a line.
 
-        The curve has a gap if no line was sent until the watchdog of the microcontroller expired.
+        Without a line the curve has a gap once the watchdog of the microcontroller has expired.
         """
         if step.recorded.sent is not None:
             curve.add(t, speed)
@@ -415,10 +392,7 @@ class ReportData:
             self.lateness.at_once()
 
     def _sample(self, step: Step, t: float, robot: Robot, refused: bool) -> None:
-        """Sample mode, link and sources if they have changed, or after `SAMPLE_S`.
-
-        `refused` is true if the refused sources have changed.
-        """
+        """Sample mode, link and sources after `SAMPLE_S`, or at once after a change."""
         mode, reason, link, _ = status = step.recorded.status
         if status == self._status and t - self._sampled < SAMPLE_S and not refused:
             return

@@ -20,10 +20,7 @@ from acsard.daemon.late_causes import cause_in
 from acsard.report.report_data import Mark, ReportData
 
 Clock = Callable[[float, bool], str]
-"""Function that formats a time in s since 1970 as local time.
-
-Its second argument is true to format the time with its date.
-"""
+"""Formats a time in s since 1970 as local time, with the date if the second argument is true."""
 
 MAX_REASONS = 8
 """Largest number of rows in the table of reasons."""
@@ -69,7 +66,7 @@ OF_THE_BOARD = {
 def differences(config: Config) -> list[Setting]:
     """Return the settings that differ from their defaults.
 
-    A command source that was added or removed appears with all its keys.
+    They include all keys of a command source that was added or removed.
     """
     here, default = (dict(flat(effective(each))) for each in (config, Config()))
     return [
@@ -123,8 +120,7 @@ def _names(marks: list[Mark]) -> str:
 def reasons(data: ReportData) -> list[tuple[str, str, str, float]]:
     """Return why command sources did not drive: rows of source, state, reason, and duration in s.
 
-    The longest duration comes first, and there are at most `MAX_REASONS` rows. Reasons that differ
-    only in numbers share a row, with the text of the reason that lasted longest.
+    The longest duration comes first. Reasons that differ only in numbers share a row.
     """
     durations: dict[tuple[str, str, str], dict[str, float]] = {}
     for name, band in data.sources.bands.items():
@@ -160,11 +156,7 @@ def _late(marks: Iterable[Mark], clock: Clock) -> str:
 
 
 def notes(data: ReportData, origin: Origin) -> list[str]:
-    """Return the notes for the reader of the report.
-
-    They are the notes of `origin`, and notes about missing steps, about a change of the clock, and
-    about the resolution of the pictures.
-    """
+    """Return the notes of `origin`, and notes about missing steps, the clock and the resolution."""
     found = list(origin.notes)
     if data.missing:
         found.append(

@@ -1,12 +1,12 @@
 """The prompt for `--json-lines`: another program, such as the robot's page, asks the person.
 
 This module writes texts and questions to standard output as JSON objects, one per line. It reads
-answers, key presses and signs of life from standard input. The program must send a line again and
-again while it is in contact with the person. If the input ends, or if the program is silent while
-something may move, this module interrupts the subcommand as Ctrl-C does.
+answers, key presses and signs of life from standard input. If the input ends, or if the program
+sends no line for `HEARD_S` while something may move, this module interrupts the subcommand as
+Ctrl-C does.
 
-deploy/web/README.md describes the fields. The page's server relays the lines, and `web/openapi.py`
-describes them for other programs, with the docstrings of their classes.
+deploy/web/README.md describes the fields. `web/openapi.py` describes the lines for other programs,
+with the docstrings of their classes.
 """
 
 from __future__ import annotations
@@ -38,19 +38,17 @@ HEARD_S = 0.9
 After a longer silence the subcommand sends zero speeds, so the robot begins to stop within a second
 of the program's last line. The program sends a line every 0.1 s, even if the line is only `{}`. TCP
 resends a lost packet after 0.2 s, and again after another 0.4 s, so a line that is lost twice still
-arrives in time. A line that is lost three times arrives too late.
+arrives in time.
 
-This computer may be too busy to keep the limit. Then a guided drive ends for another reason: it has
-received nothing from the daemon for 0.5 s (calibration/guided/leg_driver.py). When a person drives
-by hand, each command is a sign of life, and the timeout of the command source replaces this limit.
+If this computer is too busy to keep the limit, a guided drive ends because it receives nothing from
+the daemon for 0.5 s (calibration/guided/leg_driver.py). When a person drives by hand, the timeout
+of the command source replaces this limit.
 """
 
 LISTEN_S = 0.05
 
 LINE_BYTES = 65536
-"""Largest length of an input line. A longer one interrupts the subcommand, because the program is
-faulty.
-"""
+"""Largest length of an input line. A longer line interrupts the subcommand."""
 
 
 class Line(Struct, frozen=True):
@@ -185,9 +183,9 @@ class JsonPrompt:
         )
 
     def keys(self, wait_s: float) -> str:
-        """Return " " if a key was pressed since the last answer or the last call, else "".
+        """Wait up to `wait_s` s for a key press, and return " " if a key was pressed, else "".
 
-        Waits up to `wait_s` s for a key press.
+        A key that was pressed since the last answer or the last call counts too.
         """
         with self._news:
             self._news.wait_for(lambda: self._pressed, wait_s)
@@ -197,8 +195,8 @@ class JsonPrompt:
     def offer(self, config: str | None, keys: Mapping[str, object], trouble: str = "") -> bool:
         """Offer to write these keys into the configuration file; return whether they were written.
 
-        The question is asked only if the file can be changed. `config` is the path of the file, or
-        None to search for it. `trouble` is a reason not to write, or "".
+        `config` is the path of the file, or None to search for it. The question is asked only if
+        the file can be changed and `trouble`, a reason not to write, is "".
         """
         try:
             if trouble:
@@ -229,10 +227,9 @@ class JsonPrompt:
         print(msgspec.json.encode(message).decode(), flush=True)
 
     def _ask(self, read: Callable[[str | float | None], T], **about: object) -> T:
-        """Ask a question and return `read(answer)`.
+        """Ask a question until `read` accepts the answer, and return `read(answer)`.
 
-        `read` raises `ValueError` with a description of valid answers; then the question is
-        repeated.
+        `read` raises `ValueError` with a description of valid answers.
         """
         self._moves, wrong = False, ""
         while True:
@@ -282,7 +279,6 @@ class JsonPrompt:
         return ""
 
     def _readable(self, wait_s: float) -> bool:
-        """Return whether input is available, or arrives within `wait_s` s."""
         return bool(select.select([self._input], [], [], wait_s)[0])
 
     def _take(self, line: bytes) -> None:

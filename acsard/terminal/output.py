@@ -30,8 +30,7 @@ def table(
 ) -> Table:
     """Return rows as a table in columns.
 
-    `heads` are the headings, `right` are the numbers of the right-aligned columns, and `gap` is the
-    number of spaces between two columns.
+    `right` are the numbers of the right-aligned columns, and `gap` is the space between columns.
     """
     cells = list(rows)
     made = Table(
@@ -51,10 +50,7 @@ def has_screen() -> bool:
 
 
 def show(*parts: RenderableType, most: int = WHOLE) -> None:
-    """Print each part on lines of its own, at most `most` characters wide.
-
-    With `WHOLE` no row is wrapped, even if it is wider than the terminal.
-    """
+    """Print each part on lines of its own, at most `most` characters wide. `WHOLE` wraps no row."""
     console = _console(sys.stdout)
     if console.is_terminal and most < WHOLE:
         console.print(Group(*parts), width=min(most, console.width))

@@ -77,42 +77,32 @@ class Prompt(Protocol):
     def offer(self, config: str | None, keys: Mapping[str, object], trouble: str = "") -> bool:
         """Offer to write these keys into the configuration file; return whether they were written.
 
-        `config` is the path of the file, or None to search for it. `trouble` is a reason not to
-        write, or "".
+        `config` is the file's path, or None to search for it. `trouble` is a reason not to write.
         """
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
         """Ask the question. Return one of `answers`, or None if no person watches the robot."""
 
     def start(self, text: str, by_key: bool = False) -> None:
-        """Show the text, and wait until the person starts the next drive.
-
-        `by_key` is true if a key press is the intended end of that drive.
-        """
+        """Show the text until the person starts a drive, which a key should end if `by_key`."""
 
     def number(self, ask: Ask) -> float:
-        """Ask for a number, and return the number that the person measured.
-
-        Raises `NobodyError` if there is no person who can measure.
-        """
+        """Return the number that the person measured. Raises `NobodyError` without a person."""
 
     def keys(self, wait_s: float) -> str:
         """Return the keys that were pressed; wait up to `wait_s` s for the first one."""
 
 
 SIGNALS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP
-"""The signals that end a subcommand that moves something.
-
-Ctrl-Z is included because a suspended program would leave a wheel turning.
-"""
+"""The signals that end a subcommand. Suspending it with Ctrl-Z would leave a wheel turning."""
 
 
 @contextmanager
 def ended_by_signals(says: str = "", *, exits: bool = False) -> Iterator[None]:
     """Raise `KeyboardInterrupt` in the block on any of `SIGNALS`, and ignore further signals.
 
-    So the cleanup of the block can send zero speeds. `says` is printed when a signal arrives. With
-    `exits`, a signal other than Ctrl-C raises `SystemExit` with the exit code of that signal.
+    The cleanup of the block can then send zero speeds. `says` is printed when a signal arrives.
+    With `exits`, a signal other than Ctrl-C raises `SystemExit` with the exit code of that signal.
     """
     before = [signal.getsignal(number) for number in SIGNALS]
 

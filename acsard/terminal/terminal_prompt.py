@@ -33,9 +33,8 @@ COLOURS = {"PASS": "green", "WARN": "yellow", "FAIL": "red", "SKIPPED": "bright_
 class Screen:
     """Output of a subcommand that asks questions.
 
-    The present activity is a line on the terminal that the next output overwrites. There is no such
-    line if standard error is not a terminal. With `as_json`, only texts and questions are shown,
-    because the subcommand prints one JSON object at its end.
+    On a terminal the present activity is a line that the next output overwrites. With `as_json`,
+    only texts and questions are shown, because the subcommand prints one JSON object at its end.
     """
 
     def __init__(self, as_json: bool = False) -> None:
@@ -89,11 +88,10 @@ class NoPrompt(Screen):
     """Prompt that asks no person and answers the questions itself.
 
     It confirms each request that has only one possible answer, starts every drive at once, and
-    gives the default if a number is asked for. It leaves all other questions without an answer.
+    gives the default number. It leaves all other questions without an answer.
     """
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
-        """Return the only possible answer, or None if there are several."""
         return answers[0] if len(answers) == 1 else None
 
     def start(self, text: str, by_key: bool = False) -> None:
@@ -105,7 +103,6 @@ class NoPrompt(Screen):
         return ask.usual
 
     def keys(self, wait_s: float) -> str:
-        """Wait, and return no key."""
         select.select([], [], [], wait_s)
         return ""
 
@@ -116,8 +113,7 @@ class NoPrompt(Screen):
 class TerminalPrompt(Screen):
     """Prompt that asks a person on standard error and reads the answers from standard input.
 
-    To start and stop the robot with a key, the terminal must be in the mode
-    `host.terminal_modes.one_by_one`, which delivers single keys.
+    It needs `host.terminal_modes.one_by_one` to start and stop the robot with a single key.
     """
 
     def ask(self, question: str, answers: Sequence[str]) -> str:
@@ -167,7 +163,6 @@ class TerminalPrompt(Screen):
         return _read() if select.select([sys.stdin], [], [], wait_s)[0] else ""
 
     def progress(self, share: float) -> None:
-        """Show a bar on a terminal."""
         if sys.stderr.isatty():
             done = round(BAR * share)
             bar = "#" * done + "." * (BAR - done)

@@ -1,8 +1,4 @@
-"""The lines in which `acsard drive` shows the robot, for any width. This module is pure.
-
-A terminal shows these lines as a screen (`terminal.py`). Any other output gets reports of fewer
-lines.
-"""
+"""The lines in which `acsard drive` shows the robot, for any width. This module is pure."""
 
 from __future__ import annotations
 
@@ -113,10 +109,7 @@ def reason(state: RobotState) -> str:
 
 
 def refused(objection: str) -> str:
-    """Return a sentence which says why the robot does not follow the keys.
-
-    If the robot waits for a zero command, the sentence also says how to send one with the keys.
-    """
+    """Return why the robot does not follow the keys, and how to send a zero if it needs one."""
     release = " (release the key, and press it again)" if "must send a zero" in objection else ""
     return f"your keys do not drive the robot: {printable(objection)}{release}"
 

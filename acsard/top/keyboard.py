@@ -18,22 +18,20 @@ from acsard.top.drive_screen import Teleop
 HOLD_S = 0.6
 """Time for which one key press drives the robot, s.
 
-It is longer than a keyboard's delay before the first repeat (0.25 to 0.5 s); otherwise the robot
-would stutter.
+It must be longer than a keyboard's delay before the first repeat (0.25 to 0.5 s).
 """
 
 REPEAT_S, REPEATS = 0.25, 3
-"""A held key drives the robot for `REPEAT_S` seconds after each of its repeats.
+"""Time that each repeat of a held key drives, s, and repeats after which a key counts as held.
 
-A key counts as held after `REPEATS` repeats, each within `REPEAT_S` of the press before. Keyboards
-repeat a held key 10 to 30 times a second.
+The repeats must be less than `REPEAT_S` apart. Keyboards repeat a key 10 to 30 times a second.
 """
 
 BURST = 8
 """Largest number of keys that count if they arrive together.
 
-A larger number was delayed, usually by an SSH connection that stalled, because a held key repeats
-only about 30 times a second. The operator may have released the key long ago.
+More keys were delayed, usually by an SSH connection that stalled. The operator may have released
+the key long ago.
 """
 
 BURST_S = 0.2
@@ -66,7 +64,7 @@ class Keyboard:
         self._zeros = ZEROS
 
     def take(self, text: str, now: float) -> None:
-        """Process the text of one terminal read at `now` (monotonic clock, s).
+        """Process one read from the terminal at `now` (monotonic clock, s).
 
         A burst of keys stops the robot, because old keys do not show what the operator wants now.
         """
@@ -138,7 +136,6 @@ class Ride:
             self._robot.send(0.0, 0.0)
 
     def seen(self) -> Teleop:
-        """Return the values to show now."""
         now, robot, watch = time.monotonic(), self._robot, self._watch
         why = ""
         if watch.state is not None and now - self._fine > GRACE_S:

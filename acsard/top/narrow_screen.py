@@ -1,8 +1,7 @@
 """Builds the parts of the screen of `acsard top` for a narrow terminal. This module is pure.
 
-The figures are those of `wide_screen.py`, but they are below each other. Continued lines are
-indented. The figures since the start of the daemon come last, so a screen with few lines cuts them
-off first.
+The figures are those of `wide_screen.py`. The figures since the start of the daemon come last, so a
+screen with few lines cuts them off first.
 """
 
 from __future__ import annotations
@@ -58,10 +57,9 @@ def motion(state: RobotState, width: int) -> list[Text]:
 
 
 def sources(state: RobotState, room: int, width: int) -> list[Text]:
-    """Return lines about each command source: its priority, its age, and what it waits for.
+    """Return lines with each source's priority and age, and what the source waits for.
 
-    If the sources need more than about `room` lines, the last line names the sources that are left
-    out.
+    If the sources need more than about `room` lines, the last line names the other sources.
     """
     lines = [rule(width, [(0, "sources"), (16, "priority"), (26, "seen")])]
     left = list(state.sources)
@@ -124,10 +122,7 @@ def timing(state: RobotState, width: int) -> list[Text]:
 
 
 def folded(text: str, width: int, inset: int) -> list[Text]:
-    """Wrap a sentence between words, with lines indented by `inset` cells.
-
-    A first line that starts with a label is not indented.
-    """
+    """Wrap a sentence. Lines are indented by `inset` cells, but not a first line with a label."""
     first = "" if text.startswith(("gyro ", "track ", "board ", "last one ")) else " " * inset
     wide = max((cell_len(one) for one in text), default=1)  # a character may be two cells wide
     room, rest = max(inset + 1, width // max(1, wide)), " " * inset

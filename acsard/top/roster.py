@@ -21,18 +21,15 @@ ROOM = (32, 8, 6, 7, 7, 22, 21, 6)
 """Maximum widths, in characters, of all columns except the last, which gets the remaining width."""
 
 NAME, WHY = 12, 32
-"""Minimum widths of the columns ROBOT and WHY, in characters.
-
-On a narrow terminal the column ROBOT shrinks to make room for WHY, but not below its minimum.
-"""
+"""Minimum widths of ROBOT and WHY, characters. ROBOT shrinks first to make room for WHY."""
 
 BATTERY = HEADS.index("BATTERY")
 """Column of the state of charge. The table shows it only if a robot reports a battery."""
 
 URGENT = ("fault", "stopped", "GONE", "SILENT")
-"""Modes of a robot that need attention, and the words for a robot that is absent.
+"""Modes and kinds of absence that need attention. The table lists robots in this order.
 
-The table lists such robots first, because not all lines may fit. Robots with a warning come next.
+Robots with a warning come next.
 """
 
 
@@ -106,10 +103,7 @@ def told(row: Row) -> tuple[str, ...]:
 
 
 def _why(state: RobotState) -> str:
-    """Return brief warnings, the reason of the mode, and the details of the warnings.
-
-    In a mode that needs attention the reason comes first, because a terminal cuts the end.
-    """
+    """Return brief warnings, the reason of the mode, and details. An urgent reason comes first."""
     why = reason(state)
     found, parts = [one for one in warnings(state) if one.brief not in why], [why]
     if found:
@@ -132,10 +126,7 @@ def _absence(row: Row) -> str:
 
 
 def _order(row: Row) -> tuple[int, str]:
-    """Return the sort key of a row: its urgency, then its id.
-
-    If the robot is gone or silent, its last reported mode is ignored.
-    """
+    """Return the sort key of a row: its urgency, then its id. Absence overrides the mode."""
     what = _absence(row) or ("" if row.state is None else row.state.mode)
     if what in URGENT:
         return URGENT.index(what), row.robot_id
@@ -154,8 +145,8 @@ class Roster(Fleet):
     def gather(self) -> list[Row]:
         """Wait until all robots that the user named have answered, and return the rows.
 
-        The wait ends after 1.5 s, or after 3 s if no robot has answered, because the first answer
-        is late on a busy computer. If no robot has answered by then, there are no rows.
+        The wait ends after 1.5 s, or with an empty list after 3 s if no robot has answered. The
+        first answer is late on a busy computer.
         """
         began, rows = time.monotonic(), self.rows()
         while not self.whole:
@@ -168,10 +159,7 @@ class Roster(Fleet):
 
     @property
     def whole(self) -> bool:
-        """Whether all robots that the user named are present and have reported state and version.
-
-        It is never true if the user did not name robots, because their number is unknown.
-        """
+        """Whether all robots that the user named have reported; False if the user named none."""
         with self._lock:
             known = list(self._known.values())
         named = ALL not in self._ids

@@ -1,8 +1,7 @@
 """One screen of `acsard top`: turns a robot's state into lines of coloured text.
 
-This module is pure. Each line is cut to the width of the terminal, and the number of lines to its
-height, so no message can break the layout. If space is short, the screen first leaves out empty
-lines, and then command sources.
+This module is pure. Lines are cut to the size of the terminal, so no message can break the layout.
+If space is short, the screen first leaves out empty lines, and then command sources.
 """
 
 from __future__ import annotations
@@ -75,7 +74,6 @@ def _mode(seen: ScreenData, width: int) -> list[Text]:
     """Return the mode as a badge with the reason next to it.
 
     A wide screen always uses two lines, so that a long reason does not move the lines below.
-    A narrow screen uses as many lines as the reason needs.
     """
     state = seen.state
     if state is None:
@@ -90,9 +88,9 @@ def _mode(seen: ScreenData, width: int) -> list[Text]:
 
 
 def _warnings(state: RobotState, width: int) -> list[Text]:
-    """Return the lines with the warnings, or an empty list if there is no warning.
+    """Return the lines with the warnings, one line on a wide screen; [] without a warning.
 
-    A wide screen has only one line. A single warning is shown with its details.
+    A single warning is shown with its details.
     """
     found = warnings(state)
     words = clean(f"{WARNING}: {found[0]}" if len(found) == 1 else brief(found))

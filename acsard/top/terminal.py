@@ -1,7 +1,6 @@
-"""Shows the screens of `acsard top`, `fleet` and `drive`.
+"""Shows the screens of `acsard top`, `fleet` and `drive`. A key or a signal ends a screen.
 
-If the terminal cannot show a screen, `drive` prints lines instead. A key or a signal ends a screen.
-Ctrl-Z suspends it, and `fg` resumes it.
+If the terminal cannot show a screen, `drive` prints lines instead.
 """
 
 from __future__ import annotations
@@ -38,10 +37,7 @@ KEYS_S = 0.05
 """Interval at which the keys of a drive are read, s."""
 
 NEWS_S, SAME_S, QUIET_S = 0.5, 1.0, 10.0
-"""Shortest times between two reports of a drive on a terminal that cannot show a screen, s.
-
-The first applies after a change, the second while the robot moves, and the third otherwise.
-"""
+"""Shortest times between two reports in lines, s: after a change, while moving, and otherwise."""
 
 NO_END = 10**9
 
@@ -83,8 +79,7 @@ def drive(ride: Ride) -> None:
 def part(ride: Ride) -> None:
     """Wait until the robot has stopped, at most 2 s, and print a last report on a terminal.
 
-    Without the wait, this report would say that the robot is driving, although it stops a moment
-    later.
+    Without the wait, this report would say that the robot still drives.
     """
     left = time.monotonic()
     while os.isatty(0) and os.isatty(1):
@@ -181,8 +176,7 @@ def _be_lenient() -> None:
 def until_told() -> Iterator[None]:
     """End the block at the first terminating signal, or when the terminal closes.
 
-    Later signals are ignored during the cleanup: a terminal that closes under a shell sends two,
-    and Ctrl-C may be held down.
+    Later signals are ignored during the cleanup: a terminal that closes under a shell sends two.
     """
 
     def deaf() -> None:
@@ -210,10 +204,9 @@ def until_told() -> Iterator[None]:
 
 @contextmanager
 def keys() -> Iterator[Callable[[float], str | None]]:
-    """Yield a function that takes a number of seconds, waits that long for keys, and returns them.
+    """Yield a function that waits for keys for a number of seconds, and returns them or "".
 
-    The function returns "" if no key was typed, and None when the input has ended. If standard
-    input is not a terminal, it always returns "".
+    It returns None when the input has ended, and always "" if the input is not a terminal.
     """
 
     def read(seconds: float) -> str | None:
@@ -266,8 +259,8 @@ class News:
         state = seen.state
         words = ("", "") if state is None else (state.mode, state.reason)
         what = (*words, seen.objection, seen.linear, seen.angular, seen.silent)
-        moves = state is not None and bool(state.linear or state.angular)
-        wait = NEWS_S if what != self._shown else SAME_S if moves else QUIET_S
+        moving = state is not None and moves(state)
+        wait = NEWS_S if what != self._shown else SAME_S if moving else QUIET_S
         if now - self._at < wait:
             return False
         self._shown, self._at = what, now
@@ -282,10 +275,7 @@ class Page:
         """Number of lines printed since the last help, including it; `NO_END` before the first."""
 
     def with_help(self, told: list[str], height: int) -> list[str]:
-        """Return the lines `told` of a report, with the help first if it is no longer in sight.
-
-        `height` is the number of lines of the terminal.
-        """
+        """Return the lines `told`, after the help if `height` lines would no longer show it."""
         self._shown += len(told)
         if self._shown < height:
             return told

@@ -44,10 +44,9 @@ class ScreenData(Struct, frozen=True):
     silent: bool = False
     """True if the robot is silent, so the shown data is old."""
     passed: float = 0.0
-    """Seconds from the arrival of `before` to the arrival of `state`, on the local clock.
+    """Seconds between the arrivals of `before` and `state`, on the local clock.
 
-    If the time between the stamps of the two states differs from this time by more than the network
-    delay, the robot's clock was set.
+    If the stamps of the two states disagree with this time, the robot's clock was set.
     """
 
 

@@ -1,7 +1,4 @@
-"""Builds the parts of the screen of `acsard top` for a wide terminal. This module is pure.
-
-On the screen, they are below the robot's mode. Each part begins with a horizontal line.
-"""
+"""Builds the screen of `acsard top` below the robot's mode, for a wide terminal. Pure."""
 
 from __future__ import annotations
 
@@ -22,10 +19,7 @@ WIDEST = 116
 """Maximum width of the screen in character cells. Longer lines are harder to read."""
 
 SHORT_WORDS, LONG_WORDS = 21, 56
-"""Widths of the short and the long explanation of a latency in `FIGURES`, in character cells.
-
-The long explanation is used if the screen is `WIDEST` cells wide.
-"""
+"""Widths of the short and the long explanation in `FIGURES`, in character cells."""
 
 MOST_REASONS, MOST_PORT = 16, 34
 
@@ -42,10 +36,7 @@ FIGURES = {
     ),
     "mcu_round_trip": ("line out → answer in", "from a line to its answer; checked link"),
 }
-"""Maps each latency (`latencies.Name`) to a short and a long explanation.
-
-In the short one, an arrow leads from the beginning of the measured interval to its end.
-"""
+"""Short and long explanation of each latency. `a → b` means the time from event a to event b."""
 
 
 def motion(state: RobotState, width: int) -> list[Text]:
@@ -86,10 +77,7 @@ def wheel(speed: float, scale: float, cells: int) -> Text:
 
 
 def sources(state: RobotState, room: int, width: int) -> list[Text]:
-    """Return a heading and at most `room` lines, one for each command source.
-
-    If some sources do not fit, the last line names them.
-    """
+    """Return a heading and at most `room` lines, one per source. The last line names the rest."""
     room_name = 13 + max(0, width - 80) // 2
     start = room_name + 3
     at = ((0, "sources"), (start, "priority"), (start + 10, "seen"), (start + 17, "waits for"))
@@ -108,15 +96,11 @@ def hidden(left: Sequence[SourceState]) -> str:
 
 
 def drives(source: SourceState, state: RobotState) -> bool:
-    """Return whether the robot follows this source."""
     return source.name == state.source and state.mode == "driving" and not source.waits_for
 
 
 def waits(source: SourceState, state: RobotState) -> str:
-    """Return in words what a source waits for.
-
-    If it waits for nothing, the text says that it drives, or gives the mode of the robot.
-    """
+    """Return in words what a source waits for, which may be nothing."""
     if source.waits_for:
         return clean(source.waits_for)
     if drives(source, state):
@@ -166,7 +150,7 @@ def link(seen: ScreenData, state: RobotState, width: int) -> list[Text]:
 
 
 def title(seen: ScreenData, state: RobotState) -> Text:
-    """Return the state of the link and its port."""
+    """Return the heading of the link's part of the screen: the state of the link and its port."""
     told = Text.assemble("link ", (clean(state.link), f"bold {LINKS.get(state.link, 'red')}"))
     if seen.info is not None:
         sim = seen.info.simulated
@@ -175,13 +159,12 @@ def title(seen: ScreenData, state: RobotState) -> Text:
 
 
 def certificate(state: RobotState) -> Text:
-    """Return the remaining validity of the certificate."""
     style = "" if state.certificate_expiry.startswith("valid") else "bold red"
     return Text(f"certificate {clean(state.certificate_expiry)}", style)
 
 
 def rates(seen: ScreenData, state: RobotState, before: RobotState) -> Callable[[str], str]:
-    """Return a function that takes the name of a counter, and formats its rate and its total."""
+    """Return a function that formats the rate and the total of the counter with a given name."""
     # The stamps of the states give the exact time between them. If that time differs from the local
     # one by more than a network's delay, the robot's clock was set, so use the local time.
     seconds = (state.stamp.to_ns() - before.stamp.to_ns()) / NS_PER_S
@@ -218,7 +201,6 @@ def _gyro(does: str) -> Text:
 
 
 def _port(info: Info) -> str:
-    """Return the serial port, or only the last part of its path if the path is long."""
     port = clean(info.port)
     return port if len(port) <= MOST_PORT else port.rpartition("/")[2][:MOST_PORT]
 
@@ -231,7 +213,6 @@ def missed(state: RobotState, before: RobotState) -> Text:
 
 
 def _refusals(state: RobotState, before: RobotState) -> list[Text]:
-    """Return two rows: the numbers of rejections by reason, and the last rejection in words."""
     kinds = [
         Text(f"{kind} ").append_text(Text(", ").join(parts))
         for kind, parts in refused(state, before)
@@ -242,10 +223,7 @@ def _refusals(state: RobotState, before: RobotState) -> list[Text]:
 
 
 def refused(state: RobotState, before: RobotState) -> list[tuple[str, list[Text]]]:
-    """Return the numbers of rejections by kind and reason.
-
-    A number that is larger than in `before` is yellow.
-    """
+    """Return rejections by kind and reason. A number that has grown since `before` is yellow."""
     kinds = []
     for kind, prefix in (("lines", "line_"), ("commands", "command_"), ("gyro", "imu_")):
         found = [(n, c) for n, c in state.counters.items() if n.startswith(prefix) and c]

@@ -1,17 +1,12 @@
 """Accepts TCP connections, and limits them before they cost memory.
 
-No other module counts connections. A connection goes through these states:
+A connection goes through these states:
 
-1. silent: it has only a socket and a place in `Sockets`. TLS starts with the first byte, so a
-   silent connection costs a file descriptor and almost no memory;
-2. waiting, if `HANDSHAKES_AT_ONCE` others are in the TLS handshake, or if its network has begun too
-   many handshakes lately;
-3. starting: in the TLS handshake, for at most `HANDSHAKE_S`, or `HURRIED_S` if others wait;
+1. silent: it costs only a file descriptor and a place in `Sockets`, because TLS starts with the
+   first byte;
+2. waiting for its TLS handshake, if too many are running or its network has begun too many;
+3. starting: in the TLS handshake;
 4. open: aiohttp reads its requests.
-
-If all places are taken, `Sockets` chooses the connection to close. The first request must arrive
-within `REQUEST_S`. If a client sends bytes that are not an HTTP request, `Reader` explains this in
-its answer and counts the refusal. aiohttp alone would log a traceback each time.
 """
 
 from __future__ import annotations
@@ -39,29 +34,24 @@ from acsard.web.limits import HANDSHAKES, SOCKETS_HERE, UNREAD_BYTES, Sockets, s
 from acsard.web.metrics import Counts
 
 HANDSHAKE_S, HANDSHAKES_AT_ONCE = 3.0, 32
-"""Time limit for a TLS handshake, s, and maximum number of handshakes at once."""
+"""Time limit for a TLS handshake, s; maximum number of handshakes at once."""
 
 HURRIED_S = 0.3
-"""Time, s, after which a TLS handshake may be cut so that a waiting connection can start its own.
-The network with the most handshakes loses one. Without this limit, clients that fall silent in
-their handshakes would delay a phone by `HANDSHAKE_S`."""
+"""Age, s, from which a TLS handshake may be cut if `HANDSHAKES_AT_ONCE` run and others wait.
+Otherwise, clients that fall silent in their handshakes would delay a phone by `HANDSHAKE_S`."""
 
 REQUEST_S = 10.0
-"""Time limit, s, from accepting a connection to the head of its first request. After that, the
-connection is cut."""
+"""Time limit, s, from accepting a connection to the head of its first request."""
 
 UNREAD_S = 5.0
-"""Time limit, s, for a client that does not read its answers, or whose network is lost. The kernel
-ends the connection if the client acknowledges no data, or keeps its receive window closed, for this
-long."""
+"""Time, s, after which the kernel ends a connection whose client acknowledges no data or keeps its
+receive window closed."""
 
 READ_BYTES = 16384
-"""Size of asyncio's read buffer per TLS connection, bytes: one TLS record. The default of 256 KiB
-would be most of the memory of an idle connection."""
+"""Read buffer of each TLS connection, bytes: one TLS record. asyncio's default is 256 KiB."""
 
 PAUSE_S = 0.05
-"""Time, s, for which a listening address accepts no connection after the process has reached its
-limit of open files."""
+"""Pause, s, in accepting connections after the process has run out of file descriptors."""
 
 Factory = Callable[[], "Reader"]
 
@@ -69,8 +59,7 @@ Factory = Callable[[], "Reader"]
 class Acceptor:
     """Accepts TCP connections at the listening addresses, and closes those beyond a limit.
 
-    Connections from the robot itself are counted separately, so clients from the network can never
-    lock out a browser on the robot.
+    The robot itself has its own limit, so network clients cannot lock out a browser on it.
     """
 
     def __init__(self, counts: Counts) -> None:
@@ -80,21 +69,17 @@ class Acceptor:
         self._away = Sockets["_Connection"](sockets_for(files))
         self._listeners: list[socket.socket] = []
         self._waiting: dict[str, dict[_Connection, None]] = {}
-        """The connections that wait for their TLS handshake, by network. When a handshake starts,
-        its network moves to the end of this dict, so the networks take turns."""
+        """Connections that wait for their handshake, by network. The one served last is last."""
         self._handshakes = Buckets(HANDSHAKES)
         self._starting: dict[_Connection, float] = {}
-        """The connections in the TLS handshake, each with the time of its start, oldest first."""
+        """Start time of each running TLS handshake, s on the event loop's clock; oldest first."""
         self._again: asyncio.TimerHandle | None = None
         """Timer of the next call of `_next`, or None if no call is scheduled."""
         self._ended: set[_Connection] = set()
         """The connections whose token was no longer valid at the last call of `tidy`."""
 
     def listen(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
-        """Accept connections at the listening socket `opened`.
-
-        `make` creates the handler of a connection. `secure` is None for plain HTTP.
-        """
+        """Accept connections at the listening socket `opened`; `secure` is None for plain HTTP."""
         sslproto.SSLProtocol.max_size = READ_BYTES
         # A browser sends no request before it has the answer to the last one. aiohttp would queue
         # 32 requests, whose headers can take megabytes.
@@ -114,26 +99,19 @@ class Acceptor:
                 one.cut()
 
     def spoke(self, transport: asyncio.BaseTransport | None, body: StreamReader) -> None:
-        """Record that a request has begun on this connection, which ends the limit `REQUEST_S`.
-
-        `body` is the body of the request.
-        """
+        """Record that a request has begun, so the limit `REQUEST_S` no longer applies."""
         if (one := _connection(transport)) is not None:
             one.spoke(body)
 
     def admitted(self, transport: asyncio.BaseTransport | None, who: Who) -> None:
-        """Record that the client of this connection has been identified as `who`.
-
-        If all places are taken, connections without an identified client are closed first.
-        """
+        """Record the client's identity. Connections without one are the first to be closed."""
         if (one := _connection(transport)) is not None:
             one.pool.prove(one, who.token)
 
     def tidy(self, valid: Collection[str]) -> None:
-        """Cut the connections whose token is not in `valid`. `Page.tidy` calls this once a second.
+        """Cut the connections whose token was missing in `valid` at two calls in a row.
 
-        A connection is cut at the second call that finds its token invalid, because a WebSocket is
-        sent the reason first.
+        Call this once a second. The delay lets a WebSocket client receive the reason first.
         """
         before = self._ended
         self._ended = {one for pool in (self._here, self._away) for one in pool.ended(valid)}
@@ -162,11 +140,7 @@ class Acceptor:
             _Connection(self, pool, accepted, peer, secure, make).enter()
 
     def _no_file(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
-        """Close a connection to free its file descriptor; accept again after `PAUSE_S`.
-
-        A connection from another machine is closed if `Sockets` allows that, else one from the
-        robot itself.
-        """
+        """Close a connection to free its file descriptor, and accept again after `PAUSE_S`."""
         loop = asyncio.get_running_loop()
         loop.remove_reader(opened)
         loop.call_later(PAUSE_S, self._resume, opened, secure, make)
@@ -199,7 +173,7 @@ class Acceptor:
             self._waiting.pop(one.network, None)
 
     def started(self, one: _Connection) -> None:
-        """Remove a connection from the state `starting`, and let the next handshake start."""
+        """Record that a TLS handshake has ended, and let the next one start."""
         self._starting.pop(one, None)
         if self._again is None:
             self._next()
@@ -226,10 +200,7 @@ class Acceptor:
         self._again = loop.call_later(0.005, self._next)
 
     def _has_room(self, now: float) -> bool:
-        """Return whether another handshake may start.
-
-        If `HANDSHAKES_AT_ONCE` are running, cut one that is older than `HURRIED_S` to make room.
-        """
+        """Return whether a handshake may start. If too many run, cut one older than `HURRIED_S`."""
         if len(self._starting) < HANDSHAKES_AT_ONCE:
             return True
         # The most crowded network loses a handshake, so a slow client of another network keeps
@@ -267,7 +238,6 @@ class _Connection(asyncio.Protocol):
         self._head = 0
         """Number of bytes of the next request's head (request line and headers) received so far."""
         self._body: StreamReader | None = None
-        """The body of the last request."""
         self._inner: Reader | None = None
 
     def enter(self) -> None:
@@ -399,7 +369,7 @@ def _connection(transport: asyncio.BaseTransport | None) -> _Connection | None:
 
 
 class Reader(RequestHandler):
-    """aiohttp's handler of one connection. Only its answer to an invalid request differs."""
+    """aiohttp's handler of one connection, with another answer to invalid requests."""
 
     def __init__(self, counts: Counts, server: Any) -> None:
         """Create a handler for `server`, which is the server of the application's runner."""
@@ -408,10 +378,7 @@ class Reader(RequestHandler):
 
     @property
     def reads_head(self) -> bool:
-        """Whether the next bytes belong to the head of a request.
-
-        This is false while a parsed request is queued, and for a WebSocket.
-        """
+        """Whether the next bytes are a request's head. False for a WebSocket or queued requests."""
         return not self._upgraded and not self._messages
 
     def handle_error(
@@ -421,10 +388,7 @@ class Reader(RequestHandler):
         exc: BaseException | None = None,
         message: str | None = None,
     ) -> web.StreamResponse:
-        """Answer bytes that are not a valid HTTP request, and count the refusal.
-
-        Errors of the application (status 500 and above) are left to aiohttp.
-        """
+        """Answer bytes that are not an HTTP request. aiohttp alone would log a traceback."""
         if status >= 500:
             return super().handle_error(request, status, exc, message)
         nameless = (message or "").startswith("Missing 'Host'")

@@ -1,10 +1,8 @@
 """Decides whether an HTTP request reaches its handler.
 
-The table of routes has a row for each path. `Admission` checks a request in this order: whether the
-client is on the robot (`callers.py`), the origin of the web page that sent the request, the token,
-the request rate, and the role that the row requires. The handler of an admitted request finds the
-client's identity, a `Who`, in the request. A path that has no row requires a token too, so a client
-without a token does not learn which paths exist.
+The checks, in this order: whether the client is on the robot (`callers.py`), the origin of the web
+page that sent the request, the token, the request rate, the role. A path that does not exist
+requires a token too, so a client without one does not learn which paths exist.
 """
 
 from __future__ import annotations
@@ -45,12 +43,10 @@ from acsard.web.socket_messages import MAX_BYTES
 from acsard.web.tokens import Token, Vault, owner_in
 
 HOST = re.compile(r"([A-Za-z0-9.-]{1,253}|\[[0-9A-Fa-f:.]{2,45}\])(:[0-9]{1,5})?")
-"""Pattern of a valid `Host` header. It is strict because the value is copied into a response
-header."""
+"""Pattern of a valid `Host` header. It is strict, because the value is copied into an answer."""
 
 REASONS: dict[int, Reason] = {404: "path", 405: "path", 413: "too_big"}
-"""The reason under which an error of aiohttp is counted as a refusal, by HTTP status. Every other
-status counts as `malformed`."""
+"""Reason under which an error of aiohttp is counted, by HTTP status; `malformed` for all others."""
 
 WORDS = {
     404: "this address does not exist; GET /api lists all addresses",
@@ -58,15 +54,13 @@ WORDS = {
 }
 
 WHO: web.RequestKey[Who] = web.RequestKey("who", Who)
-"""Key under which a request contains the client's identity. A request for a path that is open to
-every client does not contain it."""
+"""Key of the client's identity in a request. It is missing if a path is open to every client."""
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 READ_EVERY_S = 0.005
-"""Shortest interval between two reads of the token file, s. Each read starts a thread, and the
-whole server waits while a thread starts. A flood of requests with one thread each delayed a stop by
-200 ms."""
+"""Shortest interval between two reads of the token file, s. Each read starts a thread. A flood of
+requests with one thread each delayed a stop by 200 ms."""
 
 
 class Lookups:
@@ -78,11 +72,7 @@ class Lookups:
         self._read_s = -READ_EVERY_S
 
     async def read(self) -> Sequence[Token]:
-        """Return the tokens from a read of the token file that starts after this call.
-
-        So a token that was revoked before the call is not among them. Raises `TimeoutError` if the
-        disk does not answer.
-        """
+        """Return the tokens from a read that starts after this call. Raises `TimeoutError`."""
         if self._next is None:
             self._next = asyncio.create_task(self._later())
             self._next.add_done_callback(lambda done: done.cancelled() or done.exception())
@@ -108,12 +98,7 @@ class Admission:
         counts: Counts,
         rules: WebConfig,
     ) -> None:
-        """Store the rules by which clients are admitted.
-
-        `robot` is the id of this page's robot. `names` are the host names and addresses,
-        in lower case, by which other machines reach the robot. `rules` name the role of a client on
-        the robot itself, and the origins of other web pages that may send requests.
-        """
+        """Store the rules. `names` are the robot's host names and addresses, in lower case."""
         self._local, self._origins = Who(rules.local, HERE), frozenset(rules.origins)
         self._robot, self._names, self._vault = robot, names, vault
         self._acceptor, self._counts = acceptor, counts
@@ -134,10 +119,9 @@ class Admission:
         return app
 
     async def owner(self, peer: str, shown: Sequence[str]) -> Who:
-        """Return the owner of the first valid token in `shown`, the tokens that a client has sent.
+        """Return the owner of the first valid token in `shown`; `peer` is the client's IP address.
 
-        `peer` is the client's IP address. Raises `RefusedError` if no token is valid, and
-        `TimeoutError` if the disk does not answer within `READ_S`.
+        Raises `RefusedError` if no token is valid, and `TimeoutError` if the disk does not answer.
         """
         if not any(shown):
             raise RefusedError(
@@ -202,11 +186,9 @@ class Admission:
             await asyncio.sleep(HOLD_S)
 
     async def _admit(self, request: web.Request, row: Route | None) -> bool:
-        """Check a request; raise `RefusedError` if it is refused.
+        """Store the client's identity in the request; return whether the client is too fast.
 
-        Return True if the client exceeds the request rate, so the request or its answer must wait.
-        `row` is the route of the request, or None if the path does not exist. Store the client's
-        identity in the request unless the route is open to every client.
+        Raises `RefusedError` if the client may not use the path. An unknown path has no `row`.
         """
         said = asked_of(request)
         here = place(said, self._names | {own_address(request)}) == "here"
@@ -272,7 +254,6 @@ class Admission:
 
 
 def asked_of(request: web.Request) -> Asked:
-    """Return the facts of a request that decide about its admission. The headers may be forged."""
     hosts = request.headers.getall("Host", [])
     return Asked(
         peer_of(request),
@@ -294,10 +275,7 @@ def peer_of(request: web.Request) -> str:
 
 
 def own_address(request: web.Request) -> str:
-    """Return the IP address of this machine that the client connected to.
-
-    Unlike the `Host` header, this address cannot be forged.
-    """
+    """Return the address of this machine to which the client connected. It cannot be forged."""
     return unmapped(_reached(request)[0].lower())
 
 
@@ -307,19 +285,12 @@ def own_port(request: web.Request) -> int:
 
 
 def tokens_shown(request: web.Request, robot: str) -> list[str]:
-    """Return the tokens in a request, the likeliest to be valid first.
-
-    The tokens are those in its headers. If the headers contain none, they are those in its cookies
-    for the page of the robot with the id `robot`.
-    """
+    """Return the tokens in a request's headers, or else in its cookies for the robot's id."""
     return tokens_sent(request) or tokens_in(request.cookies, robot, own_port(request))
 
 
 def tokens_sent(request: web.Request) -> list[str]:
-    """Return the token in the header `Authorization`, as a list of one.
-
-    Without this header, return the tokens in the subprotocols that a WebSocket client offers.
-    """
+    """Return the token in `Authorization`, or else those that a WebSocket client offers."""
     kind, _, text = request.headers.get("Authorization", "").partition(" ")
     if kind.lower() == "bearer":
         return [text.strip()]

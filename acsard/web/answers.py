@@ -1,8 +1,7 @@
 """The answers of the page's server: JSON, files, problems, and the headers of all of them.
 
-A file is served from `acsard/web/page` by its plain name only. `index.html` is sent with the script
-of the STOP button and the style sheet inside it, so STOP works even if another file is late or
-never arrives. The content security policy of `index.html` allows these two by their hashes.
+`index.html` is sent with the script of the STOP button and the style sheet inside it, so STOP works
+even if another file is late or never arrives.
 """
 
 from __future__ import annotations
@@ -53,16 +52,12 @@ POLICY = (
     "default-src 'self'; connect-src 'self'{connect}; frame-ancestors 'none'; base-uri 'none'; "
     "form-action 'self'"
 )
-"""Content security policy of every answer except a report. `{connect}` stands for the WebSocket
-URLs of the page's host. It is empty in a refusal, because a refused request may have a foreign
-`Host`, which must not be sent back."""
+"""Content security policy of every answer except a report. `{connect}` stands for the page's
+WebSocket URLs. It is empty in a refusal, so that a foreign `Host` is not sent back."""
 
 
 class TroubleError(AcsardError):
-    """A request that is allowed cannot be fulfilled. The text of the error gives the reason.
-
-    `status` is the HTTP status of the answer.
-    """
+    """An allowed request cannot be fulfilled; `status` is the HTTP status of the answer."""
 
     def __init__(self, status: int, text: str) -> None:
         super().__init__(text)
@@ -75,15 +70,11 @@ def reply(body: object, status: int = 200) -> web.Response:
 
 
 def problem(status: int, text: str) -> web.Response:
-    """Return an error response with the reason `text` in JSON."""
     return reply(Problem(text), status)
 
 
 def sent(request: web.Request, file: File) -> web.Response:
-    """Return the answer with a file of the page, or a 304 if the browser has the file already.
-
-    The file is compressed if the client accepts gzip.
-    """
+    """Return a file, compressed if the client accepts gzip, or a 304 if the client has it."""
     headers = {"ETag": file.tag, "Cache-Control": "no-cache", "Vary": "Accept-Encoding"}
     # A 304 has the policy too, because the browser then replaces the one stored with the file.
     headers["Content-Security-Policy"] = _policy(request, file.policy)
@@ -129,10 +120,7 @@ async def secured(request: web.Request, response: web.StreamResponse) -> None:
 
 
 def _policy(request: web.Request, more: str = "") -> str:
-    """Return the content security policy for an admitted request, with `more` appended.
-
-    Browsers before 2022 do not apply 'self' to ws:// URLs, so the host is written out.
-    """
+    # Browsers before 2022 do not apply 'self' to ws:// URLs, so the host is written out.
     host = request.headers.get("Host", "")
     return POLICY.format(connect=f" ws://{host} wss://{host}") + more
 
@@ -156,11 +144,9 @@ INLINED = {
         "style.css": (b'<link rel="stylesheet" href="page/style.css">', "style"),
     }
 }
-"""Maps the name of a file to the files that are sent inside it.
-
-Each inner file has two values. The first is the element in the outer file that would load the inner
-file. The second is the name of the element that is sent instead, with the inner file as its text.
-"""
+"""Maps a file to the files that are sent inside it. Each inner file has two values: the element
+that would load it, and the name of the element that is sent instead, with the inner file as its
+text."""
 
 
 class File(Struct, frozen=True):

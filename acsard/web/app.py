@@ -1,8 +1,7 @@
 """The request handlers of the page's server, and the table of all its paths (`ROUTES`).
 
-`Admission` finds the row of a request in `ROUTES`, and calls the row's handler if the client may
-use the path. If the request itself is at fault, the handler raises `RefusedError`, which is
-counted. If the request cannot be fulfilled now, the handler raises `TroubleError`.
+A handler raises `RefusedError` if the request itself is at fault, and `TroubleError` if the request
+cannot be fulfilled now.
 """
 
 from __future__ import annotations
@@ -54,8 +53,7 @@ from acsard.web.tokens import Vault
 from acsard.web.viewer import HEARTBEAT_S, Parts, Viewer
 
 BODY_S = 5.0
-"""Time limit for the body of a request, s. A body has a few hundred bytes, and a client that does
-not send it occupies a connection."""
+"""Time limit for the body of a request, s. A body has a few hundred bytes."""
 
 DRAWN: dict[State, int] = {"drawing": 202, "busy": 202, "ready": 200, "failed": 503}
 """HTTP status for each state of a report."""
@@ -104,29 +102,20 @@ class Page:
         acceptor: Acceptor,
         rules: WebConfig = DEFAULT,
     ) -> None:
-        """Make the web application.
-
-        `names` are the host names and addresses of the robot, in lower case. `rules` is the table
-        `[web]` of the configuration. The other arguments are shared with the rest of the server.
-        """
+        """Make the application. `names` are the robot's host names and addresses, in lower case."""
         self._parts, self._vault, self._acceptor = parts, vault, acceptor
         self._robots, self._files, self._reports = parts.robots, Files(), Reports()
         self._box = BlackBox(parts.robots)
         self._seats, self._camera = Seats(), Camera(rules.camera)
         self._has_camera = bool(rules.camera)
         self._sent: dict[str, tuple[File, float]] = {}
-        """The page's files by name, each with the time at which it was last compared with the disk,
-        s on the event loop's clock."""
+        """The page's files by name, each with the time of its last check, s on the loop's clock."""
         self._viewers: set[Viewer] = set()
         self._admission = Admission(parts.robots.id, names, vault, acceptor, parts.counts, rules)
         self.app = self._admission.application(ROUTES, self)
 
     def end_all(self, why: str) -> None:
-        """Cancel the report, stop reading the camera, and close every WebSocket.
-
-        If a viewer drives the robot, the robot is sent a zero velocity. `why` is sent to the
-        clients as the reason for closing, at most 120 characters.
-        """
+        """End the report, the camera and every WebSocket; send `why`, at most 120 characters."""
         self._reports.end()
         self._camera.close()
         for viewer in list(self._viewers):
@@ -135,9 +124,7 @@ class Page:
     async def tidy(self) -> None:
         """Close the connections whose token is not valid any more, and drop unwanted reports.
 
-        The server calls this method once a second. A token is not valid if it has expired, was
-        revoked, or cannot be read from the disk within `READ_S`. The client of a WebSocket is told
-        the reason before its connection ends.
+        Call this once a second. If the disk does not answer in time, no token counts as valid.
         """
         self._reports.tidy()
         try:
@@ -200,7 +187,6 @@ class Page:
         return response
 
     async def socket(self, request: web.Request) -> web.StreamResponse:
-        """Serve a WebSocket until it ends."""
         who, peer = request[WHO], peer_of(request)
         offered = request.headers.get("Sec-WebSocket-Protocol", "")
         if tokens_offered(offered) and PROTOCOL not in map(str.strip, offered.split(",")):
@@ -251,15 +237,12 @@ class Page:
         return reply(Caller(who.role, who.name, full))
 
     async def value(self, request: web.Request) -> web.StreamResponse:
-        """Return the last value of a key."""
         return reply(msgspec.Raw(await self._value(request.path.removeprefix("/api/"))))
 
     async def settings(self, request: web.Request) -> web.StreamResponse:
-        """Return the settings that can be changed at run time, with their present values."""
         return reply(settings_in(msgspec.json.decode(await self._value("config"))))
 
     async def guide(self, request: web.Request) -> web.StreamResponse:
-        """Return the checks and calibrations that a maintainer may start."""
         return reply(await self._parts.guide.choices(simulated=self._robots.about.simulated))
 
     async def service(self, request: web.Request) -> web.StreamResponse:
@@ -281,10 +264,7 @@ class Page:
         return reply(told, 200 if told.success else 409)
 
     async def picture(self, request: web.Request) -> web.StreamResponse:
-        """Wait for a camera picture that the client has not seen; answer 304 if none comes.
-
-        The header `If-None-Match` has the number of the last picture that the client has seen.
-        """
+        """Wait for a camera picture that the client has not seen; answer 304 if none comes."""
         seen = request.headers.get("If-None-Match", "").strip('"')
         begun_ns = clock.mono_ns()
         number = int(seen) if seen.isdecimal() and len(seen) < 16 else 0
@@ -312,7 +292,6 @@ class Page:
         return web.FileResponse(path, headers=told | {"Content-Type": "application/octet-stream"})
 
     async def draw(self, request: web.Request) -> web.StreamResponse:
-        """Return the progress of a recording's report, and start drawing it if needed."""
         told = self._reports.ask(*await self._box.found(request.match_info["name"]))
         return reply(told, DRAWN[told.report])
 
@@ -342,10 +321,7 @@ class Page:
 
 
 def settings_in(config: Mapping[str, Any]) -> list[Setting]:
-    """Return the settings in `config` that can be changed at run time, in the order of `config`.
-
-    `config` is the robot's configuration as plain tables, the decoded value of the key `config`.
-    """
+    """Return the settings in `config`, the robot's configuration, that can change at run time."""
     return [
         Setting(key, value, told.what, WHEN[told.when], **_allowed(key))
         for key, value in flat(config)
@@ -444,7 +420,6 @@ ROUTES: tuple[Route, ...] = (
         "state, counters and figures for Prometheus",
         gives={200: Body("Text.", str, "text/plain")}),
 )  # fmt: skip
-"""Every path of the page."""
 
 DOCUMENT = msgspec.json.encode(openapi.document(__version__, ROUTES))
 """The answer to `GET /api`."""

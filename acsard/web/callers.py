@@ -1,15 +1,13 @@
-"""Identifies the client of a request from its address and headers, and checks its role.
-
-This module is pure.
+"""Identifies the client of a request from its address and headers, and checks its role. Pure.
 
 A client on the robot itself needs no token and has the role in `web.local`. However, any web page
 in a browser on the robot may open `ws://localhost`, or may let its own host name point to
-127.0.0.1. So the header `Host` must be a loopback name. If the browser sends the header `Origin`,
-it must be that of the robot's own page or one in `web.origins`. A client on another machine must
-use HTTPS, a host name of the robot, and a token.
+127.0.0.1. So the header `Host` must be a loopback name, and a header `Origin` must be that of the
+robot's own page or one in `web.origins`. A client on another machine must use HTTPS, a host name of
+the robot, and a token.
 
-A request through a proxy is refused. A proxy on the robot that rewrites `Host` would give each of
-its clients the role of a client on the robot itself.
+A request through a proxy is refused, because a proxy on the robot that rewrites `Host` would make
+all of its clients look local.
 """
 
 from __future__ import annotations
@@ -27,23 +25,21 @@ Reason = Literal[
     "host", "origin", "no_token", "bad_token", "plain", "role", "too_many", "too_fast",
     "too_big", "malformed", "path", "replayed", "crowded", "slow", "proxy", "stuck",
 ]  # fmt: skip
-"""Short name of the reason for a refusal, under which refusals are counted."""
+"""Reason for a refusal, under which refusals are counted."""
 
 Place = Literal["here", "away"]
 
 HERE = "here"
-"""Name of every client on the robot itself. Such a client has no token that could name it."""
+"""Name of every client on the robot itself. Such a client has no token with a name."""
 
 COOKIE = "__Host-acsard"
-"""Prefix of the cookie names. Browsers accept a `__Host-` cookie only if it is Secure, without a
-Domain, and for all paths."""
+"""Prefix of the cookie names. For `__Host-`, browsers require Secure, Path=/ and no Domain."""
 
 PROTOCOL, TOKEN = "acsard", "acsard.token."
-"""Name of the WebSocket's subprotocol, and prefix of a subprotocol name that carries a token."""
+"""The WebSocket's subprotocol, and the prefix of a subprotocol name that carries a token."""
 
 MOST_TOKENS = 8
-"""Maximum number of tokens of one request that are checked. Each one is compared with all valid
-tokens."""
+"""Maximum number of tokens in one request that are compared with all valid tokens."""
 
 
 class RefusedError(AcsardError):
@@ -62,7 +58,6 @@ class Who(Struct, frozen=True):
     token: str = ""
     """Digest of the client's token; "" for a client on the robot itself."""
     address: str = ""
-    """IP address of the client."""
 
     @property
     def origin(self) -> str:
@@ -70,14 +65,10 @@ class Who(Struct, frozen=True):
         return f"{self.address} ({self.name})" if self.token else self.address
 
     def may(self, least: Role) -> bool:
-        """Return whether the client has at least the role `least`."""
         return has(self.role, least)
 
     def require(self, least: Role, what: str) -> None:
-        """Raise `RefusedError` unless the client has at least the role `least`.
-
-        `what` names the refused action in the text of the error.
-        """
+        """Raise `RefusedError` for the action `what` if the client's role is lower than `least`."""
         if not self.may(least):
             raise RefusedError("role", f"{what} is {self.barred(least)}: {MAY[self.role]}")
 
@@ -106,9 +97,8 @@ class Asked(Struct, frozen=True):
 def place(asked: Asked, names: Collection[str]) -> Place:
     """Return "here" if the client is on the robot and asks for a loopback name, otherwise "away".
 
-    `names` are the robot's names and addresses in lower case. Raises `RefusedError` for a request
-    through a proxy. If the client is "away", also raises it for plain HTTP and for a host that is
-    not in `names`.
+    Raises `RefusedError` for a request through a proxy. If "away", also for plain HTTP, and for a
+    host that is not in `names`, the robot's names and addresses in lower case.
     """
     if asked.proxied:
         raise RefusedError(
@@ -148,8 +138,7 @@ def require_own_origin(asked: Asked) -> None:
 def by_listed_page(asked: Asked, origins: Collection[str]) -> bool:
     """Return whether a web page of an origin in `web.origins` made the browser send this request.
 
-    `origins` are in lower case. The result is False for the robot's own page, even if its origin is
-    listed, because the server ignores the cookies that come with a request of a listed page.
+    The robot's own page never counts as listed, because a listed page's cookies are ignored.
     """
     if asked.origin is None or asked.origin.lower() == _own_origin(asked):
         return False
@@ -161,10 +150,7 @@ def _own_origin(asked: Asked) -> str:
 
 
 def tokens_offered(protocols: str) -> list[str]:
-    """Return the tokens in a `Sec-WebSocket-Protocol` header, at most `MOST_TOKENS`.
-
-    A script in a browser can set no other header of a WebSocket, so it sends its token there.
-    """
+    """Return the tokens in `Sec-WebSocket-Protocol`, the only header a page's script can set."""
     offered = (one.strip() for one in protocols.split(","))
     return [one.removeprefix(TOKEN) for one in offered if one.startswith(TOKEN)][:MOST_TOKENS]
 
@@ -172,18 +158,13 @@ def tokens_offered(protocols: str) -> list[str]:
 def cookie_name(robot: str, port: int) -> str:
     """Return the name of the cookie for the page of this robot at this port.
 
-    The name contains the robot and the port, because a browser sends a host's cookies to all of its
-    ports and keeps only one cookie of each name.
+    A browser sends a host's cookies to all of its ports, so the name differs for each port.
     """
     return f"{COOKIE}-{robot}-{port}"
 
 
 def tokens_in(cookies: Mapping[str, str], robot: str, port: int) -> list[str]:
-    """Return the tokens in the cookies of a request to the page of this robot at this port.
-
-    The cookie for this port comes first, because it is the likeliest to be valid. The cookies for
-    other ports of the same robot follow.
-    """
+    """Return the tokens in the cookies for this robot, beginning with the one for this port."""
     own, ours = cookie_name(robot, port), f"{COOKIE}-{robot}"
     names = [name for name in cookies if name.rpartition("-")[0] == ours]
     return [cookies[name] for name in sorted(names, key=lambda name: name != own)][:MOST_TOKENS]
@@ -197,19 +178,12 @@ def host_name(host: str) -> str:
 
 
 def unmapped(address: str) -> str:
-    """Return an address with the IPv4-mapped prefix `::ffff:` removed.
-
-    A dual-stack socket reports IPv4 clients with this prefix.
-    """
+    """Return an address without `::ffff:`, the prefix of IPv4 clients at a dual-stack socket."""
     return address.removeprefix("::ffff:") if "." in address else address
 
 
 def network_of(address: str) -> str:
-    """Return the network under which the limits count an address.
-
-    It is the /64 network of an IPv6 address, because one machine may use any address in it. For
-    IPv4, it is the address itself.
-    """
+    """Return the IPv4 address, or the IPv6 /64 network, because one machine may use all of it."""
     if ":" not in address:
         return address
     try:

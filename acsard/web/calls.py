@@ -1,9 +1,7 @@
 """Service calls and queries to the robot.
 
 Each call blocks a thread of its own. Stops have their own limits, so a stop never waits for other
-calls. If one client sends several stops to one robot in quick succession, the server may send one
-stop for several of them. This stop is sent after they have arrived, and each of them is answered
-with the reply to this stop.
+calls. Several stops may share one that is sent after all of them have arrived.
 """
 
 from __future__ import annotations
@@ -29,26 +27,21 @@ from acsard.web.limits import STOPS_ELSEWHERE
 from acsard.web.robots import Robots
 
 AT_ONCE, STOPS_AT_ONCE = 16, 32
-"""Maximum number of concurrent requests, and maximum number of concurrent stops of the page's own
-robot, each for all clients together. Such a stop does not count as a request. Stops beyond their
-limit share one stop, because they stop the same robot."""
+"""Maximum number of concurrent requests; maximum number of concurrent stops of the page's own
+robot, which do not count as requests."""
 
 ELSEWHERE_AT_ONCE = 8
-"""Maximum number of stops of other robots that wait for their answers at the same time. A stop
-beyond the limit is sent too, but the server does not wait for its answer."""
+"""Maximum number of stops of other robots that wait for a reply. Others are only sent."""
 
 MERGE_S = 0.02
-"""Shortest interval between two stops that the server sends for one client to one robot, s. Stops
-that arrive within the interval are merged into one, which is sent when the interval ends."""
+"""Shortest interval between two stops that are sent for one client to one robot, s."""
 
 ANSWER_S = 8.0
-"""Time limit for an answer from the bus, s. `Client` gives up sooner, with an error message for the
-user."""
+"""Time limit for an answer from the bus, s. `Client` gives up sooner, with a clear message."""
 
 T = TypeVar("T")
 
 Stop = Callable[[], Awaitable[ServiceReply]]
-"""Function that sends a stop and returns the reply."""
 
 
 class Ending(NamedTuple):
@@ -69,11 +62,7 @@ class Calls:
         ends: Callable[[], Awaitable[Ending]],
         sees: Callable[[str], bool],
     ) -> None:
-        """Store the connection and the callbacks.
-
-        `ends` ends the check or calibration that this server runs. `sees` returns whether a page
-        shows the robot with a given id.
-        """
+        """Store the arguments. `ends` ends a running check; `sees` tells if a robot is known."""
         self._robots, self._ends, self._sees = robots, ends, sees
         self._stops, self._merged = Stops(), Merged()
         self._unknown = Buckets(STOPS_ELSEWHERE)
@@ -85,11 +74,10 @@ class Calls:
     async def call(
         self, who: Who, verb: str, payload: Mapping[str, Any], robot: str = ""
     ) -> ServiceReply:
-        """Call a service on behalf of `who` and return the reply.
+        """Call the service `verb` for the client `who` and return the reply.
 
-        `verb` is the name of the service, and `payload` has its arguments. `robot` is the id of
-        another robot, on which only `stop` may be called, or "" for the page's own robot. Raises
-        `RefusedError`.
+        `robot` is the id of another robot, on which only `stop` may be called, or "" for the page's
+        own robot. Raises `RefusedError`.
         """
         require(who, verb)
         other = "" if robot == self._robots.id else robot
@@ -133,10 +121,9 @@ class Calls:
         return reply
 
     async def get(self, robot: str, name: str) -> tuple[str, bytes]:
-        """Query the last value of a key as JSON, and return its encoding and its payload.
+        """Query the last value of a robot's key as JSON; return its encoding and its payload.
 
-        `robot` is the robot's id, and `name` is the key below it. Raises `MendableError` if there
-        is no connection or no answer, or if `AT_ONCE` other requests are running.
+        Raises `MendableError` without a connection or an answer, and beyond `AT_ONCE` requests.
         """
         client = self._robots.client
         if client is None:
@@ -148,8 +135,7 @@ class Calls:
     ) -> ServiceReply:
         """Stop another robot, and return its reply.
 
-        A robot that does not exist never replies, so the number of stops that wait for a reply is
-        limited. Beyond the limit, the stop is sent without waiting for the reply.
+        A robot that does not exist never replies, so at most `ELSEWHERE_AT_ONCE` stops wait.
         """
         with self._elsewhere.held() as free:
             if free:
@@ -188,24 +174,19 @@ class Calls:
 
 
 class Merged:
-    """Limits the stops of each client to each robot to one every `MERGE_S`.
+    """Sends at most one stop per `MERGE_S` for each client and robot.
 
     No stop is lost. The stops that arrive too soon after a stop was sent share the next one.
     """
 
     def __init__(self) -> None:
         self._rests: dict[Hashable, asyncio.Event] = {}
-        """Maps the name of a client and robot to an event that is set `MERGE_S` after the client's
-        last stop of the robot. The name is then removed."""
+        """Maps a client and robot to an event that is set `MERGE_S` after the last stop."""
         self._next: dict[Hashable, asyncio.Task[ServiceReply]] = {}
-        """Maps the name of a client and robot to the task that waits for the event in `_rests` and
-        then sends a stop."""
+        """Maps a client and robot to the task that waits for the event and then sends a stop."""
 
     async def ask(self, name: Hashable, stop: Stop) -> ServiceReply:
-        """Return the reply to a stop that is sent after this call began.
-
-        `name` identifies the client and the robot. `stop` sends a stop and returns its reply.
-        """
+        """Return the reply to a stop sent after this call; `name` identifies client and robot."""
         if name in self._next:
             return await asyncio.shield(self._next[name])
         rest = self._rests.get(name)
@@ -229,21 +210,14 @@ class Merged:
 
 
 class Stops:
-    """Sends stops to the page's own robot, at most `STOPS_AT_ONCE` at the same time.
-
-    The callers beyond that number share one stop. It is sent when a running stop has ended.
-    """
+    """Sends at most `STOPS_AT_ONCE` stops at a time. Further callers share one later stop."""
 
     def __init__(self) -> None:
         self._room = asyncio.Semaphore(STOPS_AT_ONCE)
         self._next: asyncio.Task[ServiceReply] | None = None
 
     async def ask(self, call: Callable[[], ServiceReply]) -> ServiceReply:
-        """Send a stop with `call`, and return the robot's reply.
-
-        If `STOPS_AT_ONCE` stops are under way, share one later stop with the other callers that
-        wait, and return the reply to that stop.
-        """
+        """Send a stop with `call`, or share a later one, and return the robot's reply."""
         if not self._room.locked():
             async with self._room:
                 return await in_thread(call, ANSWER_S)

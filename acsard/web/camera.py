@@ -1,10 +1,9 @@
 """The newest picture of a camera's MJPEG stream, for the clients of the page.
 
 Another program (ustreamer, go2rtc, mjpg-streamer) serves the stream. One connection reads it while
-clients ask for pictures, and only the newest picture is kept: a client with a slow network gets
-fewer pictures, and no old ones. Each client that reads slowly keeps a picture in memory, so the
-number of pictures that are being sent is limited. A picture that equals the one before byte for
-byte is not new, because some servers repeat the last picture when their camera is lost.
+clients ask for pictures. Only the newest picture is kept, so a client with a slow network gets
+fewer pictures, and no old ones. Some servers repeat the last picture when their camera is lost, so
+a picture that equals the one before byte for byte is not new.
 """
 
 from __future__ import annotations
@@ -24,22 +23,19 @@ from acsard.host.rate_limits import Places
 from acsard.web.answers import TroubleError
 
 WAIT_S = 1.0
-"""Maximum time, s, for which a request waits for a new picture. If one comes, the request waits at
-most this long again, until the picture may be sent (`SENDS`)."""
+"""Time limit, s, for a new picture to arrive, and then for permission to send it (`SENDS`)."""
 
 CONNECT_S, SILENT_S = 3.0, 3.0
 """Time limits for the connection to the camera's server, and for the next byte from it, s."""
 
 MAX_PICTURE, MAX_HEAD = 1_000_000, 4096
-"""Maximum size of a picture and of the header lines before it, bytes. A JPEG of 1920 x 1080 pixels
-has a few hundred thousand."""
+"""Maximum size of a picture and of its header lines, bytes. A full HD picture has a few 100 kB."""
 
 SENDS, SENDS_OF_TOKEN = 8, 2
-"""Maximum number of pictures that are being sent at the same time: in all, and to one token."""
+"""Maximum number of pictures that are kept in memory for sending: in all, and to one token."""
 
 SEND_S = 5.0
-"""Time limit for sending a picture, s. After that the connection is cut, because the page in the
-browser waits no longer than 5 s."""
+"""Time limit for sending a picture, s. The page in the browser waits no longer than this."""
 
 _LENGTH = re.compile(rb"(?im)^content-length:[ \t]*(\d{1,8})[ \t]*\r?$")
 
@@ -56,19 +52,14 @@ class Parts:
     """Cuts a `multipart/x-mixed-replace` stream into its parts, the pictures."""
 
     def __init__(self, boundary: str) -> None:
-        """Store `boundary`, a parameter of the stream's content type.
-
-        In the stream, two dashes precede the boundary. Some servers include them in the parameter.
-        """
+        """Store `boundary` from the content type. Some servers include the two dashes before it."""
         self._end = b"\r\n--" + boundary.strip('"').removeprefix("--").encode()
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> bytes | None:
         """Add received bytes; return the newest picture that they complete, or None.
 
-        Raises:
-            ValueError: A picture has more than `MAX_PICTURE` bytes, or its header lines have more
-                than `MAX_HEAD` bytes.
+        Raises `ValueError` if a picture or its header lines are too long.
         """
         self._buffer += data
         newest = None
@@ -111,10 +102,9 @@ class Camera:
         self._reading: asyncio.Task[None] | None = None
 
     async def after(self, number: int) -> Picture | None:
-        """Wait for a picture that is newer than the one with this number, and return it.
+        """Return the newest picture, or None if its number is still `number` after `WAIT_S`.
 
-        Return None if none comes within `WAIT_S`. Raises `TroubleError` if the robot has no camera,
-        or its stream cannot be read.
+        Raises `TroubleError` if there is no camera or its stream cannot be read.
         """
         if not self._url:
             raise TroubleError(

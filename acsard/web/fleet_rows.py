@@ -42,34 +42,24 @@ class Fleet:
         self._tracked: fleet.Fleet | None = None
         self._busy: set[asyncio.Task[None]] = set()
         self.note = ""
-        """Reason why robots may be missing from the rows, in words; "" if all robots of a router
-        are visible."""
+        """Why robots may be missing from the rows; "" if all robots of a router are visible."""
 
     def join(self, viewer: object) -> None:
-        """Add this viewer; the first one to join starts the tracking."""
         self._joined.add(viewer)
         self._look()
 
     def leave(self, viewer: object) -> None:
-        """Remove this viewer; the last one to leave ends the tracking."""
         self._joined.discard(viewer)
         self._tidy()
 
     def rows(self) -> list[Row]:
-        """Return one row per robot, sorted by robot id.
-
-        If a subscription has failed or a query is due, start it in the background.
-        """
+        """Return one row per robot, sorted by id, and start any due query in the background."""
         self._look()
         rows = [] if self._tracked is None else self._tracked.rows()
         return [_row(one) for one in sorted(rows, key=lambda one: one.robot_id)]
 
     def sees(self, robot: str) -> bool:
-        """Return whether this server knows that the robot with the id `robot` exists.
-
-        It knows this while it sees the liveliness token of the robot's daemon, or if a viewer
-        follows the robot's state and a state has arrived.
-        """
+        """Return whether the robot is known from its liveliness token or from a followed state."""
         states = self._robots.streams.followed(robot, STATE)
         here = self._tracked is not None and self._tracked.here(robot)
         return here or bool(states and states.number)

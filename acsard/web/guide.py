@@ -1,10 +1,9 @@
 """Runs a board check or a calibration for a browser, as a child process (`acsard` itself).
 
-Only one child runs at a time. The lines that it prints (`--json-lines`, terminal/json_prompt.py) go
-to the WebSocket that started it. Only this WebSocket may send answers and key presses. If this
-WebSocket ends, the child is interrupted as by Ctrl-C, so it still sends zero speeds to the board.
-The child watches its standard input, so it ends when this server ends. Each question takes one
-answer, and any other answer is refused.
+Only one child runs at a time. Only the WebSocket that started it receives its lines
+(`terminal/json_prompt.py`) and may answer. If this WebSocket ends, the child is interrupted as by
+Ctrl-C, so it still sends zero speeds to the board. The child also ends with this server, because it
+watches its standard input.
 """
 
 from __future__ import annotations
@@ -39,6 +38,8 @@ NO_DEVICE = (
     "check` in a terminal on the robot."
 )
 
+ABSENT = "configured, not there now"
+
 POSITIONS = "positions"
 
 KEY = re.compile(r"(?=.{1,80}\Z)[A-Za-z0-9_][A-Za-z0-9_-]*(/[A-Za-z0-9_-]+)*\Z")
@@ -47,10 +48,7 @@ Say = Callable[[Guided], None]
 
 
 class Reach(Struct, frozen=True):
-    """The options by which a child connects to the same daemon as this server.
-
-    An option whose value is "" is left out.
-    """
+    """The options by which a child connects to this server's daemon. An empty one is left out."""
 
     config: str
     endpoint: str
@@ -98,20 +96,14 @@ class Guide:
         self._task: asyncio.Task[None] | None = None
 
     async def choices(self, *, simulated: bool) -> Choices:
-        """Return the checks and calibrations that the page may start now.
-
-        `simulated` says whether the robot is simulated.
-        """
+        """Return the checks and calibrations that the page may start now."""
         found = await self._boards()
         way, advice = SIMULATED if simulated else ("", "")
-        return Choices(NEEDS, way, advice, found, NO_DEVICE if len(found) == 1 else "")
+        sees_one = any(board.port != SIMULATOR and board.what != ABSENT for board in found)
+        return Choices(NEEDS, way, advice, found, "" if sees_one else NO_DEVICE)
 
     def join(self, viewer: object, say: Say) -> None:
-        """Add a viewer, and tell it which check or calibration is running, or that nothing runs.
-
-        A page that was disconnected when a child ended learns in this way that it ended. `say`
-        sends a message to the viewer.
-        """
+        """Add a viewer and tell it what runs, if anything. It may have missed a child's end."""
         self._viewers[viewer] = say
         say(Guided(Running("")) if self._errand is None else self._errand.about(viewer))
 
@@ -122,10 +114,7 @@ class Guide:
             errand.leave()
 
     def begin(self, viewer: object, by: str, asked: Begin) -> str:
-        """Start the requested child for a viewer. Return "" or the reason for a refusal.
-
-        `by` is the name of the viewer's user, which is reported to all viewers.
-        """
+        """Start a child for a viewer whose user is `by`. Return "" or the reason for a refusal."""
         if self._errand is not None:
             return (
                 f"{self._errand.name} already runs ({self._errand.by}), and only one can run at a "
@@ -144,10 +133,7 @@ class Guide:
         return ""
 
     def press(self, viewer: object, press: Press) -> None:
-        """Pass a viewer's key press to the child, or interrupt the child.
-
-        This never fails, because the child may already have ended.
-        """
+        """Pass a viewer's key press to its child, or interrupt the child, unless it has ended."""
         if (errand := self._of(viewer)) is None:
             return
         if press.press == "key":
@@ -156,10 +142,9 @@ class Guide:
             errand.leave()
 
     async def stop(self) -> Ending:
-        """Interrupt the running check or calibration because a client stops the robot.
+        """Interrupt the running child, because a client stops the robot. Any client may do this.
 
-        Return the outcome. Any client may stop, no matter which viewer started the child. During a
-        check the daemon cannot stop the wheels, because the check holds the serial port.
+        During a check, the daemon cannot stop the wheels, because the check holds the serial port.
         """
         if self._errand is None or self._task is None:
             return Ending()
@@ -169,10 +154,7 @@ class Guide:
         return Ending(f"{what} has ended" if done else f"{what} is being ended", bool(done))
 
     def heard(self, viewer: object) -> None:
-        """Pass a sign of life of a viewer to the child, if this viewer has started the child.
-
-        The child needs signs of life while something moves. Each message of a viewer is one.
-        """
+        """Send the viewer's child a sign of life, which it needs while something moves."""
         if (errand := self._of(viewer)) is not None:
             errand.relay()
 
@@ -217,10 +199,7 @@ class Guide:
 
 
 def boards(configured: str) -> list[Board]:
-    """Return the serial ports that can be checked: the configured one first, the simulator last.
-
-    This function scans the serial devices and the processes that hold them, so call it in a thread.
-    """
+    """Return the serial ports to choose from, the configured one first. Call this in a thread."""
     found: dict[str, str] = {}
     for device in serial_devices():
         name = device.names[0] if device.names else device.device
@@ -229,8 +208,7 @@ def boards(configured: str) -> list[Board]:
         told += [f"in use by {holder.name} (process {holder.pid})" for holder in device.holders]
         found[configured if own else name] = ", ".join(filter(None, told))
     if configured != SIMULATOR and configured not in found:
-        there = "" if os.path.exists(configured) else ", not there now"
-        found = {configured: f"configured{there}", **found}
+        found = {configured: "configured" if os.path.exists(configured) else ABSENT, **found}
     found[SIMULATOR] = "the simulator: no real robot moves"
     # The configured port comes first, because wheels turn during a check. A check that is started
     # without looking at the list must run on the robot that the operator sees.
@@ -239,11 +217,10 @@ def boards(configured: str) -> list[Board]:
 
 
 def words(begin: Begin, reach: Reach, ports: Collection[str]) -> list[str]:
-    """Return the arguments of the `acsard` command that carries out the request `begin`.
+    """Return the arguments of `acsard` for the request `begin`. Raises `FrameError`.
 
-    `ports` are the serial ports that may be checked. Raises `FrameError` if a value in the request
-    is not allowed. This function chooses the options. A text from the browser can only become the
-    value of an option, and must be in a known set of values or be a plain key.
+    This function chooses the options. A text from the browser can only become the value of an
+    option, and must be in a known set of values or be a plain key.
     """
     config = [f"--config={reach.config}"] if reach.config else []
     if begin.begin == "check":
@@ -293,10 +270,7 @@ class _Errand:
         return Guided(Running(self.name, self.by, viewer is self.viewer))
 
     async def run(self, given: Sequence[str]) -> tuple[int, str]:
-        """Run the child; return its exit code and the last lines of its standard error.
-
-        Raises `OSError`.
-        """
+        """Run the child; return its exit code and its last error output. Raises `OSError`."""
         if self.left:
             return int(Exit.FAILURE), ""
         async with running(acsard(*given), stdin=PIPE, stdout=PIPE, stderr=PIPE) as process:
@@ -316,10 +290,7 @@ class _Errand:
         return True
 
     def key(self) -> None:
-        """End the present leg, one drive of a calibration, as a key press at a terminal does.
-
-        Further presses in the same leg are ignored.
-        """
+        """End the present drive of a calibration. Further presses in the same drive are ignored."""
         if self._rides:
             self._rides = False
             self._write({"key": True})

@@ -1,8 +1,7 @@
-"""The plotted values of the last minute, for a page that has just been opened. This module is pure.
+"""The plotted values of the last minute, for a page that has just been opened. Pure.
 
-All values except the commanded speeds come from the key `state`, which the server receives anyway.
-The commanded speeds arrive a hundred times a second on the key `cmd_vel_out`, so the server
-receives them only while a viewer has subscribed to that key.
+The commanded speeds arrive a hundred times a second on `cmd_vel_out`, so the server receives them
+only while a viewer has subscribed to that key. All other values come from the key `state`.
 """
 
 from __future__ import annotations
@@ -74,7 +73,6 @@ class Minute:
         self._rows: deque[tuple[int, list[float | None]]] = deque(maxlen=ROWS)
 
     def due(self, at_ns: int) -> bool:
-        """Return whether enough time has passed since the last row to add another one."""
         return not self._rows or at_ns - self._rows[-1][0] >= STEP_NS - EARLY_NS
 
     def add(self, at_ns: int, state: RobotState, wished: Twist | None) -> None:

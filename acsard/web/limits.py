@@ -1,8 +1,6 @@
 """The limits that the page's server sets for its clients. This module is pure.
 
-The rates of messages, commands, requests, TLS handshakes and wrong tokens are limited, and so are
-the numbers of TCP connections, WebSockets and subscriptions. A network is an IPv4 address, or the
-/64 network of an IPv6 address (`callers.network_of`).
+A network is an IPv4 address, or the /64 network of an IPv6 address (`callers.network_of`).
 """
 
 from __future__ import annotations
@@ -18,39 +16,32 @@ SOCKETS, SOCKETS_HERE = 256, 96
 opens six connections in addition to its WebSocket."""
 
 SOCKETS_OF_ONE, SOCKETS_OF_TOKEN = 64, 64
-"""Maximum number of TCP connections without a valid token from one network, and maximum number with
-the same valid token. Further connections with that token count as connections without one."""
+"""Maximum numbers of TCP connections: without a valid token per network, and per valid token.
+Further connections with a token count as connections without one."""
 
 SOCKETS_OF_BROWSER = 7
-"""Number of connections that each token keeps when all places are taken: those of one browser."""
+"""Number of connections that each token keeps when all places are taken: one browser's."""
 
 SOCKETS_LEAST = 16
-"""Number of connections from other machines that are accepted even if the process may open only few
-files."""
+"""Minimum of the limit on connections from other machines, if the process may open few files."""
 
 OWN_FILES = 128
-"""Number of open files that are reserved for other purposes than connections. The process has 20
-files open without a connection. A report or a calibration needs more while it runs."""
+"""Number of files reserved for other uses: 20 always, more during a report or calibration."""
 
 UNREAD_BYTES = 32768
-"""Limit on the bytes that wait to be sent to a client that does not read. Above the limit, the
-client's next request waits, and its WebSocket gets no new values. The limit that asyncio sets by
-default for a TLS connection is 512 KiB."""
+"""Limit on the bytes that wait for a client that does not read. Above it, the client's next request
+waits, and its WebSocket gets no new values. asyncio's default for TLS is 512 KiB."""
 
 OVERRUNS = 600
 """Number of messages beyond the rate limit `MESSAGES` after which a WebSocket is closed."""
 
 CONNECTIONS, CONNECTIONS_OF_ONE, CONNECTIONS_OF_TOKEN, CONNECTIONS_ALIKE = 100, 20, 30, 6
-"""Maximum numbers of WebSockets from other machines: in all, per address, per token, and per pair
-of token and address.
-
-Because of the last limit, a program that opens one WebSocket after another cannot lock out clients
-at the same address that use another token.
-"""
+"""Maximum numbers of WebSockets from other machines: in all, per address, per token, and per token
+at one address. Because of the last limit, one program cannot lock out other tokens at its
+address."""
 
 CONNECTIONS_HERE = 20
-"""Maximum number of WebSockets from the robot itself. They are counted separately, so clients from
-the network cannot lock out a browser on the robot."""
+"""Maximum number of WebSockets from the robot itself. Other machines cannot use them up."""
 
 STREAMS, STREAMS_OF_ONE = 200, 50
 """Maximum numbers of subscribed keys of other robots: in all, and per token. Keys of the page's own
@@ -61,57 +52,48 @@ REQUESTS = Rate(50.0, 200.0)
 """Limit on HTTP requests per token. The page's static files are exempt."""
 
 STOPS, PICTURES, OPENINGS = Rate(50.0, 100.0), Rate(100.0, 200.0), Rate(4.0, 20.0)
-"""Limits on the rates of stops, camera pictures and new WebSockets, for each token in each network.
-Requests beyond a limit wait. A page asks for at most 20 pictures a second."""
+"""Limits on stops, camera pictures and new WebSockets, for each token in each network. Requests
+beyond a limit wait. A page asks for at most 20 pictures a second."""
 
 STRANGERS = Rate(30.0, 150.0)
 """Limit on the rate of requests without a valid token from one network. Requests beyond it wait. A
 phone loads the page with 16 requests, so eight phones behind one address can load it at once."""
 
 HANDSHAKES = Rate(30.0, 100.0)
-"""Limit on the rate of TLS handshakes of one network. Handshakes beyond it wait. A browser needs
-six."""
+"""Limit on TLS handshakes per network. Handshakes beyond it wait. A browser needs six."""
 
 HOLD_S = 0.5
-"""Time for which a request beyond a rate limit waits, s, whether it is then answered or refused. A
-refusal costs the server as much time as an answer."""
+"""Delay of a request beyond a rate limit, s. A refusal costs the server as much as an answer."""
 
 MESSAGES = Rate(200.0, 400.0)
-"""Limit on messages per WebSocket. The burst allowance covers the messages that a client sends when
-its network returns."""
+"""Limit on messages per WebSocket. A client sends a burst when its network returns."""
 
 COMMANDS = Rate(60.0, 120.0)
-"""Limit on the rate of commands of one token, or of one WebSocket from the robot itself. The stick
-on the page sends 20 a second. The daemon accepts 1000 a second from this server. Without the limit,
-24 WebSockets that sent 180 commands a second each made the daemon drop half of the commands of a
-client that drove."""
+"""Limit on commands per token, or per WebSocket from the robot itself. The page's stick sends 20 a
+second, and the daemon accepts 1000 a second from this server. Without the limit, 24 WebSockets with
+180 a second each made it drop half of the commands of a client that drove."""
 
 STOPS_ELSEWHERE = Rate(4.0, 16.0)
-"""Limit on the rate of stops from one token to robots that may not exist. A robot is known to exist
-if a page shows it, or if it has answered a stop from this server. Stops to known robots have no
-such limit."""
+"""Limit on stops per token to robots that may not exist: no page shows them, and they have answered
+no stop from this server."""
 
 GUESSES_OF_ONE, GUESSES = Rate(10 / 60, 10.0), Rate(100 / 60, 100.0)
-"""Limits on wrong tokens: from one network (see `callers.network_of`), and in all."""
+"""Limits on wrong tokens: from one network, and in all."""
 
 
 C = TypeVar("C", bound=Hashable)
 
 
 def sockets_for(files: int) -> int:
-    """Return the maximum number of connections from other machines.
-
-    `files` is the limit on the open files of the process. A connection needs two files while it
-    fetches a recording.
-    """
+    """Return the limit on connections from other machines if the process may open `files` files."""
+    # A connection needs two files while it fetches a recording.
     return max(SOCKETS_LEAST, min(SOCKETS, (files - OWN_FILES) // 2 - SOCKETS_HERE))
 
 
 class Sockets(Generic[C]):
     """The open TCP connections. When all places are taken, a new connection displaces an old one.
 
-    1. The network with the most connections without a valid token loses the oldest of these. So a
-       flood from a few networks displaces its own connections.
+    1. The network with the most connections without a valid token loses the oldest of these.
     2. If every connection has shown a valid token, the token with the most connections loses its
        oldest one. If it has only `SOCKETS_OF_BROWSER`, the new connection is refused instead.
     """
@@ -121,7 +103,6 @@ class Sockets(Generic[C]):
         self._strangers: dict[str, dict[C, None]] = {}
         """The connections without a valid token, by network, oldest first."""
         self._networks: dict[C, str] = {}
-        """The network of each connection."""
         self._known: dict[C, str] = {}
         """The token of each connection that is counted under a token (see `SOCKETS_OF_TOKEN`)."""
         self._shown: dict[C, str] = {}
@@ -131,8 +112,7 @@ class Sockets(Generic[C]):
     def enter(self, network: str, one: C) -> C | None:
         """Give the new connection `one` a place; return the connection to close in exchange.
 
-        Return None if a place was free. If no old connection may be closed, return `one` itself,
-        which then has no place. `network` is the client's network.
+        Return None if a place was free, and `one` itself if no old connection may be closed.
         """
         own = self._strangers.get(network, {})
         gone = None
@@ -146,10 +126,7 @@ class Sockets(Generic[C]):
         return gone
 
     def displaced(self) -> C | None:
-        """Remove and return the connection to close when all places are taken.
-
-        Return None if no connection may be closed.
-        """
+        """Remove and return the connection to close for a new one; None if none may be closed."""
         if self._strangers:
             network = max(self._strangers, key=lambda name: len(self._strangers[name]))
             gone = next(iter(self._strangers[network]))
@@ -162,10 +139,9 @@ class Sockets(Generic[C]):
         return gone
 
     def prove(self, one: C, token: str) -> None:
-        """Record that the connection `one` has shown a valid token.
+        """Record that `one` has shown a valid token; "" stands for a client on the robot itself.
 
-        `token` is "" for a client on the robot itself, which needs none. A later token replaces an
-        earlier one, because a browser may get another token.
+        A later token replaces an earlier one, because a browser may get another token.
         """
         network, before = self._networks.get(one), self._known.get(one)
         if network is None:
@@ -192,10 +168,7 @@ class Sockets(Generic[C]):
         self._fewer(token)
 
     def ended(self, valid: Collection[str]) -> list[C]:
-        """Return the connections whose last token is not in `valid`.
-
-        Connections without a token are not returned.
-        """
+        """Return the connections that have shown a token, if the last one is not in `valid`."""
         return [one for one, token in self._shown.items() if token and token not in valid]
 
     def strangers(self) -> list[C]:
@@ -214,10 +187,7 @@ class Sockets(Generic[C]):
 
 
 class Seats:
-    """Counts and limits the open WebSockets.
-
-    Those from the robot itself, which need no token, have a limit of their own.
-    """
+    """Limits the open WebSockets. Those from the robot itself are counted separately."""
 
     def __init__(self) -> None:
         self._here = Places(CONNECTIONS_HERE, CONNECTIONS_HERE)
@@ -245,10 +215,7 @@ class Seats:
             places.leave(name)
 
     def _places(self, address: str, token: str) -> list[tuple[Places, str, str]]:
-        """Return the limits that apply to a WebSocket.
-
-        Each comes with the name under which it counts the WebSocket, and the text of a refusal.
-        """
+        """Return the limits that apply, with the name to count under and the text of a refusal."""
         if not token:
             here = f"{CONNECTIONS_HERE} pages are open on the robot itself: close some"
             return [(self._here, address, here)]
@@ -269,10 +236,9 @@ class Seats:
 
 
 class Shares:
-    """Limits how many resources are in use, in total and by each holder.
+    """Limits the resources in use, in total and per holder. A shared one counts once in total.
 
-    A resource that several holders use counts once in the total. The server uses this class for
-    subscriptions to keys of other robots, whose holders are the clients' tokens.
+    The server uses this for subscriptions to keys of other robots. Their holders are tokens.
     """
 
     def __init__(self, most: int, of_one: int) -> None:

@@ -49,10 +49,7 @@ def own_name() -> str:
 
 
 def listens(text: str) -> Listen:
-    """Parse an address like http://127.0.0.1:8080. Raises `UsageError`.
-
-    Plain HTTP is allowed on loopback addresses only.
-    """
+    """Parse an address like http://127.0.0.1:8080 (http only on loopback). Raises `UsageError`."""
     scheme, _, place = text.removesuffix("/").partition("://")
     host, _, port = place.rpartition(":")
     host = host.removeprefix("[").removesuffix("]")
@@ -69,11 +66,10 @@ def listens(text: str) -> Listen:
 
 
 def invitations(listen: Sequence[Listen], tls: str) -> list[str]:
-    """Return the URLs to write on an invitation, the likeliest to work first.
+    """Return the URLs to write on an invitation, the likeliest to work first; none without HTTPS.
 
-    The list is empty if no address is HTTPS. `tls` is the directory of the robot's certificate,
-    already checked by `require_certificate`. IP addresses come before names, because not every
-    phone resolves mDNS names.
+    IP addresses come before names, because not every phone resolves mDNS names. Call
+    `require_certificate` first.
     """
     found: list[str] = []
     older_ports = _older_ports(listen)
@@ -100,10 +96,7 @@ def opened_by(one: Listen, tls: str) -> list[str]:
 
 
 def require_certificate(listen: Sequence[Listen], tls: str) -> None:
-    """Raise a `MendableError` if there is an HTTPS address but no usable certificate.
-
-    `tls` is the directory of the certificate, "" without one.
-    """
+    """Raise `MendableError` if there is an HTTPS address but no usable certificate in `tls`."""
     away = [one for one in listen if one.secure]
     if away and not tls:
         raise CertificateError(
@@ -115,10 +108,7 @@ def require_certificate(listen: Sequence[Listen], tls: str) -> None:
 
 
 def bound(listen: Sequence[Listen], next_port: bool) -> list[tuple[Listen, socket.socket]]:
-    """Open a socket at each address. If a port is taken and `next_port` is true, try later ports.
-
-    Raises `InUseError` if no port is free.
-    """
+    """Open a socket at each address; `next_port` allows later ports. Raises `InUseError`."""
     older_ports = _older_ports(listen)
     return [_bound(one, next_port, one.port not in older_ports) for one in listen]
 
@@ -129,10 +119,7 @@ def _older_ports(listen: Sequence[Listen]) -> set[int]:
 
 
 def _bound(one: Listen, next_port: bool, both: bool) -> tuple[Listen, socket.socket]:
-    """Open a socket at one address; return the address with the port that was free, and the socket.
-
-    `both` lets `::` accept IPv4 too. It is true if no IPv4 address has this port.
-    """
+    """Open a socket at the first free port; `both` lets `::` accept IPv4 too."""
     ports = range(one.port, min(65536, one.port + TRIES)) if next_port else [one.port]
     both = both and one.host == EVERYWHERE_6 and socket.has_dualstack_ipv6()
     trouble: OSError | None = None

@@ -1,7 +1,4 @@
-"""The counters of the page's server, for its log and for the path `/metrics`.
-
-`/metrics` also returns figures of the robot. It uses the Prometheus text format 0.0.4.
-"""
+"""The counters of the page's server, and the Prometheus text (format 0.0.4) of `/metrics`."""
 
 from __future__ import annotations
 
@@ -22,7 +19,6 @@ CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 Kind = Literal["gauge", "counter"]
 
 Sample = tuple[Mapping[str, str], float]
-"""The labels and the value of one sample."""
 
 
 def text(
@@ -36,10 +32,8 @@ def text(
 ) -> str:
     """Return all metrics in the text format of Prometheus.
 
-    `state` is the last state of the robot, and `version` the version of its daemon. The metrics of
-    the robot are left out unless `heard` is true, which means that messages from the daemon arrive.
-    `viewers` is the number of WebSockets. `counts` and `refused` are the results of the methods
-    `all` and `refused` of `Counts`.
+    The robot's metrics are left out unless `heard` is true, which means that messages from the
+    daemon arrive. `viewers` is the number of WebSockets.
     """
     lines: list[str] = []
 
@@ -148,8 +142,7 @@ NAMED = 5
 """Maximum number of clients that a log line about refusals names, the most frequent ones first."""
 
 KNOWN = 1000
-"""Maximum number of clients whose refusals are counted separately between two log lines. The bound
-is needed because one client may use many addresses."""
+"""Maximum number of clients counted between two log lines. A client may use many addresses."""
 
 
 class Counts:
@@ -175,12 +168,10 @@ class Counts:
                 self._origins[origin] += 1
 
     def all(self) -> dict[str, int]:
-        """Return the numbers of the server's actions since its start, by name."""
         with self._lock:
             return dict(self._counts)
 
     def refused(self) -> dict[str, int]:
-        """Return the refusals since the start, by reason."""
         with self._lock:
             return dict(self._refused)
 

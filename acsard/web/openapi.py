@@ -1,8 +1,7 @@
 """The page's interface for programs as an OpenAPI 3.1 document. This module is pure.
 
-The paths, their permissions and their bodies come from the table of routes. The schemas come from
-msgspec for the page's own messages, and from `json_schema.SCHEMAS` for those of the bus. A new row,
-key or field appears in the document without a change here.
+The paths come from the table of routes, and the schemas from msgspec and `json_schema.SCHEMAS`, so
+a new row, key or field appears in the document without a change here.
 """
 
 from __future__ import annotations
@@ -26,10 +25,10 @@ Refs = dict[Any, Described]
 """Maps each type to a reference to its schema."""
 
 TO_ROBOT, FROM_ROBOT = "ToRobot", "FromRobot"
-"""Names of two schemas, for the WebSocket messages to the robot's server and those from it."""
+"""Names of the schemas of the WebSocket messages to the robot's server and from it."""
 
 VALUE = "Value."
-"""Prefix of a schema's name, if the schema describes the messages of a subscribed key."""
+"""Prefix of the schema names for the messages of subscribed keys."""
 
 GUIDED = "Guided"
 
@@ -47,7 +46,7 @@ LINES = (
 """Types of the field `guide`, which reports a running check or calibration to the client."""
 
 KEYS = {topic.key: topic.type for topic in FOLLOWED}
-"""Message type of each key to which a client can subscribe, by key."""
+"""Message type of each key to which a client can subscribe."""
 
 
 def _ref(name: str) -> Described:
@@ -157,11 +156,7 @@ def _needed(kind: type | str) -> bool:
 
 
 def _messages() -> Described:
-    """Return the schemas of the messages on the bus.
-
-    A nested type has its own schema, named `Type.Part`, because most readers of OpenAPI documents
-    cannot resolve a schema that contains `$defs`.
-    """
+    """Return the bus messages' schemas without `$defs`, which most readers cannot resolve."""
     found: Described = {}
     for name, schema in SCHEMAS.items():
         whole = _flat(schema, f"{name}.")
@@ -172,11 +167,7 @@ def _messages() -> Described:
 
 
 def _flat(node: Any, before: str) -> Any:
-    """Return the JSON schema `node`, with each reference into `$defs` replaced.
-
-    The new reference is to the schema in the OpenAPI document whose name is `before` followed by
-    the old name.
-    """
+    """Return `node` with each reference `#/$defs/X` changed to the component `before` + X."""
     if isinstance(node, list):
         return [_flat(one, before) for one in node]
     if not isinstance(node, dict):
@@ -187,11 +178,8 @@ def _flat(node: Any, before: str) -> Any:
 
 
 def _components(kinds: Iterable[Any]) -> tuple[Described, Refs]:
-    """Return the schemas of `kinds` and their nested types, and a reference to each kind.
-
-    All kinds are described by one call, because msgspec then gives different names to two types
-    that have the same name.
-    """
+    """Return the schemas of `kinds` and their nested types, and a reference to each kind."""
+    # In one call, msgspec gives different names to two types that have the same name.
     unique = list(dict.fromkeys(kinds))
     refs, parts = msgspec.json.schema_components(
         unique,
@@ -203,11 +191,7 @@ def _components(kinds: Iterable[Any]) -> tuple[Described, Refs]:
 
 
 def _of_the_socket(refs: Refs) -> Described:
-    """Return the schemas `ToRobot` and `FromRobot`, and `Guided`, which is a part of `FromRobot`.
-
-    Together they describe all WebSocket messages. Each kind of message has a field that no other
-    kind has, so a reader can tell them apart.
-    """
+    """Return the schemas `ToRobot`, `FromRobot` and `Guided` of all WebSocket messages."""
     guided = msgspec.defstruct(
         GUIDED,
         [("guide", _raw({"oneOf": [refs[kind] for kind in LINES]}))],

@@ -30,15 +30,14 @@ POLICY = (
     "'unsafe-inline'; img-src data: blob:; base-uri 'none'; form-action 'none'; "
     "frame-ancestors 'none'"
 )
-"""Content security policy of a report. Because it does not contain `allow-same-origin`, the report
-has an opaque origin. The report contains a policy too, which names the allowed scripts by their
-hashes. The browser enforces both policies."""
+"""Content security policy of a report. Without `allow-same-origin`, the report has an opaque
+origin. The browser also enforces the report's own policy, which names the allowed scripts by their
+hashes."""
 
 NICE = 19
 
 DRAW_S = 600.0
-"""Time limit for drawing a report, s. A full file of the black box, one to four hours, takes
-minutes on a small computer."""
+"""Time limit for drawing a report, s. A full file, one to four hours, takes minutes."""
 
 ALONE_NS = 60 * NS_PER_S
 """Time, ns, after which the drawing of a report is cancelled if no client asks for its progress."""
@@ -93,10 +92,7 @@ class BlackBox:
             raise _unread(place, error) from None
 
     async def found(self, name: str) -> tuple[Path, tuple[int, int]]:
-        """Return the path of a recording, and a value that changes when it grows or is replaced.
-
-        Raises `RefusedError` if `name` is not the file name of a listed recording.
-        """
+        """Return a recording's path and a stamp that changes with it. Raises `RefusedError`."""
         place = self._place()
 
         def look() -> tuple[Path, tuple[int, int]] | None:
@@ -137,7 +133,6 @@ def rows(directory: Path) -> list[Recording]:
 
 
 def _files(directory: Path) -> list[Path]:
-    """Return the paths of the recordings; none if the directory does not exist yet."""
     try:
         return listed(directory)
     except FileNotFoundError:
@@ -208,12 +203,7 @@ class _Drawing:
 
 
 class Reports:
-    """Draws one report at a time, in a child process, and keeps the newest report.
-
-    The child runs `acsard recording report` at the lowest priority. Its time, memory and output are
-    bounded. It is killed when this server ends or no client asks for the report any more. The
-    finished report stays in memory, compressed, until another one is drawn or no client has asked
-    for it for `KEEP_NS`. No file is written.
+    """Draws one report at a time, in a child process, and keeps the newest report in memory.
 
     A recording may contain text from unknown senders, so a report could contain a malicious script.
     There are three defences. The report escapes the text. The policy in the report allows exactly
@@ -230,8 +220,8 @@ class Reports:
     def ask(self, path: Path, stamp: tuple[int, int]) -> ReportState:
         """Return the progress of the report of a recording, and start drawing it if needed.
 
-        `path` is the recording's file, and `stamp` must change when the recording changes. A failed
-        or outdated report is drawn again only after a client has received its result.
+        A report that failed, or whose `stamp` is old, is drawn again only after a client has
+        received its result.
         """
         one, now_ns = self._one, clock.mono_ns()
         if one is not None and not one.ended and one.path != path:
@@ -248,10 +238,7 @@ class Reports:
         return ReportState("drawing", percent=one.percent, seconds=round(seconds, 1))
 
     def drawn(self, name: str) -> bytes | None:
-        """Return the finished report of a recording, compressed by gzip, or None if there is none.
-
-        `name` is the recording's file name. The report is kept for `KEEP_NS` after the last call.
-        """
+        """Return the finished report as gzip, or None. Each call restarts the time `KEEP_NS`."""
         one = self._one
         if one is None or one.path.name != name or not one.packed:
             return None
@@ -259,10 +246,7 @@ class Reports:
         return one.packed
 
     def tidy(self) -> None:
-        """Cancel a drawing that no client waits for, and drop an old report.
-
-        The server calls this method once a second.
-        """
+        """Cancel an unwanted drawing, or drop an old report. Call this once a second."""
         one = self._one
         if one is None:
             return
@@ -310,10 +294,7 @@ class _FailedError(Exception):
 
 
 def _why(said: str) -> str:
-    """Return the reason why the child failed, from its error output `said`.
-
-    The reason in a traceback is its last line, or `TOO_MUCH` for a `MemoryError`.
-    """
+    """Return the reason for a failure from the child's error output `said`."""
     last = said.rpartition("\n")[2]
     if last.startswith("MemoryError"):
         return TOO_MUCH
@@ -331,10 +312,7 @@ async def _body(child: Process) -> bytes:
 
 
 async def _listened(child: Process, one: _Drawing) -> str:
-    """Read the child's error output to its end, and return the lines that explain a failure.
-
-    A line of digits is the progress of the drawing in percent. It is stored in `one.percent`.
-    """
+    """Read the child's error output. Store its progress in `one`, and return the other lines."""
     assert child.stderr is not None
     said = ""
     while part := await child.stderr.read(1 << 12):

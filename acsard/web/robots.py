@@ -33,12 +33,10 @@ AGAIN_S = 1.0
 """Delay before the next attempt to reach a daemon that does not answer, s."""
 
 ASK_S, ASK_SOON_S = 10.0, 1.0
-"""Intervals of the queries for the daemon's version and settings, s: after a query that was
-answered, and after one that was not."""
+"""Intervals of the queries for `About`, s: after an answer, and after a query without one."""
 
 PATH_S, PATH_POINTS, PATH_STEP_M = 600.0, 5000, 0.02
-"""Limits of the path that the page draws: maximum age of a point, s; maximum number of points;
-minimum distance between two points, m."""
+"""Limits of the drawn path: age of a point, s; number of points; minimum distance, m."""
 
 T = TypeVar("T")
 
@@ -69,10 +67,7 @@ def _path() -> Track:
 
 
 class _Asking:
-    """The bus client for a `Watch`, which follows a robot's state.
-
-    Queries run in threads, and do not block the event loop.
-    """
+    """The bus client of a `Watch`. Queries run in threads and do not block the event loop."""
 
     def __init__(self, client: Client) -> None:
         self.subscribe, self._client = client.subscribe, client
@@ -92,14 +87,11 @@ class Robots:
     """The connection to the daemon of the page's robot, and the data for a newly opened page."""
 
     def __init__(self, address: Address, connect: Connect, about: About, counts: Counts) -> None:
-        """Store the arguments; `run` opens the connection with `connect`.
-
-        `about` has the facts of the local configuration, which are used until the daemon answers.
-        """
+        """Store the arguments. `about` holds local values, used until the daemon answers."""
         self.id, self.endpoint = address.robot_id, address.endpoint
         self.certificate = shown_at(address.endpoint, address.tls)
-        """Common name of the certificate with which this server connects to the daemon; "" without
-        TLS. It is part of the public names of all viewers."""
+        """Common name of this server's certificate for the bus, a part of the public names of all
+        viewers; "" without TLS."""
         self.about = about
         self.client: Client | None = None
         self.streams = Streams()
@@ -113,10 +105,7 @@ class Robots:
         self._watch: Watch | None = None
 
     async def run(self) -> None:
-        """Connect to the daemon, and follow the robot until the task is cancelled.
-
-        Raises a `MendableError` if the connection cannot be opened, and trying again cannot help.
-        """
+        """Connect and follow the robot. Raises `MendableError` if trying again cannot help."""
         client = self.client = await self._reached()
         asking = asyncio.create_task(self._ask_again_and_again())
 
@@ -148,7 +137,6 @@ class Robots:
         }
 
     def minute(self) -> Plotted:
-        """Return the plotted values of the last minute."""
         return self._minute.plotted(clock.mono_ns())
 
     async def _reached(self) -> Client:

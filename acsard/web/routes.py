@@ -1,8 +1,6 @@
-"""The rows of the table of routes: the meaning, the role, the input and the output of each path.
+"""The rows of the table of paths, `app.ROUTES`. This module is pure.
 
-This module is pure. `app.ROUTES` is the table. aiohttp's router, the admission of requests, the
-rate limits and the OpenAPI document use it, so a path that is not in the table does not exist. This
-module makes the rows of the robot's keys and services from the tables in `keys_and_roles.py`.
+The router, the admission of requests, the rate limits and the OpenAPI document use this table.
 """
 
 from __future__ import annotations
@@ -74,21 +72,17 @@ class Route(Struct, frozen=True):
     forms: tuple[str, ...] = (JSON,)
     """Media types of the request's body."""
     gives: Mapping[int, Body] = {}
-    """The body of the answer for each HTTP status. The body of an error that is not listed is a
-    `Problem`."""
+    """Body of the answer by HTTP status. The body of any other error is a `Problem`."""
     rate: Rate = REQUESTS
     """Limit on the requests of one token. All rows with the same rate share one limit."""
     waits: bool = False
-    """True if a request beyond the rate waits; False if it is refused.
-
-    A POST, such as a stop, is carried out at once, and only its answer waits. If `waits` is true,
-    `rate` applies to each token in each network separately. So a program cannot use up the limit of
-    a page that uses the same token in another network.
-    """
+    """True if a request beyond the rate waits; False if it is refused. A POST is carried out at
+    once, and only its answer waits. If true, `rate` applies to each token in each network
+    separately, so a program cannot use up the limit of a page that uses the same token in another
+    network."""
 
     @property
     def parameters(self) -> list[str]:
-        """The names of the path's parameters."""
         return _PARAMETER.findall(self.path)
 
     @property

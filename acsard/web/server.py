@@ -39,8 +39,7 @@ TIDY_S, TELL_S = 1.0, 1.0
 
 FIELD_BYTES, FIELDS = 8190, 64
 """Maximum size of the request line and of a header, bytes; maximum number of headers. A browser
-sends the cookies for all ports of a host in one header, so a lower limit could lock out the
-browser."""
+sends the cookies for all ports of a host in one header, so a lower limit could lock it out."""
 
 LEAVE_S = 0.3
 """Time, s, that the server has at its shutdown to send zero velocities for viewers that drive."""
@@ -59,15 +58,12 @@ class Wanted(Struct, frozen=True):
     file: str = ""
     """Configuration file named on the command line, or ""."""
     supervised: bool = False
-    """True if the daemon started the server. The server then uses a later port if the requested one
-    is taken, and ends when its standard input closes."""
+    """True if the daemon started this server. It then uses a later port if the requested one is
+    taken, and ends when its standard input closes."""
 
 
 async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], log: Log) -> None:
-    """Serve until a signal arrives; `announce` is called once with the bound addresses.
-
-    Raises a `MendableError` if the server cannot start or cannot continue.
-    """
+    """Serve until a signal arrives; `announce` gets the bound addresses. Raises `MendableError`."""
     # A command or a stop waits at most this long while another thread holds the interpreter.
     sys.setswitchinterval(0.0005)
     leaving = asyncio.Event()
@@ -112,10 +108,7 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], lo
 
 
 async def _until(leaving: asyncio.Event, parts: Parts, page: Page, wanted: Wanted) -> None:
-    """Run the background tasks until `leaving` is set, or until one of them ends.
-
-    If a task fails, its error is raised.
-    """
+    """Run the background tasks until `leaving` is set or a task ends. Raises the task's error."""
     work: list[asyncio.Future[Any]] = [
         asyncio.create_task(leaving.wait()),
         asyncio.create_task(parts.robots.run()),
@@ -189,8 +182,7 @@ def _about(wanted: Wanted) -> About:
 def _certified(wanted: Wanted) -> tuple[ssl.SSLContext | None, set[str]]:
     """Return the TLS context, and the host names by which other machines reach this one.
 
-    Without an HTTPS address, return None and an empty set. Raises a `MendableError` if the
-    certificate is missing or cannot be used.
+    Without HTTPS, return None and an empty set. Raises `MendableError` for a bad certificate.
     """
     if not any(one.secure for one in wanted.listen):
         return None, set()

@@ -1,7 +1,6 @@
 """The outgoing side of one WebSocket: its subscribed keys, and the messages that it sends.
 
-The newest value of each key is sent when it is due, and answers are sent at once. While the client
-has not read earlier data, values are skipped and not queued.
+While the client has not read earlier data, values are skipped and not queued.
 """
 
 from __future__ import annotations
@@ -28,19 +27,14 @@ from acsard.web.socket_messages import Refused, Subscribe, Unsubscribe
 from acsard.web.streams import KEYS, UNREADY, Stream
 
 REPORTS = Rate(1.0)
-"""Limit on the rate at which a client is told that its messages are refused, for each kind of
-message and each reason. All refusals are counted."""
+"""Limit on reports of refusals to a client, for each kind of message and each reason."""
 
 
 class Following:
     """A key to which the client has subscribed, and the time at which its next value is due."""
 
     def __init__(self, robot: str, name: str, own: str, period: float) -> None:
-        """Prepare the constant part of the messages for the key `name` of a robot.
-
-        `own` is the id of the page's own robot, whose messages contain no id. `period` is the
-        shortest interval between two messages, s.
-        """
+        """Store a subscription. `own` is the id of the page's own robot, and `period` is in s."""
         self.robot, self.name, self.period = robot, name, period
         told = {"key": name} if robot == own else {"key": name, "robot": robot}
         self.head = msgspec.json.encode(told)[:-1] + b',"value":'
@@ -77,11 +71,7 @@ class Outgoing:
         self._news.set()
 
     def refuse(self, what: str, reason: Reason, text: str) -> None:
-        """Count a refused message, and tell the client why it was refused.
-
-        `what` is the kind of the message. The client is told at most once a second for each kind
-        and reason.
-        """
+        """Count a refused message, and tell the client why at most at the rate `REPORTS`."""
         self._counts.refuse(reason, self._origin)
         if self._reports.take(f"{what} {reason}", clock.mono_ns()):
             self.say(Refused(what, text))
@@ -109,10 +99,9 @@ class Outgoing:
             pass  # closing; `Viewer.run` notices
 
     async def close(self, why: str) -> None:
-        """Send a close frame with the reason `why`, at most 120 characters.
+        """Send a close frame with `why`, at most 120 characters, and cut the connection after 1 s.
 
-        The client gets a second to answer. If the connection were cut at once, many programs
-        would report a lost network instead of the reason.
+        An immediate cut would look like a lost network to many programs.
         """
         if self._closing:
             return
@@ -131,10 +120,9 @@ class Outgoing:
             self._transport.abort()
 
     def pong(self, data: bytes) -> None:
-        """Queue the answer to the newest ping, which carried `data`, and drop earlier answers.
+        """Queue the answer to the newest ping, and drop earlier answers, as the protocol allows.
 
-        The protocol allows a server to answer only the newest ping. So a client that sends pings
-        and does not read cannot fill the memory.
+        So a client that sends pings and does not read cannot fill the memory.
         """
         self._pong = data
         self._news.set()
@@ -151,10 +139,7 @@ class Outgoing:
             await self._send(self._out.popleft())
 
     async def _send_due(self, one: Following, now: float) -> float:
-        """Send the value of a key if it is due and new; return when the next value is due.
-
-        Times are s on the event loop's clock.
-        """
+        """Send a value if it is due and new. Return the next due time, s on the loop's clock."""
         stream = one.stream
         if stream is None:
             return now + one.period  # `Keys._join` wakes the task when the stream exists
@@ -178,16 +163,11 @@ class Outgoing:
 MOST = 32
 
 FRAMES_HZ = 300.0
-"""Maximum message rate of all keys of one connection together. The limit keeps viewers from taking
-the processor time that driving needs."""
+"""Maximum message rate of all keys of a connection. Driving needs processor time too."""
 
 
 class Keys:
-    """The keys of robots to which the client of one WebSocket subscribes.
-
-    `start` runs a coroutine in the background. `holder` is the client's token or name, under which
-    its subscriptions to other robots are counted.
-    """
+    """The subscriptions of one WebSocket, counted under `holder`, the client's token or name."""
 
     def __init__(
         self,
@@ -237,7 +217,6 @@ class Keys:
             self._start(self._join(one))
 
     def unsubscribe(self, frame: Unsubscribe) -> None:
-        """End the subscription to a key, if there is one."""
         name = frame.robot or self._robots.id, frame.unsubscribe
         # Remove the key now, because the client may subscribe again in the next message.
         one = self._out.following.pop(name, None)

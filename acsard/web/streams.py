@@ -1,8 +1,7 @@
 """The newest message of a key, as JSON, shared by all viewers of the page.
 
-Zenoh's thread only stores the message. It is converted to JSON once for all viewers, when the first
-of them needs it. The server subscribes to the key in msgpack, so the daemon need not encode the
-message as JSON.
+The daemon sends msgpack. Zenoh's thread only stores the message, which is converted to JSON when a
+viewer first needs it.
 """
 
 from __future__ import annotations
@@ -33,8 +32,8 @@ KEYS = frozenset(topic.key for topic in FOLLOWED)
 DECLARE_S = 3.0
 
 STATE = "state"
-"""Key of a robot's state. The server does not query the last state of another robot, but waits for
-the next one. A router's storage would return a last state even if the robot was off for a week."""
+"""Key of a robot's state. The state of another robot is not queried, because a router's storage
+would return a last state even if the robot was off for a week."""
 
 UNREADY = (TimeoutError, zenoh.ZError, UsageError)
 """Errors that mean that the bus is stuck or the session is closed. A later attempt may succeed."""
@@ -85,10 +84,7 @@ class Stream:
 
 
 class Streams:
-    """The subscribed keys of robots, shared by their users, the viewers of the page.
-
-    A subscription ends when its last user leaves.
-    """
+    """Subscriptions to keys of robots, shared by their users until the last one leaves."""
 
     def __init__(self) -> None:
         self._streams: dict[tuple[str, str], Stream] = {}
@@ -100,8 +96,7 @@ class Streams:
     async def follow(self, client: Client, robot: str, key: str) -> Stream:
         """Subscribe to a key of a robot if no other user has, and return the stream of messages.
 
-        The caller is a user of the stream until it calls `leave`. Raises an error of `UNREADY` if
-        the bus is not ready.
+        Call `leave` after use. Raises an error of `UNREADY` if the bus is not ready.
         """
         name = robot, key
         stream = self._streams.get(name)
@@ -122,10 +117,7 @@ class Streams:
         return self._streams.get((robot, key))
 
     def leave(self, robot: str, key: str) -> None:
-        """Remove a user from a stream. If it was the last one, the subscription ends.
-
-        It ends in the background, so a user whose task is being cancelled can still call this.
-        """
+        """Remove a user of a stream. After the last one, end the subscription in the background."""
         stream = self._streams.get((robot, key))
         if stream is None:
             return

@@ -49,25 +49,16 @@ class Token(Struct, frozen=True):
 
 
 class Vault:
-    """The access tokens of one robot, in a file that only its owner may read.
-
-    The file is read again when it changes. All robots of one user share the file, and this class
-    leaves out the tokens of the other robots.
-    """
+    """The access tokens of one robot, in a file that all robots of one user share."""
 
     def __init__(self, directory: Path, robot: str) -> None:
-        """Use the token file in `directory` for the robot with this id."""
         self.path, self.robot = directory / FILE, robot
         self._read: tuple[tuple[int, int] | None, list[Token]] = None, []
         """Modification time, ns, and inode number of the file when it was read, and its tokens.
         They are one value, because several threads replace it."""
 
     def known(self, text: str) -> Who | None:
-        """Return the owner of the token `text`, or None if the token is not valid.
-
-        This method does not read the disk. It uses the tokens of the last read of the file, and the
-        server reads the file once a second.
-        """
+        """Return the owner of a valid token, or None. This does not read the file again."""
         return owner_in(self._own(self._read[1]), text)
 
     def left_s(self, digest: str) -> int:
@@ -83,7 +74,6 @@ class Vault:
         return [one for one in tokens if one.robot == self.robot]
 
     def _shared(self) -> list[Token]:
-        """Return the tokens of all robots that share the file."""
         try:
             seen = self.path.stat()
             stamp = seen.st_mtime_ns, seen.st_ino

@@ -1,8 +1,6 @@
 """Serves one WebSocket of a page or a program. To the daemon, each WebSocket is one sender.
 
-Incoming messages are handled at once and never wait for outgoing ones, so a client that does not
-read can still drive and stop. Outgoing values are the newest ones at the requested rate. While the
-client has not read earlier data, values are skipped.
+Incoming messages never wait for outgoing ones, so a client that does not read can still stop.
 """
 
 from __future__ import annotations
@@ -63,34 +61,30 @@ HEARTBEAT_S = 10.0
 CALLS_AT_ONCE = 8
 
 FLEET, FLEET_S, FLEET_FIRST_S = "fleet", 1.0, 0.2
-"""Name of the key on which a client follows all robots; interval of the lists of robots, s; delay
-of the first list, s. Without the delay, the first list would be empty, because no robot has been
-found yet."""
+"""Key on which a client follows all robots; interval of the lists, s; delay of the first list, s.
+Without the delay, the first list would be empty."""
 
 
 class ViewerCommands:
     """Puts the newest velocity command of each viewer on the bus.
 
-    A command is sent once, with the stamp of its sender, or it is dropped. The server does not
-    repeat commands. It creates only one of its own: a zero velocity for a viewer that was driving
-    and has disconnected. `client` returns the connection to the bus, or None before it is open.
+    A command is sent once, with the stamp of its sender, or it is dropped. The server creates only
+    one command of its own: a zero velocity for a viewer that was driving and has disconnected.
     """
 
     def __init__(self, client: Callable[[], Client | None], counts: Counts) -> None:
         self._client, self._counts = client, counts
         self._rates = Buckets(COMMANDS)
         self.outbox = Outbox(partial(counts.add, "commands_dropped"))
-        """Queue of commands, with the thread that sends them. If this thread dies, the server must
-        exit, because without it no command is sent, not even the zero that ends a drive."""
+        """Queue of commands. If its thread dies, no zero is sent, so the server must exit."""
 
     def give(
         self, owner: str, source: str, commander: Commander, sender: Sender, wish: Wish
     ) -> bool:
         """Queue a command, in place of an older one of the same commander that still waits.
 
-        `owner` is the name under which the rate limit `COMMANDS` counts: a token, or a viewer on
-        the robot itself. Return False, and queue nothing, if the owner exceeds the limit. A zero
-        that ends a drive is queued all the same.
+        `owner` is a token, or a viewer on the robot itself. If it exceeds the rate limit
+        `COMMANDS`, return False and queue nothing, except for a zero that ends a drive.
         """
         now_ns = clock.mono_ns()
         ends = wish.twist == REST and commander.drives(now_ns)
@@ -146,8 +140,7 @@ class Viewer:
         whole = sender_id(who.name)
         self._sender, self._commanders = Sender(whole), dict[str, Commander]()
         self.sender = public_name(whole, parts.robots.certificate)
-        """Public name of this client: the value of `state.sender` while this client drives. It
-        does not reveal the sender id, which the server keeps secret."""
+        """Public name of this client in `state.sender`. It does not reveal the secret sender id."""
         self._socket = socket
         self._bucket = Bucket(MESSAGES)
         self._overruns = self._calling = 0
@@ -162,7 +155,6 @@ class Viewer:
         self._fleet_due: float | None = None
 
     async def run(self) -> None:
-        """Serve the connection until either side ends it."""
         self._greet()
         self._out.say(socket_messages.DrivenPath(**self._robots.way()))
         self._out.say(socket_messages.LastMinute(self._robots.minute()))
@@ -182,7 +174,7 @@ class Viewer:
             self._fleet.leave(self)
 
     def end(self, why: str) -> None:
-        """Close the connection; `why` is sent as the close reason, at most 120 characters."""
+        """Release the robot and close the connection; `why` has at most 120 characters."""
         if self._ended:
             return
         self._ended = True
@@ -358,10 +350,9 @@ class Viewer:
         self._out.say(socket_messages.Hello(greeting))
 
     def _look_around(self, now: float) -> float:
-        """Tell the client if the robot has become unreachable or the facts about it have changed.
+        """Tell the client what has changed, and send the list of robots when it is due.
 
-        Also send the list of all robots when it is due. Return the time of the next call. That time
-        and `now` are in s on the event loop's clock.
+        Return the time of the next call. That time and `now` are in s on the event loop's clock.
         """
         if self._robots.gone != self._gone:
             self._gone = self._robots.gone

@@ -1,13 +1,12 @@
 """Computes the error budget of a drive: the odometry error that each single cause makes.
 
 The errors of one cause are propagated alone through the error model of the odometry
-(`core/motion/uncertainty.py`). The recorded drive is repeated until the robot has driven 100 m,
-which gives the position error. It is also repeated until the robot has turned by 360 deg to one
-side, which gives the heading error.
+(`core/motion/uncertainty.py`). The recorded drive is repeated until the robot has driven 100 m, for
+the position error, and until it has turned by 360 deg to one side, for the heading error.
 
-Some errors are measured from the feedback lines: wrong stamps, quantization, gaps and contradicting
-wheels. A gyro shows the error of the track. The noise of the gyro is taken from the variance that
-the odometry publishes. All other errors are those that `[odometry]` declares.
+Feedback lines show the errors of stamps, quantization, gaps and contradicting wheels. A gyro shows
+the error of the track. The noise of the gyro is taken from the variance that the odometry
+publishes. All other errors are those that `[odometry]` declares.
 """
 
 from __future__ import annotations
@@ -29,10 +28,10 @@ from acsard.core.motion.path import Path
 from acsard.core.motion.uncertainty import GYRO_SCALE, PoseUncertainty
 from acsard.core.values import REST, PoseCovariance
 
-Cause = Literal["time", "quantisation", "gaps", "slip", "parameters", "gyro"]
+Cause = Literal["time", "quantization", "gaps", "slip", "parameters", "gyro"]
 
 Basis = Literal["measured", "settings", "unknown"]
-"""The source of an error's size: feedback lines, the settings of `[odometry]`, or none."""
+"""The source of an error's size: measurements, the settings of `[odometry]`, or none."""
 
 METRES = 100.0
 """Distance after which the position error is given, m."""
@@ -51,10 +50,7 @@ MOST_STEPS = 20_000
 
 STRAIGHT = Steps(np.array([[0.05, 0.0] + [0.0] * 7]))
 SPIN = Steps(np.array([[0.0, 0.05] + [0.0] * 7]))
-"""A step that turns by 0.05 rad on the spot, without errors.
-
-If the robot stood still, `STRAIGHT` and `SPIN` replace the recorded steps.
-"""
+"""Steps without errors (`STRAIGHT` 0.05 m, `SPIN` 0.05 rad), used if the robot stood still."""
 
 
 NOISE = (
@@ -71,13 +67,11 @@ PARAMETERS = (
 
 
 class Share(Struct, frozen=True):
-    """The errors that one cause alone makes. An error is None if this drive does not show it."""
+    """Standard deviations due to one cause alone, each None if this drive does not show it."""
 
     cause: Cause
     mm_per_100_m: float | None
-    """Standard deviation of the position after 100 m, mm."""
     deg_per_turn: float | None
-    """Standard deviation of the heading after a turn of 360 deg, deg."""
     basis: Basis
 
 
@@ -85,15 +79,12 @@ class Budget(Struct, frozen=True):
     """The errors of all causes, and facts about the drive."""
 
     seconds: float
-    """Duration of the drive, s."""
     metres: float
     """Total distance driven, forwards and backwards, m."""
     turned: float
     """Total turning to the left and to the right, deg."""
     lines: int
-    """Number of feedback lines."""
     missing: int
-    """Number of feedback lines that were lost."""
     unseen: float
     """Driving time without feedback lines, s."""
     lateness: float
@@ -112,12 +103,8 @@ class Budget(Struct, frozen=True):
     multiplier: float = 1.0
     """Configured ratio of effective track to wheel separation."""
     learned: float | None = None
-    """Ratio of effective track to wheel separation that the gyro implies; None if unknown.
-
-    It is an average over the drive so far.
-    """
+    """Mean ratio of effective track to wheel separation that the gyro implies; None if unknown."""
     learned_std: float = 0.0
-    """Standard deviation of `learned`."""
     learned_used: bool = False
     """True if the odometry uses `learned` for turns that only the wheels measure."""
     coarse: bool = False
@@ -126,8 +113,7 @@ class Budget(Struct, frozen=True):
     def largest(self, *bases: Basis) -> Share | None:
         """Return the share with the largest position error, among the shares with one of `bases`.
 
-        If no position error is greater than 0, the share with the largest heading error is
-        returned, or None if no heading error is greater than 0 either.
+        If all position errors are 0, the heading errors decide. If they are 0 too, return None.
         """
         known = [share for share in self.shares if share.basis in bases]
         for size in (_millimetres, _degrees):
@@ -137,10 +123,9 @@ class Budget(Struct, frozen=True):
         return None
 
     def total(self) -> tuple[float | None, float | None]:
-        """Return the error of all causes together, in mm after 100 m and deg after a turn.
+        """Return the errors of all causes together, in mm after 100 m and deg after a turn.
 
-        The causes are independent, so the squares of their errors are added. An error is None if it
-        is None for every cause.
+        The causes are independent, so squares are added. An error is None if all causes are None.
         """
         return _squares([share.mm_per_100_m for share in self.shares]), _squares(
             [share.deg_per_turn for share in self.shares]
@@ -151,7 +136,6 @@ class Received(Struct, frozen=True):
     """The messages about a drive that this program received from the bus."""
 
     lines: list[Line]
-    """The feedback lines."""
     sent: list[float]
     """Times at which the daemon sent lines to the microcontroller, s."""
     whole: bool = True
@@ -171,10 +155,7 @@ class Received(Struct, frozen=True):
 
 
 def budget(received: Received, config: Config, metres: float = METRES) -> Budget:
-    """Return the error budget of a drive, with the position error after `metres` m.
-
-    `config` is the configuration of the daemon.
-    """
+    """Return the error budget of a drive, with the position error after `metres` m."""
     model, lines = _Model(config, metres), received.lines
     still = _standing(received, config, model)
     if len(lines) < LEAST_LINES:
@@ -218,10 +199,7 @@ def _standing(received: Received, config: Config, model: _Model) -> Budget:
 
 
 def _causes(received: Received, model: _Model, driving: Driving, counts: int) -> Iterator[Share]:
-    """Yield the errors that each cause alone makes.
-
-    `counts` are the encoder counts per wheel turn, 0 if unknown.
-    """
+    """Yield each cause's errors. `counts` are the encoder counts per wheel turn, 0 if unknown."""
     odometry, plain = model.odometry, driving.plain()
 
     def share(
@@ -235,7 +213,7 @@ def _causes(received: Received, model: _Model, driving: Driving, counts: int) ->
     counted = received.counted
     basis: Basis = "measured" if counted or received.whole else "unknown"
     yield share("time", basis, plain if counted else driving.late())
-    yield share("quantisation", basis, plain if counted else driving.rounded(), counts=counts)
+    yield share("quantization", basis, plain if counted else driving.rounded(), counts=counts)
     yield share("gaps", basis, plain if counted else driving.missed())
 
     declared = share("slip", "settings", plain, _only(odometry, *NOISE))
@@ -262,15 +240,11 @@ class _Model:
     def __init__(self, config: Config, metres: float) -> None:
         self.odometry, self.kinematics = config.odometry, Kinematics(config.drive)
         self.rolls = self.turns = True
-        """Whether the drive is long enough to extrapolate errors.
-
-        `rolls` is for the position error, and `turns` for the heading error.
-        """
+        """Whether position errors (`rolls`) and heading errors (`turns`) can be extrapolated."""
         self._metres = metres
 
     @property
     def declares_parameters(self) -> bool:
-        """Whether the settings declare an uncertainty of the wheels or of the track."""
         return bool(columns(_only(self.odometry, *PARAMETERS), self.kinematics))
 
     def share(
@@ -280,10 +254,9 @@ class _Model:
         """Return the errors that one cause makes.
 
         Args:
-            cause: the name of the cause.
-            basis: the source of the size of the errors. If it is "unknown", the errors are None.
-            ahead: the steps that are repeated for the position error.
-            left: the steps, with all turns to the left, that are repeated for the heading error.
+            basis: the source of their size. If it is "unknown", the errors are None.
+            ahead: the steps to repeat for the position error.
+            left: the steps to repeat for the heading error, with all turns to the left.
             only: the settings without the errors of other causes.
             counts: encoder counts per wheel turn; 0 if the encoders are not the cause.
             scale: relative standard deviation of the gyro's scale; 0 if the gyro is not the cause.
@@ -303,10 +276,7 @@ class _Model:
         self, steps: Steps, only: OdometryConfig, counts: int, scale: float, metres: float,
         angle: float,
     ) -> PoseCovariance:  # fmt: skip
-        """Return the pose's covariance after `metres` m or `angle` rad, whichever comes first.
-
-        The steps are repeated until then.
-        """
+        """Return the pose's covariance when the repeated steps reach `metres` m or `angle` rad."""
         pose, path = PoseUncertainty(ErrorModel(only, self.kinematics), counts), Path()
         rolled = turned = 0.0
         for distance, turn, along, yaw, *missed, by_gyro in cycle(steps.rows.tolist()):

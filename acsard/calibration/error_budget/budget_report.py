@@ -13,7 +13,7 @@ from acsard.terminal.output import table
 
 MEANING: dict[Cause, str] = {
     "time": "errors in the times of feedback lines",
-    "quantisation": "rounding of the values in a feedback line",
+    "quantization": "rounding of the values in a feedback line",
     "gaps": "distance driven while no feedback lines came",
     "slip": "wheels that skid",
     "parameters": "wheel radii and track",
@@ -46,17 +46,14 @@ COARSE = (
     "of a feedback line becomes an error of the heading: write mcu.encoder_counts, the counts per "
     "wheel turn (`acsard mcu check` estimates them)"
 )
-"""Advice for a robot with coarse encoders."""
 
 CALIBRATE = (
     "the error of wheel radii and track width is unknown, and if the wheels skid, it is usually "
     "the largest error: run `acsard calibrate`"
 )
-"""Advice for a robot that is not calibrated."""
 
 
 def parts(budget: Budget) -> Iterator[RenderableType]:
-    """Yield a sentence about the drive, then the table, then advice on the largest cause."""
     if budget.still:
         yield _standing(budget)
     else:
@@ -68,10 +65,7 @@ def parts(budget: Budget) -> Iterator[RenderableType]:
 
 
 def advice(budget: Budget) -> str:
-    """Return advice on the largest measured cause.
-
-    If a cause whose error the settings declare is larger, the advice also covers that cause.
-    """
+    """Return advice on the largest measured cause, and on a declared cause if that is larger."""
     if budget.still:
         return (
             "drive the robot, also around curves, while the tool measures: a robot that stands "
@@ -166,7 +160,7 @@ def _number(value: float | None, digits: int) -> str:
 
 
 def _advice_on(share: Share, budget: Budget) -> str:
-    if share.cause != "quantisation":
+    if share.cause != "quantization":
         return ADVICE[share.cause].format(
             late=1e3 * budget.lateness, missing=budget.missing, unseen=budget.unseen
         )

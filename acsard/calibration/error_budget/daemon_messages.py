@@ -36,10 +36,9 @@ SHARE_COARSE = 0.1
 """Fraction of feedback lines with signs of coarse encoders, above which the report says so."""
 
 LEAST_LOST, SHARE_LOST = 3, 0.01
-"""Number and fraction of the daemon's feedback lines that this program may fail to receive.
+"""Number and fraction of feedback lines that this program may miss. The larger limit applies.
 
-The larger limit applies. A few lines are always missing, because the counters and the messages do
-not start and stop at the same moment.
+A few are always missing: the counters and the messages do not start and stop together.
 """
 
 SAMPLED = "checked with samples"
@@ -127,10 +126,6 @@ class Feed:
         )
 
     def _coarse(self, last: RobotState) -> bool:
-        """Return whether more than `SHARE_COARSE` of the lines have signs of coarse encoders.
-
-        `last` is the present state of the daemon.
-        """
         now, before = last.counters, self._first.counters
         lines, coarse = (
             now.get(name, 0) - before.get(name, 0) for name in ("lines", "coarse_encoder_lines")
@@ -138,7 +133,6 @@ class Feed:
         return coarse > SHARE_COARSE * lines
 
     def _join(self, stamp_ns: int) -> None:
-        """Combine the `odom` and the `wheel_states` message of this stamp, if both have arrived."""
         odom, wheels = self._odom.get(stamp_ns), self._wheels.get(stamp_ns)
         if odom is None or wheels is None:
             for waiting in (self._odom, self._wheels):
@@ -155,10 +149,7 @@ class Feed:
         self._count += 1
 
     def _whole(self, last: RobotState) -> bool:
-        """Return whether this program received nearly every feedback line of the daemon.
-
-        `last` is the present state of the daemon.
-        """
+        """Return whether this program received nearly every feedback line of the daemon."""
         rates, before = self._config.rates, self._first.counters
         if rates.odom or rates.wheel_states:
             return False
@@ -171,18 +162,12 @@ class Feed:
 
 
 def _value(diagnostics: DiagnosticArray, key: str) -> str:
-    """Return the first value with this key in the diagnostics, or ""."""
     rows = (value for status in diagnostics.status for value in status.values)
     return next((value.value for value in rows if value.key == key), "")
 
 
 def _learned(diagnostics: DiagnosticArray) -> tuple[float | None, float, bool]:
-    """Return the effective track that the gyro implies, according to the diagnostics.
-
-    Returns:
-        The track divided by the configured track (None if it is unknown), the relative standard
-        deviation of the track, and whether the odometry uses the track.
-    """
+    """Return `learned`, `deviation` and `used` of `Received`, from the diagnostics."""
     names = ("learned_multiplier", "wheel_separation_multiplier", "learned_multiplier_std")
     learned, configured, std = (_value(diagnostics, name) for name in names)
     used = _value(diagnostics, "multiplier_in_use") == learned != configured

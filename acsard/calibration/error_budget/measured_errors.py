@@ -1,26 +1,22 @@
 """Measures the motion of a drive and the errors of each of its steps from feedback lines.
 
-Two of the errors are late stamps and lost lines. To find them, this module estimates the times at
-which the board made its lines. The board makes a line at a fixed period, or as the answer to each
-line of the daemon, so these times form a grid. A line cannot arrive before the board made it. The
-line with the smallest delay among its neighbours therefore shows where the grid is. If even this
-line arrives a whole period later than expected, a line was lost. The difference between a stamp and
-its time on the grid is the error of the stamp.
+Late stamps and lost lines: the board makes its lines at a fixed period, or as answers to the lines
+of the daemon, so their times form a grid. A line cannot arrive before the board made it. The line
+with the smallest delay among its neighbours therefore shows where the grid is. If even this line
+arrives a whole period later than expected, a line was lost.
 
-Rounding is an error because a feedback line carries wheel speeds with two decimals. Independent
-rounding errors have a standard deviation of q / sqrt(12), where q is the quantization step. A wheel
-at a constant speed repeats the same error, so n equal values in a row are one error of n times this
-size. If a wheel passes through a value while it becomes faster or slower, the errors in the first
-and in the second half of the equal values cancel.
+Rounding: a feedback line carries wheel speeds with two decimals. Independent rounding errors have a
+standard deviation of q / sqrt(12), where q is the quantization step. A wheel at a constant speed
+repeats the same error, so n equal values in a row are one error of n times this size. If a wheel
+passes through a value while it becomes faster or slower, the errors before and after the middle of
+the equal values cancel.
 
-Some firmware counts encoder edges in each period, so each speed is a multiple of the speed of one
-count. An edge that comes too late for one period is counted in the next one, so errors of the count
-do not accumulate. The multiple is then rounded to two decimals. Only these rounding errors
-accumulate, and they can be computed.
+Encoder counts: some firmware reports multiples of the speed of one count per period. An edge that
+comes too late for one period is counted in the next one, so errors of the count do not accumulate.
+The rounding of the multiples to two decimals does accumulate, but its errors can be computed.
 
-`Driving` divides a drive into steps, each with the errors of one cause. Errors that are independent
-from step to step are given as variances. Errors that have the same sign in each step add up, so
-they are given as motion that the pose missed, like the motion in a gap.
+Errors that are independent from step to step are given as variances. Errors that have the same sign
+in each step add up, so they are given as motion that the pose missed.
 """
 
 from __future__ import annotations
@@ -60,15 +56,12 @@ The delays drift because the period is at first known only to about 1 %.
 CLUSTERED, ALIKE_TIMES = 0.4, 0.25
 """Limits for taking the median interval between lines as the period, instead of the mean.
 
-An interval is near the median if it differs by less than the fraction `ALIKE_TIMES` of the median.
-The median is taken if more than the fraction `CLUSTERED` of all intervals are near it. If lines
-arrive in bursts, fewer intervals are.
+More than the fraction `CLUSTERED` of the intervals must differ from the median by less than the
+fraction `ALIKE_TIMES` of the median. If lines arrive in bursts, fewer do.
 """
 
 
 class LineTimes(Struct, frozen=True):
-    """Estimates for each feedback line: its delay, and the number of lines lost before it."""
-
     late: Floats
     """Delay of each line minus the median delay, s."""
     missing: Counts
@@ -80,10 +73,9 @@ class LineTimes(Struct, frozen=True):
 def line_times(t: Floats, sent: Floats) -> LineTimes:
     """Estimate the delay of each feedback line, and the number of lines lost before it.
 
-    `t` contains the stamps of at least 3 feedback lines, s. `sent` contains the times at which the
-    daemon sent lines, s. A board sends feedback at a fixed period, or one line as the answer to
-    each line of the daemon. The function tries both, and returns the estimate with the smaller
-    delays.
+    `t` contains the stamps of at least 3 feedback lines, s, and `sent` the times of the daemon's
+    lines, s. One estimate assumes a fixed period, the other a board that answers each line of the
+    daemon. The one with the smaller delays is returned.
     """
     even = _even(t)
     asked = _asked(t, sent)
@@ -112,8 +104,7 @@ def _even(t: Floats) -> LineTimes:
 def _asked(t: Floats, sent: Floats) -> LineTimes | None:
     """Estimate the delays of lines with the stamps `t`, s, if the board answers the daemon's lines.
 
-    `sent` contains the times of the daemon's lines, s. The result is None if these lines are too
-    few or do not cover the feedback lines.
+    The result is None if the daemon's lines `sent`, s, are too few or do not cover the stamps.
     """
     if len(sent) < 3 or sent[0] > t[0] or len(sent) < len(t) / 2:
         return None
@@ -131,8 +122,7 @@ def _asked(t: Floats, sent: Floats) -> LineTimes | None:
 def _missing(at: Floats) -> Counts:
     """Return for each line the number of lines that were lost just before it.
 
-    `at` contains the time of each line, as a number of periods since an origin. Any origin gives
-    the same result.
+    `at` contains the times of the lines, in periods since any origin.
     """
     count = len(at)
     ahead = at - np.arange(count)
@@ -156,9 +146,8 @@ BLOCK_S = 0.5
 LEAST_LINES, ALIKE = 20, 0.99
 """Limits for the fit that separates the noise of the gyro from its scale error.
 
-`LEAST_LINES` is the minimum number of feedback lines while the robot moves. The noise grows with
-time, and the scale error grows with the turn. If the turns are nearly proportional to time (cosine
-above `ALIKE`), the fit cannot separate the two.
+`LEAST_LINES` is the minimum number of lines while the robot moves. If the turns are nearly
+proportional to time (cosine above `ALIKE`), the fit cannot separate the two.
 """
 
 LATEST_S = 0.1
@@ -187,13 +176,9 @@ class Line(Struct, frozen=True):
 
 
 class Motion(Struct, frozen=True):
-    """The motion between consecutive feedback lines, and its errors.
-
-    An array has one entry for each line except the first.
-    """
+    """The motion between feedback lines, and its errors. Arrays start with the second line."""
 
     seconds: float
-    """Duration of the drive, s."""
     period: float
     """Mean interval between two lines, s."""
     distance: Floats
@@ -207,17 +192,10 @@ class Motion(Struct, frozen=True):
     lateness: float
     """RMS error of the stamps, s."""
     filled: Floats
-    """Variances of the motion in gaps that the odometry filled, rows of (m2, rad2).
-
-    The rows of lines without such a gap are zero.
-    """
+    """Variances (m2, rad2) of the motion in gaps that the odometry filled; 0 without such a gap."""
     unfilled: Floats
-    """Motion in gaps that the odometry did not fill, and its variances: (m, rad, m2, rad2).
-
-    The pose did not move in such a gap. The rows of lines without such a gap are zero.
-    """
+    """Motion in unfilled gaps, which the pose missed, and its variances: (m, rad, m2, rad2)."""
     missing: int
-    """Number of lines that were lost."""
     unseen: float
     """Total duration of the gaps, s."""
 
@@ -225,9 +203,8 @@ class Motion(Struct, frozen=True):
 def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool) -> Motion:
     """Compute the motion of a drive of at least 3 feedback lines, and its errors.
 
-    `sent` contains the times at which the daemon sent lines, s. `whole` is true if this program
-    received every feedback line that the daemon received. If it is false, the daemon may have
-    received the missing lines, so they do not count as gaps that the odometry filled.
+    `sent` contains the times of the daemon's lines, s. `whole` is true if this program received
+    every line that the daemon received. If it is false, lost lines do not count as filled gaps.
     """
     t = np.array([line.at for line in lines])
     found = line_times(t, sent)
@@ -296,9 +273,7 @@ def _gaps(
 ) -> tuple[Floats, Floats, int, float]:
     """Return `filled`, `unfilled`, `missing` and `unseen` of `Motion`.
 
-    The variances come from the odometry's own model of gaps, `Gaps`. `twists` contains the twists
-    according to the reported speeds. `rolled` contains the motion from each line to the next,
-    according to the reported positions.
+    `twists` come from the reported speeds, and the motion `rolled` from the reported positions.
     """
     filled, unfilled = np.zeros((len(rolled), 2)), np.zeros((len(rolled), 4))
     lost, unseen = 0, 0.0
@@ -331,8 +306,7 @@ def _gaps(
 
 
 TOGETHER = 0.8
-"""If two wheels report equal speeds in at least this fraction of the feedback lines, their rounding
-errors are taken to be the same."""
+"""Fraction of lines with equal speeds at which two wheels have the same rounding errors."""
 
 LEAST_VALUES = 3
 """Minimum number of different speeds that are needed to find a quantization step."""
@@ -342,10 +316,7 @@ class Rounding(Struct, frozen=True):
     """Rounding errors of wheel speeds: a row for each feedback line, columns as `values.WHEELS`."""
 
     variance: Floats
-    """Variance of the angle that a wheel rolled from line to line, rad2.
-
-    The errors of different lines are independent.
-    """
+    """Variance of the angle rolled since the last line, rad2. Errors of lines are independent."""
     offset: Floats
     """Known error of the angle that a wheel rolled from line to line, rad."""
     alike: Floats
@@ -359,8 +330,7 @@ class Rounding(Struct, frozen=True):
 def rounding(speeds: Floats, period: float) -> Rounding:
     """Estimate the errors that the rounding of wheel speeds causes.
 
-    `speeds` contains the speeds, rad/s: a row for each feedback line, a column for each wheel. A
-    line covers `period` s.
+    `speeds`, rad/s, has a row for each line and a column for each wheel. A line covers `period` s.
     """
     moving = np.any(speeds != 0.0, axis=1)
     same = speeds[moving][:, :, None] == speeds[moving][:, None, :]
@@ -377,9 +347,8 @@ def rounding(speeds: Floats, period: float) -> Rounding:
 def _runs(values: Floats) -> Floats:
     """Return the variances of the rounding errors of a wheel, as multiples of q^2 / 12.
 
-    `values` contains the speeds of the wheel, and q is the quantization step. A sequence of n equal
-    speeds has the variance n^2 at its last speed, and 0 at the others. If the wheel passed through
-    this speed while it became faster or slower, the variance at the last speed is 1.
+    A run of n equal speeds has the variance n^2 at its last speed, and 0 at the others. If the
+    wheel passed through this speed while it became faster or slower, the last variance is 1.
     """
     found = np.zeros(len(values))
     ends = np.append(np.flatnonzero(np.diff(values)), len(values) - 1)
@@ -427,8 +396,7 @@ class Steps(Struct, frozen=True):
 class Driving:
     """Divides a drive into steps of about `step_s` s.
 
-    Each method returns these steps with the errors of one cause. `gyro` is true if a gyro
-    measured the turns.
+    Each method adds the errors of one cause. `gyro` is true if a gyro measured the turns.
     """
 
     def __init__(
@@ -480,8 +448,7 @@ class Driving:
     def contradicted(self) -> Steps:
         """Return the steps with the errors of wheels that contradict each other.
 
-        If the front and the rear wheel of a side differ, one of them is assumed to be right. Then
-        the mean of both is wrong by half of the difference.
+        One of a side's two wheels is assumed right, so their mean is wrong by half the difference.
         """
         turned = np.diff([line.positions for line in self._lines], axis=0)
         front_right, front_left, rear_left, rear_right = turned.T
@@ -489,10 +456,7 @@ class Driving:
         return self._steps(missed=self._of_wheels(np.column_stack([right, left, left, right])))
 
     def _of_wheels(self, off: Floats) -> Floats:
-        """Return the motion that the pose missed because wheel angles are wrong by `off`, rad.
-
-        The rows are (m, rad, m2, rad2). The error `off` is known, so the variances are 0.
-        """
+        """Return the motion missed because of the wheel angle errors `off`, rad: (m, rad, 0, 0)."""
         moved = off @ self._weights.T
         return np.hstack([moved, np.zeros_like(moved)])
 
@@ -500,10 +464,9 @@ class Driving:
         self, variances: Floats | None = None, missed: Floats | None = None,
         gyro: Floats | None = None,
     ) -> Steps:  # fmt: skip
-        """Return the steps with these errors; None means no error.
+        """Return the steps with these errors of all lines but the first; None means no error.
 
-        Each argument has one row for each feedback line except the first, with the columns of
-        `Steps.rows`: 2 and 3 (`variances`), 4 to 7 (`missed`), and 8 (`gyro`).
+        The columns are those of `Steps.rows`: 2, 3 (`variances`), 4 to 7 (`missed`) and 8 (`gyro`).
         """
         moved, count = self._motion, len(self._motion.distance)
         errors = [

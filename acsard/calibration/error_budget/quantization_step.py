@@ -32,10 +32,7 @@ BY_CHANCE = 1e-5
 """A step is rejected if its probability of fitting all speeds by chance exceeds this value."""
 
 STEEP = 1.0
-"""Smallest step, rad/s, that is accepted without a test against chance.
-
-Only a coarse encoder makes the speed of a wheel jump this much from line to line.
-"""
+"""Step, rad/s, above which there is no test against chance: only coarse encoders jump this much."""
 
 
 def quantization_step(speeds: Floats) -> float:
@@ -56,10 +53,7 @@ def quantization_step(speeds: Floats) -> float:
 
 
 def _strays(speeds: Floats, step: float, doubt: float) -> int:
-    """Return how many speeds, rounded to two decimals, are not multiples of `step`, rad/s.
-
-    `doubt` is the largest relative error of `step`.
-    """
+    """Return how many speeds are not multiples of `step`, whose relative error is up to `doubt`."""
     off = np.abs(speeds - step * np.round(speeds / step))
     return int(np.count_nonzero(off > ROUNDING + doubt * speeds))
 

@@ -1,8 +1,6 @@
 """The types of a guided drive: `Method`, `Leg`, `Move` and measurements, and the robot's `Setup`.
 
-A method of calibration consists of questions to ask first and legs to drive in order. `methods.py`
-contains the table of the methods, and `runner.py` leads a person through one of them. The command
-line and the page import this module to name the methods, so it does not load numpy.
+The command line and the page import this module to name the methods, so it does not load numpy.
 
 The robot stays within its limits and on a floor of 3 m x 3 m. Before the calibration it is unknown
 how far the robot turns for a command. The plan must therefore work for an effective track of 1 to
@@ -62,7 +60,6 @@ class Move(Struct, frozen=True):
     """A command, and the time for which the tool keeps sending it. Zero speeds make a pause."""
 
     seconds: float
-    """Time for which the tool sends the command, s."""
     linear: float = 0.0
     """Linear speed, m/s."""
     angular: float = 0.0
@@ -102,22 +99,13 @@ class Slant(Struct, frozen=True):
 
     quantity: Quantity
     near: str
-    """Name of the answer with the distance of one point of the robot from the line.
-
-    A turn to the left moves this point towards the line.
-    """
+    """Name of the answer with the distance of the point that a left turn moves towards the line."""
     far: str
-    """Name of the answer with the distance of a second point of the robot from the line.
-
-    A turn to the left moves this point away from the line.
-    """
+    """Name of the answer with the distance of the point that a left turn moves away."""
     apart: str
     """Name of the answer, asked before the first leg, with the distance between both points."""
     since: str = ""
-    """Name of the earlier leg after which the person measured the robot's angle to the line.
-
-    "" means that the robot was parallel to the line when the measured motion began.
-    """
+    """Name of the leg after which the start angle was measured; "" if the robot began parallel."""
     plus: float = 0.0
     """Whole and half turns to add, rad, because the angle to the line does not show them."""
     over: tuple[str, ...] = ()
@@ -137,7 +125,6 @@ class Leg(Struct, frozen=True):
     asks: tuple[Ask, ...] = ()
     """Questions that the person answers after the moves."""
     measures: tuple[Measure, ...] = ()
-    """The measurements that the answers give."""
     by_key: bool = False
     """Whether the person ends the last move with a key. Its duration is then a timeout."""
     placed: bool = False
@@ -161,10 +148,7 @@ FASTEST_WHEEL = 0.5
 """Largest rolling speed of the wheels in a turn, m/s."""
 
 REACH = 0.75
-"""Assumed distance from the robot's middle to its outermost point, in wheel separations.
-
-Half a wheel radius is added to it.
-"""
+"""Assumed distance from the robot's middle to its outermost point, in wheel separations."""
 
 EDGE = 0.1
 """Margin between the robot and the edge of the floor, m."""
@@ -179,10 +163,7 @@ STOPS_IN = 0.1
 """Distance that the robot may still roll after a leg has ended, m."""
 
 WIDEST = 2.5
-"""Largest ratio of effective track to wheel separation that the plan allows for.
-
-The smallest ratio is 1, because skidding only makes the track larger.
-"""
+"""Largest ratio of effective track to wheel separation that the plan allows for. The least is 1."""
 
 
 class Setup(Struct, frozen=True):
@@ -200,9 +181,7 @@ class Setup(Struct, frozen=True):
     wheel: float
     """Largest rolling speed of the wheels in a turn, m/s."""
     odometry: OdometryConfig = OdometryConfig()
-    """The configured noise of the odometry."""
     feedback: FeedbackConfig = FeedbackConfig()
-    """The configured response time of the wheels."""
 
     @property
     def from_edge(self) -> float:
@@ -219,18 +198,13 @@ class Setup(Struct, frozen=True):
         return Move(abs(metres) / self.speed, math.copysign(self.speed, metres))
 
     def spin(self, rate: float, seconds: float) -> Move:
-        """Return a turn on the spot that lasts `seconds` s.
-
-        `rate` is the turn rate that the robot would have without skidding, rad/s, positive to the
-        left. With skidding it turns more slowly.
-        """
+        """Return a turn on the spot to the left at `rate` rad/s. A robot that skids turns less."""
         return Move(seconds, 0.0, self.command(rate))
 
     def arc(self, rate: float, metres: float) -> Move:
         """Return a curve of the length `metres`, m; a negative length goes backwards.
 
-        `rate` is the turn rate that the robot would have without skidding, rad/s, positive to the
-        left.
+        `rate` is the turn rate without skidding, rad/s, positive to the left.
         """
         straight = self.ahead(metres)
         return Move(straight.seconds, straight.linear, self.command(rate))
@@ -238,10 +212,8 @@ class Setup(Struct, frozen=True):
     def turn(self, angle: float, rate: float, track: float) -> Move:
         """Return a turn on the spot by a true angle. The command makes up for skidding.
 
-        Args:
-            angle: the true angle in rad, positive to the left.
-            rate: the wanted true turn rate in rad/s, positive. The limits may reduce it.
-            track: the ratio of effective track to wheel separation.
+        `angle` is in rad, positive to the left. `rate` is the true turn rate, rad/s, which the
+        limits may reduce. `track` is the ratio of effective track to wheel separation.
         """
         command = abs(self.command(rate * track))
         seconds = abs(angle) * track / (command * self.rate_per_command)
@@ -260,8 +232,7 @@ class Setup(Struct, frozen=True):
     def rate_per_command(self) -> float:
         """Turn rate without skidding, rad/s, for an angular command of 1 rad/s.
 
-        It differs from 1 because the daemon computes the wheel speeds with the configured
-        multipliers, which make up for skidding.
+        It differs from 1 because the configured multipliers make up for skidding.
         """
         bare = replace(
             self.drive, wheel_separation_multiplier=1.0, left_wheel_radius_multiplier=1.0,
@@ -272,23 +243,19 @@ class Setup(Struct, frozen=True):
 
 
 Legs = Callable[[Setup, float], tuple[Leg, ...]]
-"""Function that returns the legs of a method.
+"""Function that returns the legs for a setup and a ratio of effective track to separation.
 
-Its arguments are the setup and the ratio of effective track to wheel separation. The first `turned`
-measurement shows that ratio, so the legs up to this measurement are the same for any ratio.
+The first `turned` measurement shows the ratio. The legs up to it must not depend on the ratio.
 """
 
 TRACKS = [1.0 + 0.05 * step for step in range(round((WIDEST - 1.0) / 0.05) + 1)]
 """Ratios of effective track to wheel separation for which the driving time is computed.
 
-The largest ratio alone is not enough: with a smaller one, a leg may have one more full turn and
-take longer.
+With a smaller ratio, a leg may have one more full turn and take longer.
 """
 
 
 class Method(Struct, frozen=True):
-    """A method of calibration by a guided drive."""
-
     legs: Legs
     asks: tuple[Ask, ...] = ()
     """Questions that the person answers before the first leg."""

@@ -1,9 +1,7 @@
 """Decides the commands of one leg from the daemon's messages and from key presses.
 
-A leg is one drive of a guided calibration. The driver goes through the phases of `Phase`. It
-commands zero until the daemon accepts its commands, then each move of the leg for its duration,
-then zero until the wheels stand still. An unexpected condition halts the leg for good.
-`LegDriver.halted` then contains the reason.
+A leg is one drive of a guided calibration. The driver goes through the phases of `Phase`. An
+unexpected condition halts the leg for good, and `LegDriver.halted` then contains the reason.
 """
 
 from __future__ import annotations
@@ -34,11 +32,7 @@ STILL = 0.02
 """Largest speed at which a wheel is considered to stand still, rad/s."""
 
 STANDING_S, STANDS_S = 0.5, 6.0
-"""Limits for the end of a leg, s.
-
-The leg is done when the wheels have stood still for `STANDING_S`. If that has not happened within
-`STANDS_S`, the leg is halted.
-"""
+"""Limits for the end of a leg, s: the wheels stand still for `STANDING_S` within `STANDS_S`."""
 
 ENTER = "\r\n"
 PRESSED = "a key was pressed"
@@ -97,9 +91,8 @@ class LegDriver:
     def key(self, pressed: str, now: float) -> None:
         """Handle a key press, which halts the leg except in two cases.
 
-        If the person ends the leg with a key (`Leg.by_key`), a key ends its last move, and further
-        keys are ignored while the wheels come to rest. Enter is ignored in phase OPENING, because
-        the person who started the leg with Enter may still hold the key.
+        In a leg with `Leg.by_key`, a key ends the last move, and further keys are ignored. In phase
+        OPENING, Enter is ignored: the person may still hold the key that started the leg.
         """
         if self.phase is Phase.OPENING and pressed in ENTER:
             return
@@ -196,15 +189,10 @@ class LegDriver:
             )
 
     def _tolerate_briefly(self, why: str, now: float, *, disturbed: bool) -> None:
-        """Halt the leg if the reason to halt it has lasted for `DEVIATES_S`.
+        """Halt the leg if the reason `why` has lasted for `DEVIATES_S`; "" means no reason.
 
-        A shorter time is tolerated: if this computer is busy for a moment, it sends its commands
-        late, and the robot only slows down.
-
-        Args:
-            why: the reason to halt the leg now, or "" if there is none.
-            now: the present time, s.
-            disturbed: whether the leg can be repeated after it was halted for this reason.
+        If this computer is busy for a moment, it sends commands late, and the robot only slows
+        down. `disturbed` tells whether the leg can be repeated afterwards.
         """
         if not why:
             self._deviates_since = None
@@ -226,8 +214,7 @@ class LegDriver:
     def _deviation(self, state: RobotState, now: float) -> str:
         """Return a sentence about how the wheels deviate from the command, or "" if they do not.
 
-        The turn rate of a gyro is not compared. If the wheels skid, the robot turns less than
-        commanded although the wheels follow the command.
+        A gyro's turn rate is not compared: a robot that skids turns less than commanded.
         """
         if now - self._changed < OBEYED_S:
             return ""

@@ -1,10 +1,9 @@
 """The table of the methods of calibration by a guided drive, and the legs of each.
 
 UMBmark is by Borenstein & Feng, UMBmark: A Benchmark Test for Measuring Odometry Errors in Mobile
-Robots (1995): the robot drives a square in both directions, and a person measures the distance
-between its start and its end. The paper evaluates this distance with two formulas for small errors.
-Here the same measurements go into the fit of `tape_readings.py` instead, because the track of a
-robot that skids is far from the configured one.
+Robots (1995). The paper evaluates the distance between start and end of squares with two formulas
+for small errors. Here the same measurements go into the fit of `tape_readings.py` instead, because
+the track of a robot that skids is far from the configured one.
 """
 
 from __future__ import annotations
@@ -27,10 +26,7 @@ from acsard.calibration.multipliers import LEAST_M
 from acsard.terminal.prompt import Ask
 
 TAPE_M = 0.005
-"""Standard deviation, m, of the length of the straight drive that a person measures by tape.
-
-It includes the errors at both ends.
-"""
+"""Standard deviation of a straight drive measured by tape, m, with the errors at both ends."""
 
 BY_EYE = 0.07
 """Standard deviation of a heading that a person judges by eye, rad."""
@@ -45,10 +41,7 @@ FIRST_TURN = 1.2
 """Turn rate that the first turn on the spot would have without skidding, rad/s."""
 
 MISSED = 1.1
-"""Timeout of the first turn, as a multiple of the time for a circle with the widest track.
-
-If the timeout expires, the person has missed the moment at which the circle was complete.
-"""
+"""Timeout of the first turn, as a multiple of the time for a circle with the widest track."""
 
 MOST_SPIN_S = 24.0
 """Longest time of a leg with several full turns on the spot, s."""
@@ -76,8 +69,7 @@ def _at_the_edge(setup: Setup) -> str:
 def once_round(setup: Setup, until: str, asks: tuple[Ask, ...] = (), *measures: Measure) -> Leg:
     """Return the leg of one turn to the left on the spot, which the person ends with a key.
 
-    `until` says when to press the key; it completes the instruction "Press SPACE ...". `asks`
-    contains the questions after the turn, and `measures` the measurements from the answers.
+    `until` completes the instruction "Press SPACE ...".
     """
     longest = MISSED * 2 * math.pi * WIDEST
     rate = abs(setup.command(FIRST_TURN)) * setup.rate_per_command
@@ -89,8 +81,7 @@ def once_round(setup: Setup, until: str, asks: tuple[Ask, ...] = (), *measures: 
 def turns(setup: Setup, rate: float, track: float, most: int) -> int:
     """Return how many full turns on the spot fit into `MOST_SPIN_S`, from 1 to `most`.
 
-    `rate` is the true turn rate, rad/s, and `track` the ratio of effective track to wheel
-    separation.
+    `rate` is the true turn rate, rad/s. `track` is the ratio of effective track to separation.
     """
     one = setup.turn(2 * math.pi, rate, track).seconds
     return max(1, min(most, int(MOST_SPIN_S / one)))
@@ -320,17 +311,10 @@ FAST, SLOW, CURVE = 1.5, 0.75, 0.8
 """Rates that fast turns, slow turns and curves would have without skidding, rad/s."""
 
 SPIN_S, CURVE_M, TURN_RAD = 7.5, 1.2, 5.0
-"""Sizes of the moves of the methods "gyro" and "positions".
-
-They are the duration of a turn in "gyro" (s), the length of a curve (m), and the angle of a turn
-in "positions" (rad), as it would be without skidding.
-"""
+"""Sizes of moves: turns in "gyro" (s), curves (m), turns in "positions" (rad without skidding)."""
 
 PETALS = ((FAST, CURVE), (-FAST, -CURVE), (SLOW, 0.0), (-SLOW, CURVE), (FAST, -CURVE))
-"""Pairs of turn rates, rad/s: a turn on the spot in "positions", and the curve after it.
-
-The robot would have these rates without skidding.
-"""
+"""Turn rates in "positions" without skidding, rad/s: pairs of a turn on the spot and a curve."""
 
 STANDING, PAUSE, SHORT = Move(2.5), Move(1.4), Move(0.7)
 """Pauses before the first drive, between drives, and where the robot only has to stop.
@@ -393,9 +377,9 @@ def _positions(setup: Setup, track: float) -> tuple[Leg, ...]:
 
 
 def _there_and_back(setup: Setup, rate: float) -> tuple[Move, ...]:
-    """Return a curve there and back. It stays on the floor whatever the heading of the robot is.
+    """Return a curve there and back, which stays on the floor whatever the robot's heading is.
 
-    `rate` is the turn rate that the robot would have without skidding, rad/s.
+    `rate` is the turn rate without skidding, rad/s.
     """
     metres = min(CURVE_M, ROOM / 2 - setup.from_edge)
     return setup.arc(rate, metres), SHORT, setup.arc(-rate, -metres), SHORT

@@ -1,10 +1,8 @@
 """Connects a guided drive to the robot: sends the commands of a leg, and records the messages.
 
-`leg_driver.py` decides which command to send. `Recorder` keeps the samples of a leg in the same
-form as a log. The programs that send the messages stamp them with different clocks, or do not stamp
-them. The stamps of one sensor therefore show only the intervals between its messages. The recorder
-assumes that the message with the smallest delay from stamp to arrival arrived without delay. The
-fit finds the delays that remain.
+The senders stamp their messages with different clocks, or not at all. The stamps of one sensor
+therefore show only the intervals between its messages. The recorder assumes that the message with
+the smallest delay from stamp to arrival has no delay. The fit finds the delays that remain.
 """
 
 from __future__ import annotations
@@ -42,10 +40,7 @@ SHOWN_S = 0.2
 """Period in which the progress of a leg is shown, s."""
 
 RETURNS_S = 3.0
-"""Time within which a silent daemon must send its state again, s.
-
-If it does, the robot's computer was only too busy to run it, and the leg can be repeated.
-"""
+"""Time, s, in which a silent daemon must send its state again for the leg to be repeated."""
 
 POSITIONS = (Odometry, PoseStamped)
 """Types of a position message, in the order in which they are tried.
@@ -66,10 +61,9 @@ class Sensor:
         self._decoders: list[Decoder[Any]] = [Decoder(type_) for type_ in types]
 
     def receive(self, take: Take, now: float) -> int:
-        """Pass the messages that have arrived to `take`, and return their number.
+        """Pass the arrived messages to `take` with the time `now`, s, and return their number.
 
-        `now` is passed as their time of arrival, s. Raises `GuideError` if a message cannot be
-        decoded.
+        Raises `GuideError` if a message cannot be decoded.
         """
         count = 0
         while (sample := self._samples.try_recv()) is not None:
@@ -80,8 +74,7 @@ class Sensor:
     def await_first(self, what: str) -> None:
         """Wait until a message arrives on the key, and discard it.
 
-        Raises `GuideError` if none arrives within `FIRST_S`. `what` names the expected message in
-        the text of that error.
+        Raises `GuideError`, which names the message as `what`, if none arrives within `FIRST_S`.
         """
         end = time.monotonic() + FIRST_S
         while not self.receive(lambda message, now: None, 0.0):
@@ -126,10 +119,9 @@ class Sample(Struct, frozen=True):
 
 
 class Recorder:
-    """Collects the samples of one leg.
+    """Collects the samples of one leg. Each `came` is the time of arrival of a message, s.
 
-    `joints` contains the names of the wheel joints: front right, front left, rear left, rear right.
-    In all methods, `came` is the time of arrival of the message, s.
+    `joints` names the wheel joints: front right, front left, rear left, rear right.
     """
 
     def __init__(self, joints: Sequence[str]) -> None:
@@ -163,8 +155,7 @@ class Recorder:
     def log(self) -> Log:
         """Return the leg as a log.
 
-        Raises `LogError` if there are too few wheel samples, or if two wheels of a side contradict
-        each other.
+        Raises `LogError` if wheel samples are too few or if two wheels of a side disagree.
         """
         sensors: list[dict[str, Floats]] = []
         for stream, names in STREAMS.items():
@@ -177,8 +168,7 @@ class Recorder:
 def times(samples: Sequence[Sample]) -> Floats:
     """Return the times of samples on this computer's clock, s.
 
-    If any sample has no stamp, the times of arrival are used. Otherwise the times are computed from
-    the stamps (`on_arrival_clock`).
+    They come from the stamps (`on_arrival_clock`), or from the arrivals if a stamp is missing.
     """
     came = np.array([sample.came for sample in samples])
     made = np.array([math.nan if s.made is None else s.made for s in samples])
@@ -217,8 +207,7 @@ class RobotOnBus:
         Raises:
             DisturbedError: the leg was halted, and can be repeated.
             GuideError: the leg was halted for another reason.
-            LogError: the recording has too few samples of the wheels, or two wheels of a side
-                contradict each other.
+            LogError: wheel samples are too few, or two wheels of a side disagree.
         """
         recorder = Recorder(self._joints)
         self._drain()
@@ -246,7 +235,6 @@ class RobotOnBus:
         return log.runs[0]
 
     def _returns(self) -> bool:
-        """Return whether the silent daemon sends its state again within `RETURNS_S`."""
         end = time.monotonic() + RETURNS_S
         while time.monotonic() < end:
             if self._watch.look(time.monotonic()):
@@ -284,7 +272,6 @@ class RobotOnBus:
             sensor.receive(getattr(recorder, name), now)
 
     def _drain(self) -> None:
-        """Discard the messages that arrived before the leg."""
         for sensor in (self._wheels, *(sensor for sensor, _ in self._sensors)):
             sensor.receive(lambda message, now: None, 0.0)
         self._watch.look(time.monotonic())

@@ -32,26 +32,16 @@ MOST_REPEATS = 2
 """Maximum number of times that a disturbed leg is repeated on a real robot."""
 
 MOST_SIMULATED_REPEATS = 20
-"""Maximum number of times that a disturbed leg is repeated on the simulator.
-
-There the floor has no limits, and no person has to set the robot back.
-"""
+"""Maximum repeats of a disturbed leg on the simulator, where no person sets the robot back."""
 
 
 def begins_again(legs: Sequence[Leg], number: int, *, sensor: bool) -> int:
-    """Return the index of the leg to drive next after a disturbed leg.
+    """Return the index of the leg to drive next after the disturbed leg `number`.
 
-    If a sensor measures, this is the disturbed leg itself. If a person measures by tape, each
-    measurement is relative to the place where the person put the robot. The drive then goes back to
-    the last leg before which the person placed the robot.
-
-    There is one exception: some legs only need the robot's angle at their start (`angle_before`).
-    The person then measures this angle again, and the drive repeats only the disturbed leg.
-
-    Args:
-        legs: the legs of the method.
-        number: the index of the disturbed leg.
-        sensor: whether a sensor measures instead of a person.
+    If a sensor measures, this is the disturbed leg. Measurements by tape are relative to the place
+    where the person put the robot, so the drive then goes back to the last leg before which the
+    person placed the robot. The exception is a leg that needs only the robot's angle at its start
+    (`angle_before`): the person measures this angle again, and the drive repeats only that leg.
     """
     if sensor or angle_before(legs[number]):
         return number
@@ -61,8 +51,7 @@ def begins_again(legs: Sequence[Leg], number: int, *, sensor: bool) -> int:
 def angle_before(leg: Leg) -> str:
     """Return the name of the earlier leg after which a person measured the start angle of `leg`.
 
-    The turn of `leg` is the robot's angle after `leg` minus this start angle. The name is "" if the
-    measurements of `leg` need no start angle, or if they cover several legs.
+    It is "" if `leg` needs no start angle, or if its measurements cover several legs.
     """
     slants = [measure for measure in leg.measures if isinstance(measure, Slant)]
     return next((slant.since for slant in slants if slant.since and not slant.over), "")
@@ -73,15 +62,10 @@ def guide(
 ) -> Calibration:
     """Lead a person through the legs of a method of calibration, and return the result.
 
-    A disturbed leg is repeated after the person has set the robot back.
-
     Args:
-        name: the name of the method, a key of `METHODS`.
-        setup: the robot, and the speeds and lengths of its drive.
-        prompt: the prompt that instructs and asks the person.
+        name: a key of `METHODS`.
         ride: the function that drives one leg and returns its recording.
-        simulated: whether the robot is the built-in simulator. Disturbed legs are then repeated
-            more often.
+        simulated: whether the robot is the built-in simulator, which allows more repeats.
 
     Raises:
         GuideError: the drive cannot continue.
@@ -110,10 +94,7 @@ def guide(
             answers[leg, ask.name] = UNITS[ask.unit] * prompt.number(ask)
 
     def repeat(disturbed: DisturbedError) -> int:
-        """Prepare the repetition of the disturbed leg. Return the index of the leg to drive next.
-
-        Raises `disturbed` if the leg was repeated too often.
-        """
+        """Return the index of the leg to repeat from. Raise `disturbed` after too many repeats."""
         leg = legs[number]
         repeats[leg.name] = repeats.get(leg.name, 0) + 1
         if repeats[leg.name] > most:

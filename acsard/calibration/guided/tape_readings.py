@@ -1,11 +1,9 @@
 """Computes a `Calibration` from tape readings: wheel radii, effective track and improvement.
 
 A reading is one measurement of the robot's motion since its pose was last known: a distance, a
-turn, or a displacement. Each reading is compared with the path of the wheels, which
-`calibration/positions.py` computes. The fit is a Gauss-Newton fit to all readings.
-
-A reading differs from the path of the wheels because of the error of tape and eye, and because the
-robot skids. If there are enough readings, their scatter shows how much the robot skidded.
+turn, or a displacement. A Gauss-Newton fit compares all readings with the path of the wheels. A
+reading differs from this path because of the error of tape and eye, and because the robot skids. If
+there are enough readings, their scatter shows how much the robot skidded.
 """
 
 from __future__ import annotations
@@ -47,10 +45,7 @@ UNKNOWN = 1.0
 """Prior standard deviation of the mean wheel radius, as a fraction."""
 
 PRIOR_FREE = 4.0
-"""Weight of the assumed noise, which is averaged with the noise that the readings show.
-
-The weight of the readings' noise is the number of readings minus the number that the fit needs.
-"""
+"""Degrees of freedom of the assumed noise, which is combined with the scatter of the readings."""
 
 MOST_STEPS = 50
 SMALL = 1e-9
@@ -62,10 +57,7 @@ WORST_CONDITION = 1e8
 ACTIVE = [P.LEFT, P.RIGHT, P.INVERSE_TRACK, P.TRACK_GROWTH]
 
 PRECISE = 0.2
-"""Limit for the turn reading that gives the starting parameters.
-
-Its standard deviation must be below this fraction of the turn.
-"""
+"""Relative standard deviation below which a turn reading can give the starting parameters."""
 
 
 class Reading(Struct, frozen=True, dict=True):
@@ -80,7 +72,6 @@ class Reading(Struct, frozen=True, dict=True):
 
     @cached_property
     def steps(self) -> WheelSteps:
-        """The motion of the wheels in all legs of `rides`, as if they were one leg."""
         return joined(self.rides)
 
     def residual(self, prediction: float) -> float:
@@ -100,17 +91,12 @@ class Predicted(Struct, frozen=True):
 
 
 class TapeFit(Struct, frozen=True):
-    """The parameters that fit the readings best."""
-
     parameters: Floats
     covariance: Floats
     residuals: Floats
     """Measured minus predicted value of each reading."""
     held_out: Floats
-    """Measured minus predicted value of each reading, predicted by a fit to all other readings.
-
-    It is NaN if that fit fails.
-    """
+    """Residual of each reading in a fit to all other readings; NaN if that fit fails."""
 
 
 def joined(rides: Sequence[Run]) -> WheelSteps:
@@ -166,10 +152,7 @@ def fit_readings(readings: Sequence[Reading], base: Base) -> TapeFit:
 
 
 def _starting_parameters(readings: Sequence[Reading], base: Base) -> Floats:
-    """Return starting parameters that agree with the first `turned` reading.
-
-    They are near enough to the truth to find the number of whole turns of each `angle` reading.
-    """
+    """Return parameters accurate enough to find the whole turns of each `angle` reading."""
     start = base.start()
     for reading in readings:
         if reading.quantity == "turned" and reading.deviation < PRECISE * abs(reading.value):
@@ -198,8 +181,7 @@ def _compared(
 def _solved(readings: Sequence[Reading], base: Base, start: Floats) -> tuple[Floats, Floats]:
     """Return the parameters that fit the readings best, and the normal equations of this fit.
 
-    `start` contains the parameters from which the search starts. Raises `RefusedError` if the
-    readings do not determine the parameters.
+    Raises `RefusedError` if the readings do not determine the parameters.
     """
     parameters, configured = start.copy(), base.start()
     for _ in range(MOST_STEPS):
@@ -245,23 +227,16 @@ READ_M = 0.002
 """Standard deviation of a distance by tape, m, and of the placement of a robot on a line, m."""
 
 CREDIBLE = 0.85, 3.0
-"""Range of credible ratios of effective track to wheel separation.
-
-If a ratio is outside this range, a reading must be wrong.
-"""
+"""Range of credible ratios of effective track to wheel separation."""
 
 Answers = dict[tuple[str, str], float]
-"""The answers, in m or rad, by the names of leg and question.
-
-The leg is "" for the questions before the first leg.
-"""
+"""The answers, m or rad, by leg and question. The leg is "" for questions before the first leg."""
 
 
 def reading(measure: Measure, leg: str, rides: Mapping[str, Run], answers: Answers) -> Reading:
     """Return the reading that `measure` defines, from a person's answers after the leg `leg`.
 
-    `rides` maps the name of each leg to its recording. Raises `RefusedError` if the answers are
-    impossible.
+    Raises `RefusedError` if the answers are impossible.
     """
     driven = tuple(rides[name] for name in measure.over or (leg,))
     if isinstance(measure, Mean):
@@ -282,8 +257,7 @@ def reading(measure: Measure, leg: str, rides: Mapping[str, Run], answers: Answe
 def track_ratio(reading: Reading, drive: DriveConfig) -> float:
     """Return the approximate ratio of effective track to wheel separation, from a full turn.
 
-    `reading` is a `turned` reading. The next legs are planned with the ratio. Raises `GuideError`
-    if the ratio is not credible.
+    The next legs are planned with this ratio. Raises `GuideError` if the ratio is not credible.
     """
     # Use the measured radius and separation without the configured multipliers.
     base = Base(drive.wheel_radius, drive.wheel_separation, 1.0, 1.0, 1.0)
@@ -302,9 +276,8 @@ def track_ratio(reading: Reading, drive: DriveConfig) -> float:
 def slant(near: float, far: float, apart: float) -> float:
     """Return the angle in rad between the robot and a line, positive after a turn to the left.
 
-    `near` and `far` are the distances, m, of two points of the robot from the line. The points are
-    `apart` m from each other. A turn to the left decreases `near` and increases `far`. Raises
-    `RefusedError` if the distances are impossible.
+    `near` and `far` are the distances from the line, m, of two points `apart` m from each other. A
+    turn to the left decreases `near`. Raises `RefusedError` if the distances are impossible.
     """
     sine = (far - near) / apart
     if abs(sine) > 0.98:
@@ -324,20 +297,15 @@ ADVICE = (
 )
 
 TURNED, STRAIGHT = np.pi, 0.5
-"""Limits for the turn of a drive, rad.
-
-Above `TURNED`, the drive's heading error is reported as that of a turn. Below `STRAIGHT`, it is
-reported as that of a straight drive. Between the limits, it is not reported.
-"""
+"""Limits, rad: a drive counts as a turn above `TURNED`, and as straight below `STRAIGHT`."""
 
 
 def calibrated(
     tool: str, readings: Sequence[Reading], drive: DriveConfig, odometry: OdometryConfig
 ) -> Calibration:
-    """Return the calibration from tape readings.
+    """Return the calibration from readings with `tool`, such as "a tape".
 
-    `tool` names the measuring tool, such as "a tape". Raises `RefusedError` if the readings
-    contradict each other or are too inaccurate.
+    Raises `RefusedError` if the readings contradict each other or are too inaccurate.
     """
     base = Base.of(drive)
     rides = list({id(ride): ride for reading in readings for ride in reading.rides}.values())
@@ -371,8 +339,7 @@ def calibrated(
 def _improvement(readings: Sequence[Reading], base: Base, fit: TapeFit, rate: Rates) -> Improvement:
     """Return the odometry errors with the configured and with the new parameters.
 
-    The error of a reading with the new parameters is that of a fit without this reading. If that
-    fit fails, it is the error of the fit to all readings.
+    Each error with new parameters is that of a fit without the reading, unless that fit fails.
     """
     sums = {name: np.zeros(3) for name in ("turn", "straight", "place")}
     present = fit.parameters.copy()

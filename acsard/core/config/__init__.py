@@ -1,4 +1,1 @@
-"""Decodes `acsard.toml` to a frozen `Config`, or to errors that name each key and its fix.
-
-The package does no input or output.
-"""
+"""Decodes `acsard.toml` to a frozen `Config`, or to errors that name each key and its fix."""

@@ -1,7 +1,6 @@
 """Finds contradictions between the keys of a configuration, and surprising effects.
 
-A contradiction is a mistake, and is reported as a line with the key, its value and the fix. A
-surprising effect is reported as a warning, which is a sentence. The rules about motion are in
+A contradiction is an error. A surprising effect is a warning. The rules about motion are in
 `motion_rules.py`, and the rules about simulated faults in `named_faults.py`.
 """
 
@@ -28,11 +27,9 @@ from acsard.core.config.wire_time import (
 from acsard.core.values import ROOT, WHEELS
 
 LEAST_WRAP_PERIODS = 2
-"""Shortest allowed time, in control periods, until the encoder counts become ambiguous.
-
-The counts are ambiguous if a wheel turns by half their range between two feedback lines: the turn
-then looks like one in the other direction. With two periods, one lost line does no harm.
-"""
+"""Shortest allowed time, in control periods, until the encoder counts become ambiguous. They are
+ambiguous if a wheel turns by half their range between two feedback lines, which looks like a turn
+in the other direction. With two periods, one lost line does no harm."""
 
 MOST_VOLTS = 99.99
 """Highest voltage that a status line can express, V."""
@@ -145,10 +142,7 @@ def _shorter_lines(mcu: McuConfig, rate: float) -> str:
 
 
 def _count_problems(config: Config) -> list[str]:
-    """Find encoder counts that wrap too soon.
-
-    The difference of two counts would then look like a motion in the other direction.
-    """
+    """Find encoder counts that wrap too soon, so that a motion looks like its opposite."""
     counts, fastest = config.mcu.encoder_counts, config.feedback.wheel_speed / math.tau
     lasts = LEAST_WRAP_PERIODS / config.rate_hz
     if fastest * counts * lasts <= FIELD / 2:
@@ -199,10 +193,7 @@ def _gyro_problems(config: Config) -> list[str]:
 
 
 def _battery_problems(config: Config) -> list[str]:
-    """Find battery thresholds in the wrong order, and levels that the battery could never leave.
-
-    The battery leaves a level when it rises above the threshold plus the hysteresis.
-    """
+    """Find battery thresholds in the wrong order, and levels that the battery can never leave."""
     battery, found = config.battery, []
     rows = [(f"battery.{level}_below", below) for level, below in battery.bounds.items()]
     for (name, below), (worse, lower) in pairwise(rows):
@@ -368,5 +359,4 @@ RULES: tuple[Rule, ...] = (
     _ros_problems,
     *named_faults.RULES,
 )
-"""The rules. A rule that reads a key without a valid value is skipped. So each rule is a separate
-function that reads few keys."""
+"""The rules. A rule that reads an invalid key is skipped, so each rule reads few keys."""

@@ -1,6 +1,6 @@
 """Changes values in the text of an `acsard.toml`, and keeps its comments, order and line ends.
 
-This module needs the library tomlkit (extras `tls` and `write`).
+Needs the library tomlkit (extras `tls` and `write`).
 """
 
 from __future__ import annotations
@@ -13,11 +13,7 @@ from acsard.core.config.validation import write
 
 
 def edited(text: str, keys: Mapping[str, object]) -> str:
-    """Return the text with new values for some settings.
-
-    Args:
-        text: the text of the file.
-        keys: the new values by dotted key.
+    """Return the text of a file with the new values `keys`, by dotted key.
 
     Raises:
         ConfigError: the old or the new text is not a valid configuration.
@@ -42,7 +38,6 @@ def edited(text: str, keys: Mapping[str, object]) -> str:
 
 
 def _changed(text: str, keys: Mapping[str, object]) -> str:
-    """Return the text with new values, in the same form and with the same line ends."""
     import tomlkit
 
     crlf = "\r\n" in text and text.count("\r\n") == text.count("\n")
@@ -62,11 +57,7 @@ def _changed(text: str, keys: Mapping[str, object]) -> str:
 
 
 def _adjusted(array: object, value: object) -> bool:
-    """Try to change a list in place to the new value, so that the comments in it stay.
-
-    The function removes the items that are not in `value`, and appends the items that are new.
-    Return True if the list then equals `value`. Otherwise return False.
-    """
+    """Try to change a list in place, so that its comments stay. Return whether this succeeded."""
     from tomlkit.items import Array
 
     if not (isinstance(array, Array) and isinstance(value, list | tuple)):
@@ -84,11 +75,8 @@ def _adjusted(array: object, value: object) -> bool:
 def _dotted(text: str, keys: Mapping[str, object]) -> tuple[str, dict[str, object]]:
     """Insert new settings into tables that the text writes as dotted keys, like `mcu.port = ...`.
 
-    The inserted settings are dotted keys too. tomlkit would insert a table header in the middle of
-    the dotted keys.
-
-    Returns:
-        The text with the inserted keys, and the settings that were not inserted.
+    tomlkit would insert a table header in the middle of the dotted keys. Return the new text, and
+    the settings that were not inserted.
     """
     import tomlkit
 

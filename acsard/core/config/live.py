@@ -1,8 +1,7 @@
 """Lists the settings that may change while the daemon runs, and checks such a change.
 
-A change must satisfy the same rules as the file, and is applied completely or not at all. The
-caller passes the new configuration to the method `use` of each part of the robot. A setting that is
-not in the table `LIVE` takes effect only at the next start of the daemon.
+A change must satisfy the same rules as the file, and is applied completely or not at all. A setting
+that is not in the table `LIVE` takes effect only at the next start of the daemon.
 """
 
 from __future__ import annotations
@@ -26,13 +25,9 @@ WHEN: dict[When, str] = {
     "raised": "lowered only while the robot stands",
     "rest": "only while the robot stands",
 }
-"""When a setting may change, in words.
-
-- raised: the setting may be raised at any time, but lowered only while the robot stands. With a
-  lower deceleration, a driving robot could not stop in time.
-- rest: the setting may change only while the robot stands. A lower `limits.wheel_speed` would cut
-  the speed at once. After a change in `commands`, each sender must send a zero before it drives.
-"""
+"""When a setting may change, in words. With a lower deceleration ("raised"), a driving robot could
+not stop in time. A lower `limits.wheel_speed` ("rest") would cut the speed at once. After a change
+in `commands` ("rest"), each sender must send a zero before it drives."""
 
 
 class Live(Struct, frozen=True):
@@ -40,7 +35,6 @@ class Live(Struct, frozen=True):
 
     when: When
     what: str
-    """Description of the setting."""
 
 
 LIVE: dict[str, Live] = {
@@ -81,10 +75,8 @@ LIVE: dict[str, Live] = {
     "rates.diagnostics": Live("always", "how often diagnostics are published"),
     "log.level": Live("always", "lowest level that is logged"),
 }
-"""The settings that may change while the daemon runs, by their dotted keys in `acsard.toml`.
-
-The keys of a command source contain its name instead of its index. Here "*" stands for each name.
-"""
+"""The settings that may change while the daemon runs, by their dotted keys in `acsard.toml`. A key
+of a command source contains its name, not its index; "*" stands for each name."""
 
 SECTIONS: dict[str, type[Struct]] = {field.name: field.type for field in fields(Config)}
 
@@ -100,8 +92,8 @@ def live(key: str) -> Live | None:
 def flat(value: object, name: str = "") -> Iterator[tuple[str, object]]:
     """Yield the dotted name and the value of each key in nested tables.
 
-    A table in a list, such as a source, is named by the value of its key `name` and not by its
-    index. `name` is the dotted name of `value` itself, "" for the whole configuration.
+    A table in a list, such as a source, is named by its key `name` and not by its index. `name` is
+    the dotted name of `value`, "" for the whole configuration.
     """
     if isinstance(value, Mapping):
         for key, inner in value.items():
@@ -123,17 +115,14 @@ class Difference(Struct, frozen=True):
     """Value in the file."""
 
     def words(self, key: str) -> str:
-        """Return a text with the setting's key, its value in force and its value in the file."""
+        """Return a text with the setting's key and both values."""
         # If only one configuration has a command source, the other has no value for its keys.
         its, ours = ("absent" if one is None else show(one) for one in (self.its, self.ours))
         return f"{key} = {its}, not {ours}"
 
 
 def differences(runs: Config, file: Config) -> dict[str, Difference]:
-    """Return the keys whose values differ, as dotted keys with both values.
-
-    `runs` is the configuration in force, and `file` the one in the configuration file.
-    """
+    """Return both values of each key that differs between `runs`, in force, and `file`."""
     its, ours = dict(flat(effective(runs))), dict(flat(effective(file)))
     return {
         key: Difference(its.get(key), ours.get(key))
@@ -146,16 +135,10 @@ def changed(config: Config, wishes: Mapping[str, object], at_rest: bool) -> tupl
     """Return the configuration with these settings, and a description of the changes.
 
     A setting that already has the requested value is neither changed nor refused. The description
-    is "" if nothing changes.
-
-    Args:
-        config: the present configuration.
-        wishes: the requested values by dotted key.
-        at_rest: whether the robot stands.
+    is "" if nothing changes. `wishes` contains the requested values by dotted key.
 
     Raises:
-        ConfigError: the change is not allowed, so no setting is changed. The error gives the
-        reasons.
+        ConfigError: the change is not allowed, so no setting is changed. The error says why.
     """
     tables: dict[str, Any] = effective(config)
     before = dict(flat(tables))

@@ -37,9 +37,8 @@ def with_lowered(config: Config, kept: Mapping[str, float]) -> tuple[Config, lis
     """Return the configuration with the limits that were lowered before the restart, and events.
 
     `kept` contains these limits by dotted key. A limit is applied only if it is below that of
-    `config`. If the file has changed since then, the limits together may contradict it. Then they
-    are applied one by one, and each limit that contradicts the file is dropped. The events report
-    the limits that are applied and dropped.
+    `config`. If the limits together contradict a file that has changed, they are applied one by
+    one, and each contradicting limit is dropped. The events report applied and dropped limits.
     """
     limits = config.limits
     wishes: dict[str, object] = {

@@ -14,15 +14,13 @@ from acsard.core.config.partial import Rule, mistakes
 from acsard.core.config.settings import Config
 
 LEAST_JERK = 0.01
-"""Smallest allowed jerk limit, m/s3 or rad/s3. With a lower one, the robot would need over ten
-seconds to reach walking pace."""
+"""Smallest allowed jerk limit, m/s3 or rad/s3. With less, reaching walking pace takes over 10 s."""
 
 LONGEST_STOP_S = 2.0
 """Longest allowed time from full speed to rest after a stop, s. No person should wait longer."""
 
 LONGEST_RAMP_S = 5.0
-"""Longest allowed time from full speed to rest after commands have ended, s. During this time
-nobody steers the robot."""
+"""Longest allowed time from full speed to rest after commands have ended, s: nobody steers then."""
 
 HEADROOM = 1.1
 """Factor by which a healthy wheel may exceed its commanded speed for a moment."""
@@ -31,11 +29,8 @@ MOST_WHEEL_SPEED = 99.99
 """Highest wheel speed that a serial line can express, rad/s."""
 
 LONGEST_REPLY_S = 0.25
-"""Longest allowed time between two feedback lines, s.
-
-A board that is silent for one second counts as restarted. With this period, the next line arrives
-in time even if two lines are lost.
-"""
+"""Longest allowed time between two feedback lines, s. A board that is silent for one second counts
+as restarted. With this period, the next line arrives in time even if two lines are lost."""
 
 LINES_OF_EVIDENCE = 2
 """Number of feedback lines that must show a wheel fault before it is reported. One is too few."""
@@ -130,7 +125,7 @@ def _reply_problems(config: Config) -> list[str]:
 def longest_reply(fault_s: float) -> float:
     """Return the longest allowed `mcu.reply_period`, s.
 
-    `fault_s` is `feedback.fault_time`, s. It is 0 if the daemon does not check for wheel faults.
+    `fault_s` is `feedback.fault_time`, s, or 0 if the daemon does not check for wheel faults.
     """
     share = math.floor(round(fault_s / LINES_OF_EVIDENCE * 1000, 6)) / 1000
     return min(LONGEST_REPLY_S, share) if fault_s else LONGEST_REPLY_S

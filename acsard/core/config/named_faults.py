@@ -1,7 +1,6 @@
 """Reads the names of the simulator's faults, such as `mute`, `stuck_encoder=b` or `stalls=5:0.15`.
 
-The module contains the tables of the names, and finds mistakes in `[sim] faults`. The methods that
-produce the faults have the same names. They are in `core/simulator/faults.py` and
+The methods that produce the faults have the same names. They are in `core/simulator/faults.py` and
 `core/simulator/fake_mcu.py`.
 """
 
@@ -34,19 +33,15 @@ ARGUMENTS = {
     "bumper_pressed": "nnn", "bumpers_silent": "nn", "driver_fault": "nn",
     "battery": "nn",
 }  # fmt: skip
-"""Names of the simulator's faults with arguments, each with the kinds of its arguments.
-
-`m` is a motor, written as a to d and stored as 0 to 3. `n` is a number.
-"""
+"""The simulator's faults with arguments, each with the kinds of its arguments. `m` is a motor,
+written as a to d and stored as 0 to 3. `n` is a number."""
 
 INPUTS = ("estop_pressed", "estop_silent", "bumper_pressed", "bumpers_silent", "driver_fault")
 """Faults whose last two arguments are the time until the fault begins and its duration, s."""
 
 RESET = "reset"
-"""Fault that restarts the simulated board periodically. Its argument is the period, s.
-
-It needs a timer, so only `acsard sim --fault` offers it.
-"""
+"""Fault that restarts the simulated board periodically. Its argument is the period, s. It needs a
+timer, so only `acsard sim --fault` offers it."""
 
 MOTORS = "abcd"
 

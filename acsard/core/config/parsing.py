@@ -1,7 +1,4 @@
-"""Decodes the text of `acsard.toml` to a `Config`, or to an error with every mistake and its fix.
-
-The keys are defined in `settings.py`, and the rules between keys in `contradictions.py`.
-"""
+"""Decodes the text of `acsard.toml` to a `Config`, or to an error with every mistake and fix."""
 
 from __future__ import annotations
 
@@ -20,7 +17,7 @@ MAX_BYTES = 65536
 
 
 class ConfigError(AcsardError):
-    """The configuration cannot be used. `problems` lists each mistake with its fix."""
+    """Error for a configuration that cannot be used. `problems` lists each mistake with its fix."""
 
     def __init__(self, problems: list[str]) -> None:
         super().__init__("\n".join(problems))
@@ -28,10 +25,9 @@ class ConfigError(AcsardError):
 
 
 def parse(text: bytes, overrides: dict[str, dict[str, object]] | None = None) -> Config:
-    """Return the configuration in the bytes of a file. Raises `ConfigError` with every mistake.
+    """Return the configuration in `text`. Raises `ConfigError` with every mistake.
 
-    `overrides` contains values from the command line, by table and key. They replace the values of
-    the file.
+    `overrides` are values of the command line, by table and key. They replace those in `text`.
     """
     if len(text) > MAX_BYTES:
         raise ConfigError(

@@ -1,8 +1,4 @@
-"""Runs the rules between keys on a configuration in which some keys have no valid value.
-
-A rule that reads such a key is skipped, because its result would be meaningless. All other rules
-run, so that a user sees every mistake at once.
-"""
+"""Runs the rules between keys, except the rules that read a key without a valid value."""
 
 from __future__ import annotations
 
@@ -17,14 +13,11 @@ Rule = Callable[[Config], Iterable[str]]
 
 
 class InvalidKeyError(AcsardError):
-    """Raised when a rule reads a key that does not have a valid value."""
+    """Error for a rule that reads a key without a valid value."""
 
 
 def view_without(config: Config, invalid: Set[str]) -> Config:
-    """Return a view of `config` that raises `InvalidKeyError` if an invalid key is read.
-
-    `invalid` contains the dotted names of the invalid keys.
-    """
+    """Return a view of `config` that raises `InvalidKeyError` for the dotted keys in `invalid`."""
     return cast(Config, _View(config, "", invalid)) if invalid else config
 
 

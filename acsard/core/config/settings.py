@@ -315,7 +315,7 @@ class RatesConfig(Struct, frozen=True):
 
 
 TLS = "tls/"
-"""Prefix of endpoints with TLS. They present a certificate and require one from the client."""
+"""Prefix of endpoints with mutual TLS: the server and the client each present a certificate."""
 
 
 class BusConfig(Struct, frozen=True):

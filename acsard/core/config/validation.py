@@ -1,7 +1,4 @@
-"""Decodes a TOML table to a frozen struct, or to a list of mistakes with key, value and fix.
-
-The module checks only the types in the struct. The rules between keys are in `contradictions.py`.
-"""
+"""Decodes a TOML table to a frozen struct, or to a list of mistakes with key, value and fix."""
 
 from __future__ import annotations
 
@@ -24,11 +21,8 @@ _BARE_KEY = re.compile(r"[A-Za-z0-9_-]{1,80}")
 def build(cls: type[T], table: object, path: str, problems: list[str]) -> T | None:
     """Return `table` as a struct, or None if it has a mistake.
 
-    Args:
-        cls: the type of the struct.
-        table: the TOML table.
-        path: the dotted name of the table, "" for the whole document.
-        problems: the list that gets a line for each mistake.
+    `path` is the dotted name of the table, "" for the whole document. `problems` gets a line for
+    each mistake.
     """
     before = len(problems)
     made = build_partly(cls, table, path, problems, set())
@@ -98,10 +92,7 @@ def _value(
 
 
 def _finite(raw: object) -> bool:
-    """Return whether all numbers in a value are finite.
-
-    TOML allows inf and nan, and msgspec does not refuse them.
-    """
+    """Return whether all numbers are finite. TOML allows inf and nan, and msgspec accepts them."""
     if isinstance(raw, list):
         return all(_finite(item) for item in raw)
     return not isinstance(raw, float) or math.isfinite(raw)

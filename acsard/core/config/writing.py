@@ -8,10 +8,7 @@ from acsard.core.config.validation import write
 
 
 def document(table: dict[str, object], path: str = "") -> list[str]:
-    """Return the lines of a TOML document: the plain keys first, then the tables.
-
-    `path` is the dotted name of the table, or "" for the whole document.
-    """
+    """Return the lines of a TOML document, plain keys first. `path` is the table's dotted name."""
     lines: list[str] = []
     tables: list[str] = []
     for key, value in table.items():
@@ -27,7 +24,7 @@ def document(table: dict[str, object], path: str = "") -> list[str]:
 
 
 def excerpt(keys: Mapping[str, object]) -> list[str]:
-    """Return settings, which are given by dotted key, as lines of TOML with a header per table."""
+    """Return the TOML lines of settings that are given by dotted key, with a header per table."""
     lines: list[str] = []
     table = ""
     for key, value in sorted(keys.items(), key=lambda item: item[0].count(".")):

@@ -1,8 +1,4 @@
-"""The interface between the control loop and the bus. `daemon/bus/bus.py` implements it with Zenoh.
-
-The module also turns two kinds of input into counters and events: reports of the TLS gateway, and
-changes of the connections to the endpoints in `bus.connect`.
-"""
+"""The interface of the control loop to the bus. `daemon/bus/bus.py` implements it with Zenoh."""
 
 from __future__ import annotations
 
@@ -27,17 +23,16 @@ class BusInput(Struct, frozen=True):
     overrun: int = 0
     """Number of samples that were dropped because the control loop did not fetch them in time."""
     overrun_sources: tuple[str, ...] = ()
-    """The command sources whose samples are among those that `overrun` counts."""
+    """Command sources of the samples that `overrun` counts."""
     dropped: int = 0
     """Number of published messages that were dropped because the bus did not send them in time."""
     stuck: bool = False
-    """True in the first `BusInput` after sending on the bus has begun to block."""
+    """True once: in the first `BusInput` after a send on the bus has begun to block."""
     routers: RoutersStatus | None = None
     """The connections to the endpoints in `bus.connect` if they have changed, else None."""
 
 
 NOTHING = BusInput()
-"""The input of a step in which nothing has arrived, as in nearly every step."""
 
 
 class Waker(Protocol):
@@ -90,10 +85,9 @@ class GatewayFollower:
         self._last = GatewayState(0, 0, 0)
 
     def receive(self, arrival: Arrival, counters: MutableMapping[str, int]) -> int | None:
-        """Add the gateway's events since its last report to `counters`. Ignore an invalid report.
+        """Add the gateway's new events to `counters`. An invalid report is ignored.
 
-        Returns:
-            Wall-clock time at which the TLS certificate expires, ns, or None if it is unknown.
+        Returns the wall-clock time at which the TLS certificate expires, ns, or None if unknown.
         """
         try:
             report = _decoder.decode(arrival.encoding, arrival.payload)

@@ -1,14 +1,9 @@
 """Decodes samples and service queries from the bus into a `Command` or a `Request`.
 
-The whole sample is refused for each of these reasons:
-
-- The payload cannot be decoded or is too big.
-- A field that the daemon reads is NaN or infinity.
-- The key contains a wildcard.
-- The sample is a DELETE.
-- The sender id belongs to another certificate.
-
-A refused command does not keep the robot moving: it does not refresh the timeout of its source.
+A sample is refused if it is a DELETE, if its key contains a wildcard, or if its payload is too big
+or cannot be decoded. It is also refused if a field that the daemon reads is NaN or infinity, or if
+the sender id belongs to another certificate. A refused command does not refresh the timeout of its
+source.
 """
 
 from __future__ import annotations
@@ -44,39 +39,28 @@ from acsard.core.values import NS_PER_S, REST, Command, Pose, Request, Verb, Whe
 from acsard.core.values import Twist as BodyTwist
 
 BOUND_NS = 60 * NS_PER_S
-"""Time without commands after which a sender id may be used with another certificate, ns.
-
-For example, a program with a fixed id may move from the robot to a laptop.
-"""
+"""Time without commands after which a sender id may be used with another certificate, ns. For
+example, a program with a fixed id may move from the robot to a laptop."""
 
 MAX_BOUND = 1024
-"""Largest number of senders that are remembered. With one more, the sender with the oldest command
-is forgotten."""
+"""Largest number of senders to remember. The sender with the oldest command is forgotten first."""
 
 
 class Bindings:
     """Binds each sender id to the certificate with which the daemon first saw it.
 
     One id with two certificates is a mistake or a stolen secret. The daemon refuses the second
-    certificate while the sender with the first one keeps commanding.
-
-    Only acsard's own (native) keys name a certificate. A sender that commands on a ROS key is not
-    bound, and its public name never equals that of a native sender.
+    certificate while the sender with the first one keeps commanding. Only native keys name a
+    certificate. A sender on a ROS key is not bound, and its public name never equals that of a
+    native sender.
     """
 
     def __init__(self) -> None:
         self._seen: dict[str, tuple[str, int]] = {}
-        """Certificate and time of the last command (ns) of each sender.
-
-        The certificate is "" for a program on the robot's own machine.
-        """
+        """By sender: the certificate ("" on the robot itself) and the last command's time, ns."""
 
     def other(self, sender: str, certificate: str, now_ns: int) -> str | None:
-        """Return the certificate to which `sender` is bound if it is not `certificate`, else None.
-
-        If the result is None, `sender` is bound to `certificate` from now on. `now_ns` is the
-        monotonic time of the command.
-        """
+        """Bind `sender` to `certificate`, unless another one still binds it: return that one."""
         bound, seen_ns = self._seen.get(sender, (certificate, now_ns))
         if bound != certificate and now_ns - seen_ns <= BOUND_NS:
             return bound
@@ -91,19 +75,17 @@ MAX_COMMAND_BYTES = 4096
 """Largest payload in bytes. A TwistStamped in JSON is shorter than 300 bytes."""
 
 REPLACED_NS = NS_PER_S // 2
-"""Largest time by which a timestamp may be ahead of the daemon's clock, ns. Zenoh replaces a
-timestamp that is further ahead."""
+"""Zenoh replaces a timestamp that is ahead of the daemon's clock by more than this, ns."""
 
 Via = Literal["native"] | Transport
-"""The tree of keys on which a sample or query arrived: acsard's own, or that of a ROS
-transport."""
+"""The keys on which a sample or query arrived: acsard's own ("native"), or a ROS transport's."""
 
 
 class Arrival(Struct, frozen=True):
     """A sample as Zenoh delivered it."""
 
     key: str
-    """The key below `acsard/<id>/`. For a sample on a ROS key, it is the equivalent native key."""
+    """The key below `acsard/<id>/`, or the equivalent native key of a ROS key."""
     put: bool
     """True for a PUT, false for a DELETE."""
     payload: bytes
@@ -113,19 +95,14 @@ class Arrival(Struct, frozen=True):
     stamp_ns: int | None
     """Zenoh's timestamp by the wall clock, ns, if the sender or a router set it."""
     sender: str
-    """Id of the Zenoh session that stamped the sample, usually the session of the sender.
-
-    It is "" if the sample has no stamp, or if the daemon's own session stamped it. On a native key,
-    it is also "" if a connected router stamped it.
-    """
+    """Id of the Zenoh session that stamped the sample, usually the session of the sender. It is ""
+    if the sample has no stamp, or if the daemon's own session stamped it. On a native key, it is
+    also "" if a connected router stamped it."""
     via: Via = "native"
     attachment: bytes = b""
     received_ns: int | None = None
-    """Zenoh's timestamp by the wall clock, ns, if the daemon's own session set it.
-
-    The session sets one if the sample has none, or if the sample's timestamp is too far ahead of
-    the daemon's clock.
-    """
+    """Zenoh's timestamp by the wall clock, ns, if the daemon's own session set it. The session does
+    so if the sample has none, or one that is too far ahead of the daemon's clock."""
 
 
 class _TwistPayload(Struct, frozen=True, forbid_unknown_fields=True):
@@ -138,14 +115,11 @@ class _TwistPayload(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 TWIST_CDR_BYTES, STAMPED_CDR_BYTES = 52, 68
-"""Size of a Twist in CDR and the least size of a TwistStamped, bytes.
-
-If the Encoding names no type, only the size distinguishes the two.
-"""
+"""Size of a Twist in CDR and the least size of a TwistStamped, bytes. If the Encoding names no
+type, the size shows which of the two a payload is."""
 
 TWISTS = ("geometry_msgs/msg/Twist", "acsard.Twist.v1")
 STAMPED_TWISTS = ("geometry_msgs/msg/TwistStamped", "acsard.TwistStamped.v1")
-"""Type names of a TwistStamped in an Encoding. `TWISTS` contains those of a Twist."""
 
 _twists = Decoder(_TwistPayload)
 _wheels = Decoder(JointState)
@@ -165,10 +139,7 @@ class Receiver:
         self._bindings = Bindings()
 
     def command(self, arrival: Arrival) -> Command:
-        """Return the command in a sample on `cmd/…` or `wheel_cmd/…`.
-
-        Raises `DecodeError` if the sample is refused.
-        """
+        """Return the command in a sample on `cmd/…` or `wheel_cmd/…`, or raise `DecodeError`."""
         kind, source, certificate = parts(arrival.key)
         if "*" in arrival.key or "/" in certificate:
             raise DecodeError(
@@ -264,12 +235,8 @@ class Receiver:
     ) -> Request:
         """Return the request in a service query. Raises `DecodeError` if the payload is not valid.
 
-        Args:
-            verb: the service.
-            ticket: the number with which the reply names the query.
-            encoding: the Zenoh Encoding of the payload.
-            payload: the payload of the query.
-            asked_ns: the monotonic time of the query, ns.
+        `ticket` is the number with which the reply names the query. `asked_ns` is the monotonic
+        time of the query.
         """
         request = Request(verb, ticket, asked_ns=asked_ns)
         if verb not in _payloads or (SERVICES[verb].optional and not payload):
@@ -298,7 +265,6 @@ class Identity(Struct, frozen=True):
     stamp_ns: int | None = None
     """Time of sending by the sender's wall clock, ns."""
     sequence: int | None = None
-    """Sequence number that the sender gave the sample."""
     shared: bool = False
     """Whether several programs may share this identity."""
     steady: bool = False
@@ -312,10 +278,7 @@ class Identity(Struct, frozen=True):
 # keys carry commands.
 @lru_cache(64)
 def parts(key: str) -> tuple[str, str, str]:
-    """Return the kind, the source and the certificate in a command's key, "" for a missing part.
-
-    The parts of `cmd/app` are "cmd", "app" and "".
-    """
+    """Return kind, source and certificate in a command's key: "cmd", "app" and "" for `cmd/app`."""
     kind, _, rest = key.partition("/")
     source, _, certificate = rest.partition("/")
     return kind, source, certificate
@@ -401,13 +364,8 @@ def caller_name(via: Via, attachment: bytes, stamped_by: str = "") -> str:
 
     It is the public name of the sender id in the attachment, with the transport in brackets. The
     name is only a claim of the program, because Zenoh does not say on which connection a query
-    arrived. A program keeps its public name as long as it keeps its sender id. A call over
-    rmw_zenoh is named by the GID of the client. A call through a bridge has no name.
-
-    Args:
-        via: the tree of keys on which the call arrived.
-        attachment: the attachment of the call.
-        stamped_by: the id of the Zenoh session that stamped the sample, or "".
+    arrived. A call over rmw_zenoh is named by the GID of the client. A call through a bridge has no
+    name. `stamped_by` is the id of the Zenoh session that stamped the sample, or "".
     """
     if via == "rmw":
         return f"unnamed (rmw {attachment[-GID_BYTES:].hex()})"

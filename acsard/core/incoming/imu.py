@@ -3,9 +3,8 @@
 A sample is a sensor_msgs/Imu in any encoding. In JSON and msgpack only `angular_velocity` is
 required. The z axis points up, so a turn to the left is positive.
 
-If several gyros send samples, the daemon uses only those of the first gyro until it is silent. Then
-it may change to another gyro, whose first sample is marked (`GyroSample.anew`), because two gyros
-have different biases.
+The daemon uses the samples of one gyro until that gyro is silent. Then it may follow another one,
+whose first sample is marked (`GyroSample.anew`), because two gyros have different biases.
 """
 
 from __future__ import annotations
@@ -39,8 +38,6 @@ UNKNOWN = [0.0] * 9
 
 
 class _Reading(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """An Imu message in which only `angular_velocity` is required."""
-
     header: Header = Header()
     orientation: Quaternion = Quaternion()
     orientation_covariance: Covariance3 = []
@@ -57,11 +54,7 @@ class GyroFollower:
     """Decodes the samples of one gyro on the bus, and refuses those of all other gyros."""
 
     def __init__(self, own: bool = False) -> None:
-        """Start without a gyro.
-
-        `own` says that the daemon runs its own simulator. Then only the simulator's gyro is
-        accepted.
-        """
+        """Start without a gyro. With `own`, accept only the gyro of the daemon's own simulator."""
         self._own = own
         self._followed = public_name(OWN) if own else ""
         self._heard_ns = -FOLLOWED_NS
@@ -69,10 +62,7 @@ class GyroFollower:
     def receive(
         self, arrival: Arrival, counters: MutableMapping[str, int], events: list[Event]
     ) -> GyroSample | None:
-        """Return the turn rate in a sample, or None if the sample is refused.
-
-        A refusal is counted in `counters` and reported in `events`.
-        """
+        """Return the turn rate in a sample, or None after counting and reporting its refusal."""
         try:
             sample = reading(arrival)
             anew = self._follow(sender(arrival), arrival.arrived_ns)
@@ -83,10 +73,9 @@ class GyroFollower:
         return replace(sample, anew=True) if anew else sample
 
     def _follow(self, who: str, now_ns: int) -> bool:
-        """Follow the sender with the public name `who`. Return whether it replaces another sender.
+        """Follow the sender `who`, and return whether it replaces another one.
 
-        `now_ns` is the monotonic time of the sample. Raises `DecodeError` if the daemon follows
-        another gyro that is not silent.
+        Raises `DecodeError` if the gyro in use is not silent.
         """
         other = who != self._followed
         if other and (self._own or now_ns - self._heard_ns < FOLLOWED_NS):
@@ -100,10 +89,7 @@ class GyroFollower:
 
 
 def reading(arrival: Arrival) -> GyroSample:
-    """Return the turn rate in a sample. Raises `DecodeError` if the sample is not valid.
-
-    The orientation and the acceleration are ignored.
-    """
+    """Return the turn rate in a sample. Raises `DecodeError` if the sample is not valid."""
     if not arrival.put:
         raise DecodeError("not_a_put", "a DELETE is not a sample: send a PUT")
     if len(arrival.payload) > MAX_COMMAND_BYTES:

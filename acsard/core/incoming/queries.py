@@ -60,10 +60,8 @@ from acsard.core.values import ROLES, Answer, Outputs, Request
 Current = Callable[[str], Message | None]
 
 MAX_WILDCARD = 512
-"""Largest number of characters of a key expression with a wildcard.
-
-A longer one would delay the control loop. No key is that long.
-"""
+"""Largest number of characters of a key expression with a wildcard. No key is that long, and a
+longer expression would delay the control loop."""
 
 BUSY = "busy: too many queries at once; ask again"
 
@@ -91,7 +89,6 @@ class Reply(Struct, frozen=True):
     """A reply to a query."""
 
     ticket: int
-    """Number of the query that this reply answers (`Query.ticket`)."""
     key: str
     payload: bytes
     encoding: str
@@ -104,16 +101,13 @@ class _Waiting(Struct, frozen=True):
     """A service call that waits for the answer of the robot."""
 
     key: str
-    """Key of the service."""
     form: Format
     """Encoding of the reply."""
     asked: Attachment | None
     """The attachment of a call over rmw_zenoh, which the reply repeats. None for other calls."""
     ros: bool = False
-    """Whether the call came on a ROS key."""
     wish: bytes = b""
-    """The payload of a ROS request to set parameters, from which the reply is built. b"" for other
-    calls."""
+    """Payload of a ROS request to set parameters, from which the reply is built. Else b""."""
 
 
 class Queries:
@@ -128,7 +122,6 @@ class Queries:
         }
         self._parameters = Parameters(effective(config))
         self._waiting: dict[int, _Waiting] = {}
-        """Service calls that wait for the robot's answer, by ticket."""
 
     def use(self, config: Config) -> None:
         """Answer with this configuration from now on."""
@@ -142,12 +135,8 @@ class Queries:
         """Return the replies to a query, or the `Request` of a service call.
 
         The list is empty if the daemon has no value for the query. Raises `DecodeError` for a ROS
-        request that cannot be served; `refused` builds the reply to such a request.
-
-        Args:
-            query: the query.
-            current: returns the present message of a published key.
-            outputs: the outputs of the last step, or None before the first step.
+        request that cannot be served; `refused` builds the reply to such a request. `current`
+        returns the present message of a published key, and `outputs` are those of the last step.
         """
         if query.via != "native":
             return self._ros(query, 0 if outputs is None else outputs.now.wall_ns)
@@ -164,10 +153,7 @@ class Queries:
             return [Reply(query.ticket, query.topic, words, "text/plain", ok=False)]
 
     def answered(self, answer: Answer, wall_ns: int) -> Reply | None:
-        """Return the reply with the robot's answer, or None if no service call waits for it.
-
-        `wall_ns` is the wall-clock time for the attachment of the reply, ns.
-        """
+        """Return the reply with the robot's answer, or None if no service call waits for it."""
         waiting = self._waiting.pop(answer.id, None)
         if waiting is None:
             return None
@@ -245,11 +231,7 @@ class Queries:
         return [] if value is None else [(topic, type(value).__name__, value)]
 
     def _matches(self, query: Query, key: str) -> bool:
-        """Return whether the key expression of a query includes a key below `acsard/<id>/`.
-
-        If the client's expression begins with exactly these two chunks, `query.asked` omits
-        them. Otherwise `query.asked` is the complete expression, for example `acsard/*/info`.
-        """
+        """Return whether the key expression of a query includes a key below `acsard/<id>/`."""
         if "*" not in query.asked:
             return query.asked == key
         if len(query.asked) > MAX_WILDCARD:
@@ -273,10 +255,7 @@ def includes(expression: str, key: str) -> bool:
 
 
 def _fits(pattern: str, chunk: str) -> bool:
-    """Return whether `pattern`, a chunk of a key expression, includes a chunk of a key.
-
-    The pattern may be `*`, or contain `$*`, which matches any characters.
-    """
+    """Return whether `pattern` includes `chunk`. In the pattern, `$*` matches any characters."""
     if pattern == "*":
         return True
     first, *middle = pattern.split("$*")
@@ -297,8 +276,7 @@ def _fits(pattern: str, chunk: str) -> bool:
 def refused(query: Query, why: str, wall_ns: int) -> Reply | None:
     """Return the reply that refuses a query, or None if the client could not read a reply.
 
-    A ROS client does not receive the error replies of Zenoh, so it gets a response with `success`
-    or `successful` false. `why` is the reason.
+    A ROS client receives no error replies of Zenoh, so its response says that the call failed.
     """
     if query.via == "native":
         return Reply(query.ticket, query.topic, why.encode(), "text/plain", ok=False)
@@ -320,20 +298,12 @@ def most_bytes(topic: str) -> int:
 
 
 def _echo(asked: Attachment | None, wall_ns: int) -> bytes:
-    """Return the attachment of a reply, by which rmw_zenoh matches the reply with its request.
-
-    `asked` is the attachment of the request. If it is None, the reply has no attachment. `wall_ns`
-    is the wall-clock time of the reply, ns.
-    """
+    """Return the attachment by which rmw_zenoh matches a reply with its request, or b""."""
     return b"" if asked is None else Attachment(asked.sequence, wall_ns, asked.gid).pack()
 
 
 def _format(query: Query) -> Format:
-    """Return the encoding of the reply to a query.
-
-    The parameter `fmt` decides. Without it, a service call is answered in the encoding of its
-    payload, and any other query in JSON. A call without a payload is answered in JSON too.
-    """
+    """Return the encoding of a reply: `fmt`, else that of a service call's payload, else JSON."""
     for form in FORMATS:
         if query.fmt == form:
             return form
@@ -361,10 +331,7 @@ def topic_table(config: Config) -> Topics:
 
 
 def interfaces(config: Config, outputs: Outputs | None) -> Interfaces:
-    """Return the command and state interfaces of the joints, named as in ros2_control.
-
-    `outputs` are those of the last step, or None before the first step.
-    """
+    """Return the command and state interfaces of the joints, named as in ros2_control."""
     linked = outputs is not None and outputs.linked
     claimed = outputs is not None and outputs.mode == "driving"
     joints = config.joints.as_tuple()

@@ -5,10 +5,9 @@ A speed limit never raises a speed. The robot's `limits.linear_speed` is the low
 - the *setting*: the value in the configuration, or the value of the last `set`.
 - the limit in the last message, converted to m/s. A message with 0.0 lifts the limit.
 
-The class `Robot` knows nothing of speed limits. This module turns a message into a `set` request of
-its own. While a limit is in force, a client's `set` is checked against the settings without the
-limit, because they apply again when the limit is lifted. The robot then gets the client's value or
-the limit, whichever is lower. So each control step obeys the setting and the limit.
+The class `Robot` does not know speed limits: this module sends it a `set` request with the lower
+value. While a limit is in force, a client's `set` is checked against the settings without the
+limit, because they apply again when the limit is lifted.
 """
 
 from __future__ import annotations
@@ -32,19 +31,14 @@ SETTING = "limits.linear_speed"
 """The setting that a speed limit lowers."""
 
 PAUSE_NS = NS_PER_S // 10
-"""Least time between two changes of the limit, ns.
-
-Each change builds the whole configuration again, so a flood of messages would delay the control
-loop. Until the time has passed, the newest message waits.
-"""
+"""Least time between two changes of the limit, ns. Each change builds the whole configuration, so a
+flood of messages would delay the control loop. Meanwhile the newest message waits."""
 
 LIFTED = 0.0
 """Value of nav2_msgs/SpeedLimit that means "no limit", in m/s and in %."""
 
 
 class _Payload(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A SpeedLimit in which only the number is required."""
-
     header: Header = Header()
     percentage: bool = False
     speed_limit: float
@@ -64,10 +58,7 @@ class Limit(Struct, frozen=True):
 
 
 def decode_limit(arrival: Arrival, configured: float) -> Limit:
-    """Return the limit in a sample. Raises `DecodeError` if the sample is not valid.
-
-    `configured` is the configured `limits.linear_speed`, m/s. A percentage is a share of it.
-    """
+    """Return the limit in a sample, or raise `DecodeError`. 100 % is `configured`, m/s."""
     if not arrival.put:
         raise DecodeError("not_a_put", "a DELETE is not a speed limit: send a PUT")
     if len(arrival.payload) > MAX_COMMAND_BYTES:
@@ -106,25 +97,16 @@ class SpeedLimiter:
         self._asked: tuple[Request, float] | None = None
         """The client's `set` of the speed in this step, and the speed that it asks for, m/s."""
         self._held: list[Request] = []
-        """The `set` requests that wait for the next step.
-
-        While a limit is in force, a step takes only one of them.
-        """
+        """The `set` requests for the next step. With a limit in force, a step takes only one."""
 
     @property
     def settings(self) -> Config:
-        """The configuration that applies without the speed limit.
-
-        It is the same object until one of its settings changes.
-        """
+        """The configuration without the speed limit; the same object until a setting changes."""
         return self._settings
 
     @property
     def lowers(self) -> bool:
-        """Whether the limit lowers the speed.
-
-        After a limit has ended, this stays True until the robot has its higher setting again.
-        """
+        """Whether the limit lowers the speed. True until the robot has its higher setting again."""
         lowest = min(self._limit.speed, self._robot.limits.linear_speed)
         return lowest < self._settings.limits.linear_speed
 
@@ -139,11 +121,7 @@ class SpeedLimiter:
         )
 
     def receive(self, arrival: Arrival, configured: float, refusals: list[Refusal]) -> None:
-        """Store the limit in a message for the next step. Add invalid messages to `refusals`.
-
-        The robot counts and reports the refusals. `configured` is the configured
-        `limits.linear_speed`, m/s.
-        """
+        """Store the limit of a message for the next step, or add a refusal to `refusals`."""
         try:
             self._waiting = decode_limit(arrival, configured)
         except DecodeError as error:
@@ -154,8 +132,7 @@ class SpeedLimiter:
     ) -> tuple[tuple[Request, ...], list[Answer]]:
         """Return the requests for the robot in this step, and the answers to refused requests.
 
-        `requests` are those of the clients, and `now_ns` is the monotonic time of the step. Call
-        `settle` after the step.
+        `requests` are those of the clients. Call `settle` after the step.
         """
         own = self._own(now_ns)
         if self._limit is NONE and not self._held:
@@ -209,11 +186,6 @@ class SpeedLimiter:
 
         If a client has set a speed above the limit, its answer and a new event say that the speed
         will apply when the limit ends.
-
-        Args:
-            robot: The configuration of the robot after the step.
-            answers: The robot's answers to the requests of the step.
-            events: The list to which the event is added.
         """
         answers = tuple(answers)
         speed = self._settings.limits.linear_speed

@@ -1,4 +1,1 @@
-"""Handles the serial protocol of the board: lines, checksums, sample times and the link state.
-
-The package does no input or output.
-"""
+"""The serial protocol of the board: lines, checksums, sample times and link state. Does no I/O."""

@@ -27,11 +27,8 @@ from msgspec.structs import astuple
 from acsard.core.link.codec import FrameError
 
 STATUS = b"!status"
-"""First bytes of every status line.
-
-No other line begins like this. A reply begins with a letter, and the line in which a board
-identifies itself begins with `!acsard-mcu`.
-"""
+"""First bytes of every status line. A reply begins with a letter instead, and the line in which a
+board identifies itself with `!acsard-mcu`."""
 
 _LINE = re.compile(STATUS + rb"((?: [a-z]+=[^ *]+)+)(?:\*([0-9A-F]{4}))?")
 
@@ -44,7 +41,6 @@ _FORMS = {
     b"charge": re.compile(rb"(?:100|[0-9]{1,2})%"),
     b"temp": re.compile(rb"-?[0-9]{1,3}\.[0-9]"),
 }
-"""The pattern that the value of each field of a status line must match, by the field's name."""
 
 
 class BoardStatus(Struct, frozen=True):
@@ -55,11 +51,10 @@ class BoardStatus(Struct, frozen=True):
     bumpers: tuple[bool, ...] | None = None
     """Whether each bumper is pressed, in the order of the board, 1 to 4 values."""
     driver_fault: bool | None = None
-    """Whether a motor driver reports a fault."""
     volts: float | None = None
-    """Voltage of the battery, V."""
+    """Battery voltage, V."""
     amps: float | None = None
-    """Current of the battery, A. It is negative while the battery discharges."""
+    """Battery current, A. It is negative while the battery discharges."""
     charge: float | None = None
     """State of charge of the battery, 0 to 1."""
     temperature: float | None = None
@@ -67,10 +62,7 @@ class BoardStatus(Struct, frozen=True):
 
 
 def merged(status: BoardStatus, newer: BoardStatus) -> BoardStatus:
-    """Return a copy of `status` in which the fields of `newer` replace the old ones.
-
-    A field that is None in `newer` keeps its old value.
-    """
+    """Return a copy of `status` with the fields of `newer` that are not None."""
     pairs = zip(astuple(status), astuple(newer), strict=True)
     return BoardStatus(*[old if new is None else new for old, new in pairs])
 
@@ -93,14 +85,10 @@ def shown(status: BoardStatus) -> dict[str, str]:
 # A board at rest repeats the same line, so the last lines are cached.
 @lru_cache(8)
 def decode_status(line: bytes, check: bool) -> BoardStatus:
-    """Return the fields of a status line.
+    """Return the fields of a status line. Raises `FrameError` if the line is not valid.
 
-    Args:
-        line: The line without its line end. It begins with `STATUS`.
-        check: Whether a line without a checksum is refused. A wrong checksum is always refused.
-
-    Raises:
-        FrameError: The line is damaged, or it has an unknown field.
+    `line` begins with `STATUS` and has no line end. With `check`, a line without a checksum is
+    refused. A wrong checksum is always refused.
     """
     match = _LINE.fullmatch(line)
     if match is None:

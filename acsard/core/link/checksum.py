@@ -46,11 +46,7 @@ class Reading(Struct, frozen=True):
 
 
 class Checked(Struct, frozen=True):
-    """A reply with a correct CRC.
-
-    `plain` is its plain part. `sequence` is the sequence number of the command that it answers.
-    `reading` contains the sample fields, or is None for a reply without them.
-    """
+    """A reply with a correct CRC. `sequence` is the number of the command that it answers."""
 
     plain: bytes
     sequence: int
@@ -58,22 +54,13 @@ class Checked(Struct, frozen=True):
 
 
 def seal(line: bytes, sequence: int, letters: bytes = b"") -> bytes:
-    """Return the checked form of a plain command line. Both forms end with CR LF.
-
-    Args:
-        line: The plain command line.
-        sequence: The sequence number of the command, 0 to 255.
-        letters: The request letters, such as `ASK_SAMPLE`.
-    """
+    """Return a plain command line in its checked form, with CR LF. `sequence` is 0 to 255."""
     body = b"%b#%02X%b" % (line.removesuffix(b"\r\n"), sequence, letters)
     return b"%b*%04X\r\n" % (body, binascii.crc_hqx(body, 0))
 
 
 def unseal(line: bytes) -> Checked:
-    """Return the parts of a checked reply. `line` has no line end.
-
-    Raises `FrameError` if the form or the CRC is wrong. The plain part is not decoded.
-    """
+    """Return the parts of a checked reply without its line end, or raise `FrameError`."""
     match = _REPLY.fullmatch(line)
     if match is None:
         has_suffix = b"#" in line or b"*" in line

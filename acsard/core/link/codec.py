@@ -50,11 +50,7 @@ class FrameError(AcsardError):
 
 
 class Codec:
-    """An encoder and decoder of lines for one wiring of the motors.
-
-    `wheels` gives the motor letter and the direction of each wheel. With `trailing_comma`, encoded
-    lines end with a comma.
-    """
+    """An encoder and decoder of lines for one wiring of the motors."""
 
     def __init__(self, wheels: WheelMap, trailing_comma: bool = False) -> None:
         motors = (wheels.front_right, wheels.front_left, wheels.rear_left, wheels.rear_right)
@@ -90,10 +86,7 @@ class Codec:
         return ",".join(tokens).encode() + self._end
 
     def wheels(self, motors: Motors) -> Motors:
-        """Convert values of the motors a to d to values of the wheels, in `WHEELS` order.
-
-        A positive value of a wheel means forward.
-        """
+        """Convert values of the motors a to d to `WHEELS` order. There, positive means forward."""
         wheel = [0.0] * 4
         for motor, (_, index, sign) in zip(motors, self._wiring, strict=True):
             wheel[index] = motor * sign
@@ -101,10 +94,7 @@ class Codec:
         return front_right, front_left, rear_left, rear_right
 
     def decode(self, line: bytes) -> WheelSpeeds:
-        """Return the wheel speeds in `line`, which has no line end.
-
-        Raises `FrameError` if any part of the line is invalid.
-        """
+        """Return the wheel speeds in a line without its line end, or raise `FrameError`."""
         words = _words(line)
         if words is None:
             raise FrameError("malformed", line)
@@ -124,10 +114,7 @@ class Codec:
 # A robot at rest repeats the same line, so the last lines are cached.
 @lru_cache(16)
 def _words(line: bytes) -> tuple[tuple[bytes, float], ...] | None:
-    """Return the four values of a line, or None if the line is malformed.
-
-    A value is a pair such as `(b"ap", 12.5)`: motor letter with direction, absolute speed in rad/s.
-    """
+    """Return the four values of a line, such as `(b"ap", 12.5)` in rad/s, or None if malformed."""
     match = _LINE.fullmatch(line)
     if match is None:
         return None

@@ -21,18 +21,14 @@ from acsard.core.link.minimum_delay import MinimumDelay
 from acsard.core.values import NS_PER_S
 
 SLACK_COUNTS = 4
-"""Counts that a wheel may make between two readings in addition to those of its highest speed.
-
-It covers one count at each end of the interval, and play in the gears.
-"""
+"""Counts that a wheel may make between two readings beyond those of its highest speed. They cover
+one count at each end of the interval, and play in the gears."""
 
 ROUNDING_MS = 2
-"""Largest error of the time between two readings, ms. The board sends its clock in whole ms, so
-each of the two times has an error of up to 1 ms."""
+"""Largest error of the time between two readings, ms. Each reading has an error of up to 1 ms."""
 
 LATEST_MS = 1000.0
-"""Limit of the measured delay of a line, ms. A longer delay counts as this value, because the
-session restarts after such a gap anyway."""
+"""Limit of the measured delay of a line, ms. After a longer gap the session restarts anyway."""
 
 Unknown = Literal["unknown", "leap", "restarted"]
 """The reason why the difference between two readings of the encoders cannot be used.
@@ -56,9 +52,8 @@ class Encoders:
     def __init__(self, counts: int, wheel_speed: float, quiet_ns: int) -> None:
         """Start.
 
-        If the first of two readings arrived late, the board's clock seems to gain on the host's
-        clock. This gain is no larger than the delay of the first reading. If the gain exceeds
-        that delay by more than `quiet_ns`, the board has restarted.
+        After a restart the board's clock seems to jump ahead. The board has restarted if the delay
+        of a reading falls below the least delay so far by more than `quiet_ns`.
 
         Args:
             counts: Encoder counts per turn, 0 if unknown.
@@ -73,18 +68,13 @@ class Encoders:
         """Measures by how much the delay of a reading exceeds the least delay, ms."""
 
     def forget(self) -> None:
-        """Forget the last reading, so that the next reading gives no angles.
-
-        This is needed in a new session, and after a line whose angles the caller has computed as
-        speed times time.
-        """
+        """Forget the last reading, in a new session or after a line without a reading."""
         self._last = None
 
     def turned(self, reading: Reading, at_ns: int) -> Turned | Unknown:
         """Return how far the motors turned since the last reading, or why that is unknown.
 
-        `at_ns` is the monotonic time at which the host received the reading. It is used only to
-        detect a restart or a wrap.
+        `at_ns`, the monotonic time of arrival, serves only to detect a restart or a wrap.
         """
         last, self._last = self._last, (reading, at_ns)
         if last is None:

@@ -27,21 +27,17 @@ from acsard.core.link.sample_time import BRIDGED_S, FreeRunningTimes, Placed, Pr
 from acsard.core.values import NS_PER_S, Instant, WheelSpeeds
 
 APART_NS = 1000
-"""Least time between the stamps of two lines, ns. Two lines with equal stamps would look like one
-line."""
+"""Least time between the stamps of two lines, ns, because equal stamps would look like one line."""
 
 LATER = 0.05
-"""Gain of the filter for the mean offset between the two clocks, `PromptedTimes` and
-`FreeRunningTimes`."""
+"""Gain of the filter for the mean offset between `PromptedTimes` and `FreeRunningTimes`."""
 
 FULL_READ = 1024
-"""Number of bytes in a full read of the port. After a full read, the kernel may still hold more
-data."""
+"""Number of bytes in a full read of the port, after which the kernel may still hold more data."""
 
 DIFFERS = 1.5
 """`ReplyStyle` evaluates a read of the port if the number of reply periods since the last read
-differs by at least this much from the number of command lines. Scheduling alone does not cause such
-a difference. It also evaluates the next `AFTER` reads."""
+differs by at least this from the number of command lines. Scheduling alone causes less."""
 
 TELLING = 2.5
 """`ReplyStyle` decides only if its two sums (of reply periods and of command lines) differ by at
@@ -52,17 +48,16 @@ LATEST = 100.0
 
 CLEAR = 0.5
 """`ReplyStyle` decides only if the number of received lines is clearly nearer to one of its two
-sums (of reply periods and of command lines) than to the other. The two distances must differ by at
-least this share of the difference between the sums."""
+sums: the two distances must differ by at least this share of the difference between the sums."""
 
 AFTER = 3
 """Number of further reads of the port that `ReplyStyle` evaluates after one that reaches
 `DIFFERS`."""
 
 NEAR = 0.35
-"""`ReplyStyle` decides for a kind of board only if the expected and the received number of lines
-differ by at most this share of the received lines, or by 1.5 lines if that is more. It is not 0
-because some lines get lost."""
+"""`ReplyStyle` decides only if the nearer sum differs from the number of received lines by at most
+this share of that number, or by 1.5 lines if that is more. It is not 0, because some lines get
+lost."""
 
 
 class Feedback(Struct, frozen=True, gc=False):
@@ -82,8 +77,7 @@ class Feedback(Struct, frozen=True, gc=False):
     """Time at the start of `dt` in which lines were lost, s. The odometry fills this time with the
     speeds of the lines before and after it."""
     asked_ns: int | None = None
-    """Monotonic time at which the daemon wrote the command line that this line answers, ns. None if
-    that command line is unknown."""
+    """Monotonic time at which the answered command line was written, ns. None if unknown."""
     since: float = 0.0
     """Time since the previous line, s, according to the board's clock if the line contains it, else
     according to the arrival times. 0 after a silence or a gap. The plausibility checks use it."""
@@ -123,10 +117,7 @@ class ReplyStyle:
         self._left += 1
 
     def read(self, lines: int, periods: float) -> None:
-        """Process a read of the port that contained `lines` lines.
-
-        It came `periods` reply periods after the last read.
-        """
+        """Process a read of `lines` lines, `periods` reply periods after the last read."""
         left, self._left = self._left, 0
         if self._known or periods > LATEST:
             return
@@ -165,12 +156,8 @@ class Timeline:
     ) -> None:
         """Start.
 
-        Args:
-            mcu: The table `[mcu]`.
-            codec: The codec for the board's wiring.
-            wheel_speed: The highest speed that a wheel can have, rad/s.
-            quiet_ns: The duration of silence after which the link is stale, ns.
-            rate_hz: Control rate, Hz.
+        `wheel_speed` is the highest speed that a wheel can have, rad/s. After a silence of
+        `quiet_ns`, the link is stale.
         """
         self._codec, self._baud_rate, self._quiet_ns = codec, mcu.baud_rate, quiet_ns
         self._encoders = Encoders(mcu.encoder_counts, wheel_speed, quiet_ns)
@@ -188,10 +175,9 @@ class Timeline:
         self._spoilt = False
         """Whether a bad or ignored line came since the last good line."""
         self._later = 0.0
-        """Mean time by which a line is later according to `PromptedTimes` than according to
-        `FreeRunningTimes`, ns."""
+        """Mean time by which `PromptedTimes` places a line later than `FreeRunningTimes`, ns."""
         self.leaps = 0
-        """Number of lines with impossible encoder counts. For these, speed times time is used."""
+        """Number of lines with impossible encoder counts, for which speed times time is used."""
         self.restarted = False
         """Whether the board's clock in the last line shows that the board has restarted."""
 
@@ -210,11 +196,7 @@ class Timeline:
     def read(self, at: Instant, size: int, lines: int, following: int) -> None:
         """Process a read of the port that completes at least one line.
 
-        Args:
-            at: The time of the read.
-            size: The number of bytes in the read.
-            lines: The number of lines that the read completes.
-            following: The number of bytes in the read after the end of the last line.
+        The read contains `size` bytes, and `following` of them come after the end of its last line.
         """
         before, end_ns = self._end_ns, at.mono_ns
         if following:
@@ -235,10 +217,7 @@ class Timeline:
         self._prompts.read(end_ns, lines, following > 0)
 
     def spoilt(self) -> None:
-        """Skip the next line of the read, because it is bad.
-
-        If the board answers lines, also skip the command line that the bad line answers.
-        """
+        """Skip the next line of the read, which is bad, and the command line that it may answer."""
         self._rest -= 1
         self._spoilt = True
         if not self._style.speaks:
@@ -260,10 +239,8 @@ class Timeline:
             reading: The sample fields of a checked reply, None if it has none.
             following: The number of bytes in the read after the end of the line.
             length: The number of bytes of the line with its line end.
-            silent: True after a silence that makes the link stale, and for the first line of a
-                session.
-            asked_ns: Monotonic time at which the daemon wrote the line that this reply answers, ns.
-                None if unknown.
+            silent: Whether a silence made the link stale, or a session begins with the line.
+            asked_ns: Monotonic time at which the answered command line was written, ns, or None.
         """
         self._rest -= 1
         # Bytes that followed in the same read were on the wire after this line was complete.
@@ -296,11 +273,7 @@ class Timeline:
         return Feedback(at, speeds, dt, gap, wheels, bridged, asked_ns, since, came_ns)
 
     def _placed(self, asked_ns: int | None, came_ns: int) -> Placed:
-        """Return the time of the next line according to the best available clock.
-
-        `asked_ns` is the monotonic time at which the command line that it answers was written, None
-        if unknown. `came_ns` is the monotonic time at which the line was complete.
-        """
+        """Return the time of the next line, complete at `came_ns`, by the best available clock."""
         speaks, answered = self._style.speaks, None
         if asked_ns is not None or not speaks:
             answered = self._prompts.place(asked_ns)
@@ -346,7 +319,6 @@ class Timeline:
         return dt, dt - period if missing else 0.0
 
     def _compare(self, answered: Placed, slot: Placed) -> None:
-        """Update `_later` with the times that the two clocks give for one reply."""
         later_ns = answered.due_ns - slot.due_ns
         if slot.dt is None or self._last_placed.clock != "slots":
             self._later = float(later_ns)
@@ -363,11 +335,7 @@ class Timeline:
         return self._slots.usual or self._period_ns
 
     def _sampled(self, came_ns: int, placed: Placed, length: int) -> Instant:
-        """Return the sample time of a line: the time at which the board began to send it.
-
-        `came_ns` is the monotonic time at which the line was complete, and `length` is its number
-        of bytes.
-        """
+        """Return the sample time of a line of `length` bytes: when the board began to send it."""
         mono_ns = min(came_ns, placed.due_ns) - wire_ns(length, self._baud_rate)
         last, read = self._last, self._at
         wall_ns = read.wall_ns - read.mono_ns + mono_ns
@@ -378,7 +346,6 @@ class Timeline:
         return self._last
 
     def _turned(self, reading: Reading | None, at_ns: int) -> Turned | None:
-        """Return the angles that the motors turned since the previous line, or None if unknown."""
         self.restarted = False
         if reading is None or not self._counts:
             self._encoders.forget()

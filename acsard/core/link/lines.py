@@ -8,10 +8,8 @@ line end, and a board that echoes may send it back.
 from __future__ import annotations
 
 MAX_LINE = 128
-"""Largest number of bytes in a line, with its line end.
-
-A reply has about 62 bytes, and a status line with all fields about 100. A longer line is noise.
-"""
+"""Largest number of bytes in a line with its line end. A reply has about 62 bytes, and a status
+line with all fields about 100."""
 
 
 class LineReader:
@@ -21,7 +19,6 @@ class LineReader:
         self._held = b""
         self._discarding = False
         self.too_long = 0
-        """Number of lines that were discarded because they were too long."""
 
     def clear(self) -> None:
         """Forget a half-received line, because the port has been reopened."""
@@ -31,9 +28,8 @@ class LineReader:
     def feed(self, data: bytes) -> list[tuple[bytes, int]]:
         """Return the lines that `data` completes, in order and without their line ends.
 
-        Each line is paired with the number of bytes of `data` that followed it. Those bytes were
-        on the wire after the line was complete, so their number shows how long before the read the
-        line was complete.
+        Each line is paired with the number of bytes of `data` after it. This number shows how long
+        before the read the line was complete.
         """
         lines = []
         ends = data.split(b"\n")

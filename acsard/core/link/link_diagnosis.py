@@ -1,10 +1,7 @@
 """Explains to the operator why the link is not up or loses lines, and what to do.
 
-The module knows three causes of a silence: this computer did not run (`Lateness`), the board sent
-something other than replies (`SilenceDiagnosis`), or the board is silent. It also warns if a link
-that is up loses answers (`UnansweredLines`). It contains the sentences for `state.reason`, the log
-and the web page. The diagnosis does not change the state of the link, which `link_state.py`
-decides. `acsard mcu check` uses the same diagnosis.
+The sentences appear in `state.reason`, in the log and on the web page. `acsard mcu check` uses the
+same diagnosis. The diagnosis does not change the state of the link, which `link_state.py` decides.
 """
 
 from __future__ import annotations
@@ -29,7 +26,6 @@ BUSY = (
     "`top` shows which other program uses the processor; if acsard runs as the service, it has "
     "priority"
 )
-"""The advice for a computer that is late."""
 
 HOST = "this computer did not run for"
 SIMULATOR = "the built-in simulator, which is a part of this program, is late"
@@ -71,14 +67,12 @@ BLOCKED = (
     "the serial port sends nothing, because its driver accepts no bytes: unplug the "
     "adapter and plug it in again"
 )
-"""The reason that is reported while the driver of the port accepts no bytes."""
 
 WINDOW = 1000
 """Number of sent lines after which `UnansweredLines` counts the answers: 10 s at 100 Hz."""
 
 LOST = 0.02
-"""Share of sent lines without an answer above which `UnansweredLines` warns. A sound link loses no
-answer."""
+"""Share of unanswered lines above which `UnansweredLines` warns. A sound link loses no answer."""
 
 
 def is_ours(words: str) -> bool:
@@ -90,12 +84,7 @@ class Lateness:
     """Detector of late control steps. Such a step is a silence that this computer itself causes."""
 
     def __init__(self, simulated: bool, quiet_ns: int) -> None:
-        """Start.
-
-        Args:
-            simulated: Whether the board is a part of this process.
-            quiet_ns: The duration of silence after which the link is stale, ns.
-        """
+        """Start. `quiet_ns` is the duration of silence after which the link is stale, ns."""
         self._simulated, self._least_ns = simulated, SHARE * quiet_ns
         self._looked_ns: int | None = None
         self.late_s = 0.0
@@ -104,10 +93,10 @@ class Lateness:
         """Time between the last two steps, s, if it was too long. Otherwise 0."""
 
     def look(self, now_ns: int, good: bool) -> bool:
-        """Record a control step. `good` says whether the step received a good line.
+        """Record a step, and return whether a good line ends a silence that this computer caused.
 
-        Return True if a good line ends a silence that this computer caused. The simulator runs on
-        this computer, so with it the result is True for every good line.
+        `good` says whether the step received a good line. The simulator runs on this computer, so
+        with it the result is True for every good line.
         """
         before_ns, self._looked_ns = self._looked_ns, now_ns
         passed_ns = 0 if before_ns is None else now_ns - before_ns
@@ -117,10 +106,7 @@ class Lateness:
         return good and (late_s > 0.0 or self._simulated)
 
     def words(self, link: LinkState) -> str:
-        """Return a sentence about a link in the state `link`.
-
-        If this computer caused the silence, the sentence says so.
-        """
+        """Return a sentence about the link, or about this computer if it caused the silence."""
         if link == "stale" and self.late_s:
             return (
                 f"{HOST} {self.late_s:.2f} s, so it received nothing from the microcontroller: "
@@ -134,12 +120,10 @@ class Lateness:
 class Heard(Struct):
     """The bytes and lines received in an interval.
 
-    `lines` is the number of lines and `good` the number of good ones. `last` is the last bad line,
-    or the last bytes while no line has ended.
+    `last` is the last bad line, or the last bytes while no line has ended.
     """
 
     size: int = 0
-    """Number of bytes."""
     lines: int = 0
     good: int = 0
     statuses: int = 0
@@ -176,10 +160,7 @@ class Heard(Struct):
 
     @property
     def counted(self) -> str:
-        """Text with the number of received lines and the last bad line.
-
-        If no line has ended, the text gives the number of bytes and the last bytes.
-        """
+        """Number of received lines and the last bad line (or the last bytes), as text."""
         if self.statuses and not self.lines:
             return "only status lines were received"
         if not self.size:
@@ -212,10 +193,7 @@ class SilenceDiagnosis:
 
     def __init__(self) -> None:
         self.heard: Heard | None = None
-        """The bytes and lines of the last complete interval.
-
-        None until the first interval has ended, and while the link is up.
-        """
+        """The bytes and lines of the last complete interval, if any. None while the link is up."""
         self.now = Heard()
         """The bytes and lines of the present interval."""
         self._since_ns: int | None = None
@@ -226,10 +204,7 @@ class SilenceDiagnosis:
             self.heard, self.now, self._since_ns = None, Heard(), None
 
     def judge(self, now_ns: int) -> bool:
-        """Process a control step in which the link is not up.
-
-        Return True if an interval has ended and the diagnosis has changed.
-        """
+        """Process a step without a link. Return True if an interval ends with a new diagnosis."""
         if self._since_ns is None:
             self._since_ns = now_ns
         if now_ns - self._since_ns < PATIENCE_NS:
@@ -242,29 +217,20 @@ class SilenceDiagnosis:
 class UnansweredLines:
     """Warning that the board does not answer all lines while the link is up.
 
-    No other check detects this loss. After every `WINDOW` sent lines, the number of sent lines is
-    compared with that of good lines. The warning is given once, and again only after a window
-    without loss or after the link was lost. A sound board that reports by its own clock causes the
-    same warning if it sends fewer lines than the daemon and mcu.reply_period is not set.
+    After every `WINDOW` sent lines, the number of sent lines is compared with that of good lines.
+    The warning is given once, and again only after a window without loss or after the link was
+    lost. A sound board that reports by its own clock causes the same warning if it sends fewer
+    lines than the daemon and mcu.reply_period is not set.
     """
 
     def __init__(self, reply_period: float) -> None:
-        """Start. `reply_period` is the setting mcu.reply_period, s.
-
-        It is 0 for a board that answers lines. With any other value nothing is compared.
-        """
+        """Start. `reply_period` is mcu.reply_period, s. Unless it is 0, nothing is compared."""
         self._own_clock = reply_period > 0.0
         self._since: tuple[int, int] | None = None
         self._told = False
 
     def look(self, sent: int, good: int, linked: bool) -> Event | None:
-        """Process the numbers of lines sent and received so far. Return the warning if it is due.
-
-        Args:
-            sent: Number of lines sent since the start.
-            good: Number of good lines since the start.
-            linked: Whether the link is up.
-        """
+        """Process the numbers of sent and good lines since the start. Return a due warning."""
         if not linked or self._own_clock:
             self._since, self._told = None, False
             return None
@@ -297,10 +263,7 @@ def words(
     lateness: Lateness,
     longest_reply: float,
 ) -> str:
-    """Return a sentence about the link of an open port.
-
-    `longest_reply` is the largest value that mcu.reply_period may have, s.
-    """
+    """Return a sentence about an open port's link. `longest_reply` limits mcu.reply_period, s."""
     if link.state in ("booting", "stale"):
         heard = hearing.heard
         if check.trouble:
@@ -333,8 +296,7 @@ def _sparse(sparse_s: float, longest_reply: float) -> str:
 def check_event(check: Negotiation, wants_samples: bool) -> Event:
     """Return the event for the newly agreed form of the lines, plain or checked.
 
-    It is a warning if the board does not support the check, or if `wants_samples` is true and the
-    board sends no counts.
+    It is a warning if the board lacks the check, or the counts that `wants_samples` asks for.
     """
     fallen = check.state == "plain" or (wants_samples and check.state == "checked")
     text = f"the serial lines are {check.in_force}"

@@ -39,10 +39,7 @@ TABLE: dict[tuple[State, Sign], State] = {
     ("stale", "opened"): "booting",
     ("stale", "trusted"): "up",
 }
-"""Maps (state, sign) to the next state. A pair without an entry does not change the state.
-
-A sign is an input of the state machine.
-"""
+"""Maps (state, sign) to the next state. A pair without an entry does not change the state."""
 
 WORDS: dict[State, str] = {
     "down": "the serial port is closed; it is being reopened",
@@ -55,12 +52,10 @@ WATCHDOG_S = 0.3
 """If the board receives no valid line from the daemon for this time, s, it stops the motors."""
 
 GOOD_LINES = 3
-"""Number of good lines in a row before the link is trusted. A board that has just reset may print
-anything for a while."""
+"""Good lines in a row before the link is trusted. A board may print anything after a reset."""
 
 BAD_LINES = 5
-"""Number of bad lines in a row on a checked link after which the daemon asks for the check
-again."""
+"""Number of bad lines in a row on a checked link after which the daemon renegotiates the check."""
 
 SPARSE = 2
 """Number of silences in a row, each ended by one good line, after which the board's lines count as
@@ -77,15 +72,11 @@ class Link:
         self.sparse_s = 0.0
         """Time between the last two good lines, s, after `SPARSE` silences in a row; else 0."""
         self._silences = 0
-        """Number of silences in a row, each ended by one good line."""
         self._good_in_row = self._bad_in_row = 0
         self._heard_ns: int | None = None
 
     def sign(self, sign: Sign) -> None:
-        """Process an input of the state machine, and change the state by `TABLE`.
-
-        Every input except "trusted" resets the count of good lines.
-        """
+        """Change the state by `TABLE`. Every input but "trusted" resets the count of good lines."""
         self.state = TABLE.get((self.state, sign), self.state)
         if sign == "trusted":
             return
@@ -101,10 +92,7 @@ class Link:
         return self._heard_ns is None or now_ns - self._heard_ns > self.quiet_ns
 
     def good(self, at_ns: int) -> int | None:
-        """Count a good line, which arrived at `at_ns` on the monotonic clock.
-
-        Return the time since the previous good line, ns, or None for the first of a session.
-        """
+        """Count a good line. Return the time since the previous one of the session, ns, if any."""
         since_ns = None if self._heard_ns is None else at_ns - self._heard_ns
         if not self.silent(at_ns):
             self.excuse()
@@ -119,11 +107,7 @@ class Link:
         return since_ns
 
     def excuse(self) -> None:
-        """Reset the count of silences.
-
-        This is done if a line came in time, if this computer caused the silence, or if the port was
-        opened or closed.
-        """
+        """Reset the count of silences: a line was in time, or the board was not the cause."""
         self._silences, self.sparse_s = 0, 0.0
 
     def missed(self) -> None:
@@ -132,10 +116,7 @@ class Link:
             self._good_in_row = 0
 
     def bad(self) -> bool:
-        """Count a bad line. Return True if it is exactly the BAD_LINES-th in a row.
-
-        On a checked link, the caller must then ask for the check again.
-        """
+        """Count a bad line. If True, the caller must renegotiate the check of a checked link."""
         self.missed()
         self._bad_in_row += 1
         return self._bad_in_row == BAD_LINES
@@ -146,10 +127,7 @@ class Link:
         return self._bad_in_row >= BAD_LINES
 
     def judge(self, now_ns: int, may_rise: bool) -> None:
-        """Make the link stale after a silence, or up after GOOD_LINES good lines in a row.
-
-        `may_rise` is False if the link must not become "up" now.
-        """
+        """Make the link stale after a silence, or up after GOOD_LINES good lines if `may_rise`."""
         silent = self.silent(now_ns)
         if self.state == "up":
             if silent:

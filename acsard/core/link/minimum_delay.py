@@ -18,24 +18,16 @@ class MinimumDelay:
     """The delay of the last event in excess of the minimum, in the caller's unit of time."""
 
     def __init__(self, drift: float = DRIFT, most: float = math.inf) -> None:
-        """Start.
-
-        `drift` is the largest relative drift of the clocks. An excess above `most`, in the caller's
-        unit of time, is treated as `most`.
-        """
+        """Start. `drift` is a relative error. An excess above `most` is treated as `most`."""
         self._drift, self._most = drift, most
         self.late = 0.0
-        """Delay of the last event in excess of the minimum."""
 
     def add(self, ours: float, theirs: float) -> float:
         """Process an event, and return its delay in excess of the minimum so far.
 
         If the result is negative, this event is the new minimum. The allowed drift is not
-        subtracted from the result, unlike in `measure`.
-
-        Args:
-            ours: time since the last event by this computer's clock.
-            theirs: time since the last event by the other clock.
+        subtracted from the result, unlike in `measure`. `ours` is the time since the last event by
+        this computer's clock, and `theirs` by the other clock.
         """
         later = self.late + ours - theirs
         self.measure(ours, theirs)
@@ -45,8 +37,7 @@ class MinimumDelay:
     def measure(self, ours: float, theirs: float) -> float:
         """Return by how much the delay of an event exceeds the minimum and the allowed drift.
 
-        If the result is negative, the delay is less than the minimum. This method does not change
-        the minimum; `believe` does. The arguments are those of `add`.
+        The minimum does not change until `believe` is called. The arguments are those of `add`.
         """
         self.late = self.late + ours - theirs - self._drift * ours
         return self.late

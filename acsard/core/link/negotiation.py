@@ -1,7 +1,7 @@
 """Negotiates with the board whether lines have a check: a sequence number and a CRC.
 
-This is done at every opening of the port, and again after a gap in the lines. A question is a stop
-line with the check (`checksum.py`). A board that knows the check answers it in the same form. The
+The negotiation runs when the port is opened, and again after a gap in the lines. A question is a
+stop line with the check (`checksum.py`). A board that knows the check answers in the same form. The
 states of the negotiation are:
 
 - off: mcu.link_check is "off". Lines are plain, and the daemon does not ask for the check.
@@ -17,10 +17,9 @@ states of the negotiation are:
 Once a board has answered with the check, the daemon accepts no plain replies until the port is
 reopened, because noise must not end the check.
 
-The module also detects echoes: the daemon's own lines come back, because TX and RX are connected or
-the far end echoes. A question that comes back is detected at once, because no reply has request
-letters. `EchoDetector` detects the echo of plain lines, and of checked lines that ask for no
-sample.
+The module also detects echoes of the daemon's own lines: TX and RX are connected, or the far end
+echoes. A question that comes back is detected at once, because no reply has request letters.
+`EchoDetector` detects the echo of plain lines, and of checked lines that ask for no sample.
 """
 
 from __future__ import annotations
@@ -73,9 +72,7 @@ IN_FORCE: dict[State, str] = {
 }
 
 Trouble = Literal["", "echo", "forgotten", "unknown"]
-"""The reason why the negotiation of the check does not end; "" if there is none.
-
-The robot cannot drive until the negotiation ends.
+"""The reason why the negotiation does not end, so that the robot cannot drive; "" if there is none.
 
 - echo: the lines that the daemon sends come back
 - forgotten: the board answered with the check before and does not now
@@ -104,8 +101,7 @@ WINDOW = 64
 so a reply cannot match the wrong line."""
 
 LATE_NS = round(WATCHDOG_S * NS_PER_S)
-"""Largest delay of an answer, ns. After a longer delay the board's watchdog has stopped the
-motors."""
+"""Largest delay of an answer, ns. Later, the board's watchdog has stopped the motors."""
 
 BLIND_PERIOD_NS = NS_PER_S // 10
 """Least time between two stop lines while the board sends nothing, ns. 10 Hz is enough to wake the
@@ -115,12 +111,10 @@ THINKING_NS = 30_000_000
 """Time that the board and the drivers may take to answer, in addition to the wire time, ns."""
 
 FEW_SAMPLES = 5
-"""Number of correct replies in a row without a sample after which the daemon stops asking for
-samples."""
+"""Number of correct replies in a row without a sample after which the daemon asks for none."""
 
 REPORTS = 20
-"""Number of reports in a row that must equal sent lines to count as an echo. At 100 Hz they take
-0.2 s."""
+"""Number of reports in a row that must equal sent lines to count as an echo: 0.2 s at 100 Hz."""
 
 CHANGE = 2.0
 """A run of reports counts as an echo only if its speed changes add up to this, rad/s. The change
@@ -141,14 +135,10 @@ class Throttle:
 
     def __init__(self) -> None:
         self.last_ns: int | None = None
-        """Monotonic time of the last event that passed, None before the first."""
         self._before_ns: int | None = None
 
     def lets(self, now_ns: int, wait_ns: int) -> bool:
-        """Return whether an event may pass now, and record it as the last event if it may.
-
-        It may pass if the last event was at least `wait_ns` ago.
-        """
+        """Return whether the last event was at least `wait_ns` ago. If so, record a new event."""
         if self.last_ns is not None and now_ns - self.last_ns < wait_ns:
             return False
         self._before_ns, self.last_ns = self.last_ns, now_ns
@@ -190,9 +180,7 @@ class EchoDetector:
         self._lines = self._reports = 0
         self._runs: dict[int, _Run] = {}
         """The runs by offset: the number of a report minus the number of the line that it equals.
-
-        The offset is constant in an echo, whatever the delay of the echo is.
-        """
+        In an echo, the offset is constant."""
 
     def left(self, line: bytes) -> None:
         """Record that `line`, with its line end, was written to the port."""
@@ -200,10 +188,7 @@ class EchoDetector:
         self._sent.append(line.removesuffix(b"\r\n"))
 
     def report(self, line: bytes, speeds: WheelSpeeds) -> bool:
-        """Process a report, and return whether the last reports are an echo.
-
-        `line` is the report without its line end, and `speeds` are the speeds in it.
-        """
+        """Process a report without its line end. Return whether the last reports are an echo."""
         self._reports += 1
         runs: dict[int, _Run] = {}
         if line not in self._sent:
@@ -224,14 +209,10 @@ class EchoDetector:
 
 
 class Negotiation:
-    """The negotiation of the check (sequence number and CRC) with the board.
-
-    It makes the questions, adds the check to lines, and matches each reply with the line that it
-    answers.
-    """
+    """Negotiates the check with the board, adds it to lines, and matches replies with lines."""
 
     def __init__(self, mcu: McuConfig, stop: bytes) -> None:
-        """Start. `mcu` is the table `[mcu]`, and `stop` is the plain stop line."""
+        """Start. `stop` is the plain stop line."""
         self._stop, self._wanted = stop, mcu.link_check
         self.state: State = "off" if mcu.link_check == "off" else "waking"
         self.trouble: Trouble = ""
@@ -240,16 +221,12 @@ class Negotiation:
         first = (ASK_SAMPLE,) * TRIES if mcu.wants_samples else (ASK_NOTHING,)
         self._letters = (*first, *(b"",) * TRIES)
         self._question = b""
-        """The last question without its line end, b"" if it has no request letters. Replies have no
-        request letters, so a received line that equals this one is an echo."""
+        """The last question without its line end, b"" if it has no request letters."""
         longest = line_bytes(mcu.trailing_comma, check=True, sample=mcu.wants_samples)
         self._answer_ns = THINKING_NS + 4 * wire_ns(longest, mcu.baud_rate)
         self._sequence = 0
         self._made: tuple[int, int] | None = None
-        """Sequence number and time (ns) of the last checked line that was made.
-
-        None after `settle` has recorded whether the line was written.
-        """
+        """Sequence number and time, ns, of the last checked line, until `settle` is called."""
         self._pending: deque[tuple[int, int]] = deque(maxlen=WINDOW)
         """Sequence numbers and times (ns) of the written lines that are not answered yet."""
         self._knows = False
@@ -273,11 +250,7 @@ class Negotiation:
         return IN_FORCE[self.state]
 
     def begin(self, fresh: bool = False) -> None:
-        """Start the negotiation again, and forget the lines that wait for answers.
-
-        If `fresh` is True, the port has been opened. Then also forget what is known about the
-        board.
-        """
+        """Start the negotiation again. With `fresh`, also forget what is known about the board."""
         self._sign("gap")
         self._begin(fresh)
         if fresh:
@@ -323,14 +296,7 @@ class Negotiation:
         self._echo.left(line)
 
     def settle(self, went: bool, late_ns: int = 0) -> None:
-        """Record whether the port wrote the last line.
-
-        A line that was not written gets no answer.
-
-        Args:
-            went: Whether the port wrote the line.
-            late_ns: The time from making the line to writing it, ns.
-        """
+        """Record whether the port wrote the last line, `late_ns` ns after the line was made."""
         if self._made is not None and went:
             sequence, made_ns = self._made
             self._pending.append((sequence, made_ns + late_ns))
@@ -350,8 +316,7 @@ class Negotiation:
     def echoed(self, line: bytes) -> bool:
         """Return whether `line`, which has no line end, or an earlier line is an echo.
 
-        A line that equals the last question is an echo. After an echo, every received line is
-        rejected until the port is reopened.
+        After an echo, every received line is rejected until the port is reopened.
         """
         if self._question and line == self._question:
             self.trouble = "echo"
@@ -369,18 +334,14 @@ class Negotiation:
         return self.echoes
 
     def heard_plain(self) -> None:
-        """Record that a valid plain line came while the daemon asks for the check.
-
-        The board is awake, so unanswered questions are counted from now on.
-        """
+        """Record a valid plain line while asking. From now on, unanswered questions are counted."""
         self._sign("heard")
 
     def answered(self, reply: Checked, at_ns: int) -> int:
-        """Process a correct reply, and return when the line that it answers was written.
+        """Process a correct reply, and return when its line was written, monotonic ns.
 
-        `at_ns` is the time at which the reply was read. Both times are ns on the monotonic clock.
-        Raises `FrameError` unless the reply answers a line that was written within `LATE_NS` and is
-        not answered yet.
+        `at_ns` is the monotonic time at which the reply was read. Raises `FrameError` unless the
+        reply answers a line that was written within `LATE_NS` and is not answered yet.
         """
         while self._pending and at_ns - self._pending[0][1] > LATE_NS:
             self._pending.popleft()

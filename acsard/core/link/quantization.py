@@ -17,8 +17,7 @@ from acsard.core.link.feedback import Feedback
 from acsard.core.link.whole_counts import WholeCounts
 
 FLICKER = 0.0105
-"""Smallest change of a wheel's reported speed that counts as a step, rad/s. A smaller change is
-only rounding."""
+"""Smallest change of a wheel's reported speed that is more than rounding, rad/s."""
 
 BLOCK = 64
 """Number of steps of a reported speed that form a block, from which `Steps.size` is learned. Even
@@ -54,8 +53,7 @@ class Steps:
     One count more or less in a period T changes the reported speed by 2 pi / (counts per turn x T).
     This is 31 rad/s at 20 counts per turn and 100 Hz. Such a step is not an acceleration. The size
     is learned from the reported speeds, so it is right whether the firmware divides counts by its
-    nominal period, divides them by the measured time, or filters the speeds. Steps that counts
-    cause recur. A damaged line causes only two steps, one away from the speed and one back.
+    nominal period, divides them by the measured time, or filters the speeds.
 
     `size` is in rad/s. It is `math.inf` until `FIRST` steps were found.
     """
@@ -97,15 +95,12 @@ class Coarseness:
 
     def __init__(self) -> None:
         self._rows = NOTHING, NOTHING
-        """The speeds of the last two lines, rad/s."""
         self._jumps, self._wheel = [0.0] * 4, 0
         """Filtered jump of each wheel, rad per line, and the wheel examined in the last line."""
 
     def add(self, speeds: Motors, own: float) -> bool:
-        """Process the speeds of a line, rad/s. Return whether an encoder looks coarse.
-
-        Each call examines one wheel, in turn. `own` is the time since the previous line, s.
-        """
+        """Process speeds in rad/s, `own` s after the last line. Return whether an encoder is
+        coarse."""
         (older, before), self._rows = self._rows, (self._rows[1], speeds)
         if speeds == NOTHING == before or own > LONGEST_LINE:
             return False
@@ -123,10 +118,7 @@ class CountRecovery:
         """Start. `counts` is the configured number of counts per turn, 0 if unknown."""
         self._configured, self._whole = counts, WholeCounts(counts)
         self.coarse_lines = 0
-        """Number of lines with speeds that jump as with coarse encoders.
-
-        They are counted only if the counts per turn are not configured.
-        """
+        """Number of lines whose speeds jump as with coarse encoders, if the counts are unknown."""
         self.forget()
 
     def forget(self) -> None:
@@ -135,15 +127,11 @@ class CountRecovery:
         self._coarseness = Coarseness()
         self._wheels = tuple(Steps() for _ in NOTHING)
         self._reported, self._steps = NOTHING, NOTHING
-        """`_reported` is the learned quantization step of each wheel, rad/s. `_steps` is the same,
-        limited by `ALIKE`."""
+        """Learned quantization steps of the wheels, rad/s, without and with the bound `ALIKE`."""
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """Configured counts per turn of each wheel.
-
-        0 means that the counts are unknown or that the speeds are not whole counts.
-        """
+        """Configured counts per turn of each wheel. 0 if unknown or contradicted by the speeds."""
         return (self._configured if self._whole.believed else 0,) * 4
 
     def look(self, line: Feedback) -> Feedback:

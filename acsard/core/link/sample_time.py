@@ -4,8 +4,8 @@ The time at which the host reads a line is not the time of its sample: an adapte
 a stall of the host may have held the line back. `FreeRunningTimes` finds the period of a board that
 reports by its own clock. For a board that answers each command line, `PromptedTimes` uses the times
 at which the command lines were written. Each class is a clock. For each read of the port, call
-`read` on both. Then `place` returns the time of each line of the read as a `Placed`. `forget`
-starts a new session. `feedback.py` chooses the better clock for each line.
+`read` on both classes. Then `place` returns the time of each line of the read. `feedback.py`
+chooses the better clock for each line.
 """
 
 from __future__ import annotations
@@ -25,8 +25,7 @@ Read = tuple[int, int]
 """A read of the port: the time at which its last line was complete, ns, and its number of lines."""
 
 BRIDGED_S = 1.0
-"""Longest time without lines that the odometry fills from the lines before and after it, s. After a
-longer time the board may have been reset."""
+"""Longest time without lines that the odometry fills, s. Later the board may have been reset."""
 
 
 class Placed(Struct, frozen=True, gc=False):
@@ -40,8 +39,7 @@ class Placed(Struct, frozen=True, gc=False):
     clock: Literal["slots", "prompts", "reads"]
     due_ns: int
     dt: float | None = None
-    """Time since the previous line with a time from this clock, s. None for the first such line,
-    and for the clock "reads"."""
+    """Time since the previous line with this clock, s. None for the first line and for "reads"."""
     bridged: float = 0.0
     """The part of `dt` whose lines were lost, s."""
     early: bool = False
@@ -97,12 +95,10 @@ SURE = 0.15
 limit by more than one period and the margin, a line before it is missing."""
 
 EARLY = 0.25
-"""If a line comes before its expected time by more than this number of periods, `FreeRunningTimes`
-gives its clock up as wrong."""
+"""If a line is early by more than this number of periods, `FreeRunningTimes` drops its clock."""
 
 LOSSY_READS = 0.45
-"""If lines seem to be missing before more than this share of the reads in two windows, the period
-is wrong."""
+"""If more than this share of the reads in two windows follow missing lines, the period is wrong."""
 
 
 class FreeRunningTimes:
@@ -147,12 +143,10 @@ class FreeRunningTimes:
         """Number of slots that were recently counted as missing lines. They may be taken back."""
         self._lag = self._batch = self._gain = self._share = 0.0
         """`_lag` is the usual lateness x of a read, and `_batch` the usual time between two reads,
-        both in slots. `_gain` is the gain g. `_share` is the share of the reads in the last window
-        before which lines are missing."""
+        both in slots. `_gain` is the gain g. `_share` is the share of reads in the last window
+        after missing lines."""
         self._batched: bool = False
-        """Whether an adapter batches lines."""
         self._alone: bool = False
-        """Whether the last read had a single line."""
         self._least: float
         self._begin(0)
         self.forget()
@@ -160,8 +154,7 @@ class FreeRunningTimes:
     def forget(self) -> None:
         """Give up the clock, because the lines contradict it or may come from another board."""
         self.period: float | None = None
-        """Nominal period of the firmware, s. None while no clock is known. The firmware divides its
-        counts by this period even if its clock is fast or slow."""
+        """Nominal period by which the firmware divides its counts, s. None without a clock."""
         self._reads: list[Read] = []
         self._last: float | None = None
         """Slot of the last line that the present clock has placed. None before the first one."""
@@ -169,12 +162,9 @@ class FreeRunningTimes:
     def read(self, at_ns: int, lines: int, drained: bool) -> int:
         """Process a read, and return the number of lines that were lost before its last line.
 
-        The result is -1 if one slot too many had been counted as missing.
-
-        Args:
-            at_ns: The monotonic time at which the last line was complete.
-            lines: The number of lines in the read.
-            drained: Whether the read took all data that the kernel held.
+        The result is -1 if one slot too many had been counted as missing. `at_ns` is the monotonic
+        time at which the last line was complete. `drained` says whether the read took all data that
+        the kernel held.
         """
         self._stretch = 1.0
         since, self._before = at_ns - self._before, at_ns
@@ -211,10 +201,7 @@ class FreeRunningTimes:
         return self._lag * self.usual
 
     def place(self, behind: int) -> Placed | None:
-        """Return the time of the line that lies `behind` lines before the last one of the read.
-
-        Missing slots are spread over the lines of the read. Return None while no clock is known.
-        """
+        """Return the time of the line `behind` lines before the last, or None without a clock."""
         period, last = self.period, self._last
         if period is None:
             return None
@@ -227,15 +214,10 @@ class FreeRunningTimes:
         return Placed("slots", due_ns, passed * period, missing * period)
 
     def _missing(self, ahead: float, since: float, lines: int, drained: bool) -> int:
-        """Return the number of missing lines that this read proves.
+        """Return the number of missing lines that this read proves, or -1 if it refutes the clock.
 
-        Return -1 if the read contradicts the clock.
-
-        Args:
-            ahead: The lateness x of the read's last line, slots.
-            since: The time since the last read, slots.
-            lines: The number of lines in the read.
-            drained: Whether the read took all data that the kernel held.
+        `ahead` is the lateness x of the read's last line, and `since` is the time since the last
+        read, both in slots. `drained` is as in `read`.
         """
         lag = min(self._lag, 0.5)
         if ahead < -0.5 + 0.6 * lag:
@@ -311,10 +293,7 @@ class FreeRunningTimes:
             yield own, LATE_BATCHED, slope
 
     def _begin(self, at_ns: int) -> None:
-        """Start a window: reset its least lateness `_least`, reads `_count` and slots `_passed`.
-
-        `_lossy` counts the reads in the window before which lines are missing.
-        """
+        """Start a window. `_lossy` counts its reads before which lines are missing."""
         self._window_ns: int = at_ns
         self._least = math.inf
         self._count: int = 0
@@ -322,10 +301,7 @@ class FreeRunningTimes:
         self._lossy: int = 0
 
     def _follow(self, at_ns: int) -> None:
-        """Correct the clock by the equations (2) and (3) of the class at the end of a window.
-
-        If the window contradicts the clock, give the clock up instead.
-        """
+        """Correct the clock by the equations (2) and (3) after a window, or give it up as wrong."""
         least, slots = self._least, self._passed
         lossy, self._share = self._share, self._lossy / self._count
         if (lossy + self._share) / 2 > LOSSY_READS or least < -EARLY or least == math.inf:
@@ -344,8 +320,7 @@ class FreeRunningTimes:
     def _nominal(self) -> float:
         """Return the nominal period of the firmware, s.
 
-        It is a configured period or a whole number of milliseconds if the measured period is close
-        to one of them. Otherwise it is the measured period.
+        It is a configured period or a whole number of ms, if one is close. Else it is as measured.
         """
         seconds = self.usual / NS_PER_S
         for known in self._known:
@@ -356,10 +331,7 @@ class FreeRunningTimes:
 
 
 def _slots(reads: list[Read], period: float = math.inf) -> list[int]:
-    """Return the number of the slot of each read's last line. The first read has the slot 0.
-
-    With a finite `period`, ns, slots without a line are counted too: their lines are missing.
-    """
+    """Return the slot of each read's last line. With a `period`, ns, missing lines count too."""
     slots = [0]
     for (before, _), (at, lines) in pairwise(reads):
         slots.append(slots[-1] + max(lines, round((at - before) / period)))
@@ -377,9 +349,9 @@ def _slope(reads: list[Read], slots: list[int]) -> float:
 
 
 def _latest(reads: list[Read], slots: list[int], period: float) -> tuple[float, list[float]]:
-    """Return the time of slot 0, ns: the latest one for which no read comes before its slot.
+    """Return the latest time of slot 0, ns, at which no read comes before its slot.
 
-    Also return the lateness of each read that follows from this time, in slots. `period` is in ns.
+    Also return the resulting lateness of each read, in slots. `period` is in ns.
     """
     offsets = [at - slot * period for (at, _), slot in zip(reads, slots, strict=True)]
     first = min(offsets)
@@ -430,12 +402,10 @@ RISE_NS = 20_000
 forgotten. A link is batched if an adapter holds replies back, so that one read contains several."""
 
 LOSING = 0.005
-"""Gain of the filter for the share of lost replies. It is small, because a filter over 20 reads
-would reach `LOSSY` after only two lost replies."""
+"""Gain of the filter for the share of lost replies. With 1/20, two losses would reach `LOSSY`."""
 
 LOSSY = 0.03
-"""Share of lost replies above which a batched link counts as lossy. Then any command line may lack
-its reply."""
+"""Share of lost replies above which a batched link counts as lossy: any line may lack its reply."""
 
 SEVERAL = 0.15
 """If more than this share of the reads of the port have several lines, an adapter batches lines.
@@ -446,8 +416,7 @@ THINKS = 0.6
 adapter whose packets fill line by line also varies it, but only for a quarter of a second."""
 
 BATCH_NS = 2_000_000
-"""Mean deviation of the reply delay above which an adapter holds the lines back, ns. No board
-causes as much."""
+"""Mean deviation of the reply delay above which an adapter, not the board, is the cause, ns."""
 
 
 class PromptedTimes:
@@ -464,10 +433,7 @@ class PromptedTimes:
     """
 
     def __init__(self, soonest_ns: int) -> None:
-        """Start. `soonest_ns` is the least possible delay of a reply, ns.
-
-        It is the time that a line and its reply take on the wire.
-        """
+        """Start. `soonest_ns` is the time that a line and its reply take on the wire, ns."""
         self._soonest = soonest_ns
         self._left: deque[int] = deque(maxlen=MEMORY)
         self.forget()
@@ -487,15 +453,12 @@ class PromptedTimes:
         self._first = False
         """Whether the usual delay was measured on the first reply alone."""
         self._spread = self._least = 0.0
-        """`_spread` is the mean deviation from the usual reply delay, and `_least` the long-term
-        least delay, both ns."""
+        """Mean deviation from the usual reply delay, and the long-term least delay, ns."""
         self._soon = 0.0
         """Least delay of the last replies, ns."""
         self._sent: int | None = None
-        """Time at which the last command line was written, ns."""
         self._apart = self._missing = 0.0
-        """`_apart` is the usual time between two command lines, ns. `_missing` is the share of lost
-        replies."""
+        """The usual time between two command lines, ns, and the share of lost replies."""
         self._last: int | None = None
         """Time at which the last answered command line was written, ns. If its reply came later or
         sooner than usual because of the board, the time is shifted by the difference."""
@@ -509,8 +472,8 @@ class PromptedTimes:
         oldest first. An adapter that stalled may still deliver their replies."""
         self._at, self._alone, self._since = 0, False, 0
         self._base, self._batch, self._losses = 0.0, 2e7, 0.0
-        """For a batched link: `_base` is the least reply delay and `_batch` the usual time between
-        two reads, both ns. `_losses` is the share of lost replies."""
+        """For a batched link: the least reply delay and the usual time between two reads, both ns,
+        and the share of lost replies."""
         self._several = 0.0
         """Filtered share of the reads that have several lines."""
         self._thinking = 0.0
@@ -541,10 +504,7 @@ class PromptedTimes:
         self._left.append(at_ns)
 
     def read(self, at_ns: int, lines: int, cut: bool = False) -> None:
-        """Process a read of `lines` lines. The last was complete at the monotonic time `at_ns`.
-
-        `cut` says whether the read ends within a further line.
-        """
+        """Process a read of `lines` lines at `at_ns`. If `cut`, a part of another line follows."""
         alone, since = lines == 1, at_ns - self._at
         self._at, self._alone, self._since = at_ns, alone, since
         self._several += FAST * ((not alone) - self._several)
@@ -561,8 +521,7 @@ class PromptedTimes:
     def place(self, asked_ns: int | None = None) -> Placed | None:
         """Return the time of the next reply, or None if no command line waits for a reply.
 
-        `asked_ns` is the monotonic time at which the answered line was written, if the reply names
-        that line. Otherwise it is None.
+        `asked_ns` is the monotonic time at which the answered line was written, if it is known.
         """
         left = self._left
         if asked_ns is not None:
@@ -605,11 +564,7 @@ class PromptedTimes:
             self._passed = self._left.popleft()
 
     def _begin(self) -> None:
-        """Discard the command lines that are older than the one which the first reply answers.
-
-        The usual delay is not known yet. So the reply is assigned to the newest line that was sent
-        early enough for the wire time of a line and its reply.
-        """
+        """Assign the first reply to the newest command line that was sent early enough for it."""
         left = self._left
         while len(left) > 1 and left[1] + self._soonest <= self._at:
             self._passed = left.popleft()
@@ -634,16 +589,12 @@ class PromptedTimes:
             self._spread = 0.0
 
     def _weigh(self, lines: int, since: int, cut: bool) -> None:
-        """Give up the command lines whose replies were lost. This is for a read of a batched link.
+        """Give up the command lines whose replies a batched link has lost.
 
         The last reply of a batch shows the loss: it is too late for the line that it would answer.
         If many replies are lost, the first reply of the batch decides instead, because the board
-        made it after the previous batch.
-
-        Args:
-            lines: The number of replies in the batch.
-            since: The time since the previous read, ns.
-            cut: Whether the read has a part of one more reply.
+        made it after the previous batch. `since` is the time since the previous read, ns. `cut`
+        says whether the read has a part of one more reply.
         """
         left, at, began = self._left, self._at, lines + cut
         judged, soonest = lines - 1, float(self._soonest)

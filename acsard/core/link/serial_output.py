@@ -12,8 +12,7 @@ from acsard.core.config.wire_time import wire_ns
 from acsard.core.values import Instant, Received
 
 Offered = Literal["sent", "superseded", "down"]
-"""The result for a line: it was sent, it was dropped in favour of a newer one, or the port is
-closed."""
+"""The result for a line. "superseded" means that the line was dropped in favour of a newer one."""
 
 
 class Port(Protocol):
@@ -37,20 +36,14 @@ class Port(Protocol):
         """
 
     def offer(self, line: bytes, now: Instant) -> Offered:
-        """Write a line that the control loop made at `now`, and return the result.
-
-        If the port does not write the line at once, it drops the line.
-        """
+        """Write a line that was made at `now`, at once or not at all, and return the result."""
 
 
 class SerialOutput:
     """The output of a serial port from its opening to its closing. It has no queue."""
 
     def __init__(self, baud_rate: int, stop: bytes, period_ns: int) -> None:
-        """Start. `stop` is the plain stop line.
-
-        Any other line is dropped if it is older than `period_ns` ns when it is to be written.
-        """
+        """Start. `stop` is the plain stop line. Only stops may be older than `period_ns` ns."""
         self._baud_rate, self._stop, self._period_ns = baud_rate, stop, period_ns
         self._still = stop.removesuffix(b"\r\n")
         """The bytes with which every stop line begins, plain or checked."""
@@ -62,14 +55,10 @@ class SerialOutput:
     def prepare(self, line: bytes, made_ns: int, now_ns: int, kernel_bytes: int) -> bytes | None:
         """Return the bytes to pass to the kernel for a line, or None if the line must be dropped.
 
-        A line is dropped for each of these reasons:
-
-        - The kernel still has bytes to send.
-        - The previous line was still on the wire when the line was made.
-        - The line is older than a period because the process did not run. This does not apply to a
-          stop.
-
-        The first line after the port was opened is replaced by a plain stop.
+        A line is dropped if the kernel still has bytes to send, or if the previous line was still
+        on the wire when the line was made. Unless it is a stop, it is also dropped if it is older
+        than a period because the process did not run. The first line after the port was opened is
+        replaced by a plain stop.
 
         Args:
             line: The line with its line end.
@@ -86,16 +75,11 @@ class SerialOutput:
         return (b"\r\n" if self._torn else b"") + goes
 
     def took(self, line: bytes, handed: bytes, taken: int, now_ns: int) -> Offered:
-        """Record how many bytes the kernel accepted, and return "sent" or "superseded".
+        """Record that the kernel accepted `taken` bytes of `handed`, and return the result.
 
-        The result is "superseded" if the kernel did not accept all bytes, or if `prepare` had
-        replaced the line by a stop. The remaining bytes are dropped.
-
-        Args:
-            line: The line that was given to `prepare`.
-            handed: The bytes that `prepare` returned.
-            taken: The number of these bytes that the kernel accepted.
-            now_ns: The present monotonic time, ns.
+        `handed` are the bytes that `prepare` returned for `line`. The result is "superseded" if the
+        kernel did not accept all bytes, or if `prepare` had replaced the line by a stop. The
+        remaining bytes are dropped.
         """
         whole = taken == len(handed)
         if whole:

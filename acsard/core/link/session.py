@@ -1,9 +1,8 @@
 """Follows one serial port through openings, losses and silences.
 
-The session decodes the bytes that the port received, and returns the good lines as feedback with
-their times. It also encodes the lines for the board. `negotiation.py` decides whether lines are
-plain or checked, and `link_state.py` decides whether the link may carry motion. The link does not
-come up while the session asks the board whether it can send checked lines.
+The session turns received bytes into feedback, and speeds into lines for the board.
+`negotiation.py` decides whether lines are plain or checked, and `link_state.py` decides whether the
+link may carry motion. The link does not come up while the session asks the board for checked lines.
 """
 
 from __future__ import annotations
@@ -31,7 +30,6 @@ NAMES: dict[LinkState, EventName] = {
     "up": "link_up",
     "stale": "link_stale",
 }
-"""The event that reports a change to each state of the link."""
 
 LONG_GAP_NS = 1 * NS_PER_S
 """Duration of a gap in the lines of either direction after which the MCU may have been reset, ns.
@@ -57,11 +55,8 @@ class McuSession:
     ) -> None:
         """Start without a port.
 
-        Args:
-            mcu: The table `[mcu]`.
-            rate_hz: Control rate, Hz.
-            wheel_speed: The highest speed that a wheel can have, rad/s.
-            longest_reply: The highest value that mcu.reply_period may have, s.
+        `wheel_speed` is the highest speed that a wheel can have, rad/s. `longest_reply` is the
+        highest value that mcu.reply_period may have, s.
         """
         self.codec = Codec(mcu.wheels, mcu.trailing_comma)
         self._lines = LineReader()
@@ -71,7 +66,6 @@ class McuSession:
         self.status = BoardStatus()
         """The last received value of each field of the status lines."""
         self.status_ns: int | None = None
-        """Monotonic time of the last status line, ns; None before the first one."""
         self.quiet_ns = int(NS_PER_S * max(0.1, 4 / rate_hz, 3 * mcu.reply_period))
         """Duration of silence after which the link is stale, ns."""
         self.negotiation = Negotiation(mcu, self.codec.stop)
@@ -97,8 +91,7 @@ class McuSession:
         self._opened = 0
         self._blind, self._just_blind = Throttle(), False
         self._made: tuple[bytes, int] | None = None
-        """The last line that was made and its time (ns), until it is known whether the port wrote
-        it."""
+        """The last line and its time, ns, until it is known whether the port wrote the line."""
         self._left_ns = 0
         """Monotonic time at which the port wrote the last line or was opened, ns."""
         self._held_up = False
@@ -122,13 +115,9 @@ class McuSession:
     ) -> list[Feedback]:
         """Process the state of the port and the received bytes, and return the good lines in order.
 
-        Args:
-            now: Both clocks at this step.
-            port_open: Whether the port is open.
-            opened: The number of openings of the port. If it has changed, a new session starts.
-            received: The bytes since the last update.
-            unsent: True if the port did not write the last line.
-            late_ns: The time from making the last line to writing it, ns.
+        A new session starts if `opened`, the number of openings of the port, has changed. `unsent`
+        is true if the port did not write the last line. `late_ns` is the time from making that line
+        to writing it, ns.
         """
         self.restarted, self._starting_over, self.events = False, False, []
         if self.statuses:
@@ -185,10 +174,7 @@ class McuSession:
         return None if self._heard_ns is None else (now_ns - self._heard_ns) / NS_PER_S
 
     def words(self, port_trouble: str = "") -> str:
-        """Return a sentence about the link.
-
-        `port_trouble` is the reason why the port is closed, "" if there is none.
-        """
+        """Return a sentence about the link. `port_trouble` says why the port is closed."""
         if self.link == "down" and port_trouble:
             return port_trouble
         if self.blocked:
@@ -199,20 +185,14 @@ class McuSession:
 
     @property
     def note(self) -> str:
-        """Text that says whether lines are checked or plain now, to append to the reason of a mode.
-
-        It is "" with `mcu.link_check = "off"`.
-        """
+        """The form of the lines, to append to a mode's reason. "" if no check is configured."""
         check = self.negotiation
         return "" if check.state == "off" else f" (serial lines {check.in_force})"
 
     # sessions
 
     def _settle(self, went: bool, port_open: bool, late_ns: int) -> None:
-        """Record whether the port wrote the last line. If not, the next one may be sent at once.
-
-        `late_ns` is the time from making the line to writing it, ns.
-        """
+        """Record whether the port wrote the last line, `late_ns` ns after the line was made."""
         made = self._made
         if made is None:
             return
@@ -242,10 +222,7 @@ class McuSession:
         self.negotiation.begin(fresh=True)
 
     def _restart(self, how: str) -> None:
-        """Start a new session, because the MCU has restarted and its motors stand still.
-
-        `how` describes the restart for the event.
-        """
+        """Start a new session, because the MCU has restarted and its motors stand still."""
         if self.link == "up":
             self.events.append(Event("mcu_restarted", f"the microcontroller {how}", "warning"))
         self._link.sign("restarted")
@@ -293,13 +270,11 @@ class McuSession:
         self._rejected.clear()
 
     def _bad(self) -> None:
-        """Count a bad line. After several in a row, a checked link asks for the check again."""
         if self._link.bad() and self.negotiation.checked:
             self._link.sign("damaged")
             self.negotiation.begin()
 
     def _announce(self) -> None:
-        """Add an event for the link and one for the check if they have changed."""
         link, check = self._link.state, self.negotiation
         before = self._announced
         self._announced = (link, check.in_force, bool(check.trouble), self.blocked)
@@ -318,7 +293,6 @@ class McuSession:
     # lines
 
     def _read(self, piece: Received) -> list[Feedback]:
-        """Return the good lines of one read, and pass each line to the timeline."""
         lines, timeline, feedback = self._lines.feed(piece.data), self._timeline, []
         link, came = self._link, piece.data
         statuses = [line for line, _ in lines if line.startswith(STATUS)]
@@ -393,11 +367,7 @@ class McuSession:
         size: tuple[int, int],
         asked_ns: int | None,
     ) -> Feedback:
-        """Return the feedback of a good line.
-
-        `size` is the number of bytes in the read after the line, and the number of bytes of the
-        line with its line end.
-        """
+        """Return the feedback of a good line. `size` is (`following`, `length`) as in `place`."""
         self.good_lines += 1
         before_ns, self._heard_ns = self._heard_ns, read_at.mono_ns
         if before_ns is not None and read_at.mono_ns - before_ns >= LONG_GAP_NS:

@@ -41,19 +41,13 @@ MOST_TRIES = 16
 line. It bounds the time of a control step."""
 
 BY_CHANCE = 0.05
-"""Largest accepted probability that random speeds look like whole counts.
-
-The probability grows with each number of counts that is tried. Above the limit, speeds that look
-like whole counts prove nothing.
-"""
+"""Largest accepted probability that random speeds look like whole counts. It grows with each number
+of counts that is tried. Above the limit, speeds that look like whole counts prove nothing."""
 
 EXACT = 0.3
 """Largest accepted difference, in counts, between a whole number of counts and speed times host
-time.
-
-It applies if the speeds alone prove nothing, as with fine encoders. It also helps to decide whether
-the counts of a line include those of the missing line before it.
-"""
+time. It applies if the speeds alone prove nothing, as with fine encoders. It also helps to decide
+whether a line covers the missing line before it."""
 
 WIDE, WIDE_S = 0.6, 0.005
 """Largest error of the host's time between two samples: `WIDE` times this time plus `WIDE_S` s."""
@@ -126,11 +120,8 @@ class WholeCounts:
         time. Return None if the firmware does not report whole counts, or if the speeds are not all
         0 but none exceeds its rounding error.
 
-        Args:
-            speeds: The speeds in the line, rad/s.
-            own: The host's estimate of the time since the previous line, s.
-            gap: The time from the last good line to the missing previous line, s. 0 if none is
-                missing.
+        `own` is the host's estimate of the time since the previous line, s. `gap` is the time from
+        the last good line to the missing previous line, s, 0 if none is missing.
         """
         self.covers_gap = False
         before, self._before = self._before, speeds
@@ -195,22 +186,15 @@ class WholeCounts:
         )
 
     def _fits(self, number: int, fastest: float, want: float) -> bool:
-        """Return whether the host's time `want`, s, agrees with `number` counts of a wheel.
-
-        `fastest` is the speed of that wheel, rad/s.
-        """
+        """Return whether `number` counts of a wheel with speed `fastest` fit the time `want`, s."""
         return abs(number - want * fastest / self.angle) <= EXACT
 
     def _number(self, speeds: Motors, fastest: float, want: float) -> tuple[int, bool | None]:
         """Return n, the counts of the fastest wheel, or 0 if the line does not show n.
 
         The second value is True if the speeds prove that they are whole counts, False if they prove
-        the opposite, and None if they prove nothing.
-
-        Args:
-            speeds: The speeds in the line, rad/s.
-            fastest: The largest absolute value of the speeds, rad/s.
-            want: The host's estimate of the time between the samples, with the carried time, s.
+        the opposite, and None if they prove nothing. `want` is the host's estimate of the time
+        between the samples, with the carried time, s.
         """
         count = fastest / self.angle
         exact = want * count  # counts if the host's time were right

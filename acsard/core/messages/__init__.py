@@ -1,4 +1,1 @@
-"""Defines the messages on the bus: types, the table of keys, encodings, reports and signatures.
-
-The package does no input or output.
-"""
+"""The messages on the bus: types, table of keys, encodings, reports and signatures. Does no I/O."""

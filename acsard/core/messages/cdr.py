@@ -2,11 +2,7 @@
 
 The codec is derived from the type of the struct. It writes plain CDR (XCDR1), little endian, after
 the encapsulation header of 4 bytes. It reads both byte orders. Numbers are aligned relative to the
-byte after the header.
-
-The codec of each type is compiled once to a list of parts. Neighbouring numbers form one part,
-which a single call packs, so a message needs fewer calls than it has fields. `cdr_types.py` reads
-the types.
+byte after the header. Neighbouring numbers are packed by a single call, which is faster.
 """
 
 from __future__ import annotations
@@ -64,10 +60,7 @@ class Cdr(Generic[T]):
         return bytes(out)
 
     def decode(self, payload: bytes) -> T:
-        """Return the message in a payload. Bytes after the message are ignored as padding.
-
-        Raises `CdrError`, and no other exception, if the payload is not valid.
-        """
+        """Return the message in a payload, or raise only `CdrError`. Trailing bytes are ignored."""
         order = _ORDERS.get(payload[:2])
         if order is None or len(payload) < 4:
             raise CdrError(
@@ -135,13 +128,7 @@ def _whole(code: str, value: Any) -> Any:
 
 @cache
 def _layout(order: str, codes: str, start: int) -> struct.Struct:
-    """Return the layout of numbers, each aligned to its size.
-
-    Args:
-        order: the byte order, "<" or ">".
-        codes: the code of each number in the struct module.
-        start: the position of the first number modulo 8.
-    """
+    """Return the layout of numbers, each aligned to its size. `start` is the position modulo 8."""
     text, at = order, start
     for code in codes:
         pad = -at % SIZES[code]
@@ -203,8 +190,6 @@ class _Numbers:
 
 
 class _Text:
-    """A part: a string of a message."""
-
     def __init__(self, get: Get) -> None:
         self._get = get
 

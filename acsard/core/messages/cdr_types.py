@@ -13,15 +13,13 @@ from typing import Any
 from msgspec import inspect
 
 SIZES = {"d": 8, "f": 4, "q": 8, "Q": 8, "i": 4, "I": 4, "B": 1, "?": 1}
-"""Size of a number in CDR, in bytes, by its code in the struct module. CDR aligns a number to its
-size."""
+"""Size and alignment of a number in CDR, in bytes, by its code in the struct module."""
 
 Build = Callable[[Iterator[object]], object]
-"""Function that returns a struct. It takes the values of the fields from an iterator, those of
-nested structs included."""
+"""Function that builds a struct from the values of its fields, those of nested structs included."""
 
 Limit = tuple[float, float]
-"""Least and greatest value of a number, in the number's unit."""
+"""Least and greatest value of a number."""
 
 
 def struct_info(cls: Any) -> inspect.StructType:
@@ -43,10 +41,7 @@ def leaves(info: inspect.StructType, path: str = "") -> Iterator[tuple[str, insp
 
 
 def builder(info: inspect.StructType) -> Build:
-    """Return a function that builds this struct from the values of its fields.
-
-    In place of a nested struct, the iterator gives the values of its fields one by one.
-    """
+    """Return a function that builds this struct from its fields' values, nested ones included."""
     kinds = [plain(field.type) for field in info.fields]
     children = [builder(kind) if isinstance(kind, inspect.StructType) else next for kind in kinds]
     return lambda values: info.cls(*[child(values) for child in children])

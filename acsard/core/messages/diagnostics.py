@@ -1,16 +1,12 @@
 """Makes the rows of the message `diagnostics`, which rqt_robot_monitor shows.
 
-The rows come from the outputs of the last step (`Outputs`) and the robot's state (`Snapshot`).
-
-The levels have these meanings:
-
 - OK: the robot needs no attention.
-- WARN: there is a condition that a person should know about.
-- ERROR: there is a condition that keeps the robot from driving.
+- WARN: a person should know about a condition.
+- ERROR: a condition keeps the robot from driving.
 
-As long as the daemon runs, each message has the same rows. If a row were missing from a message,
-rqt_robot_monitor would show the row as stale. The rows of the board and of its battery appear when
-the board first reports a value for them, and then they stay.
+Each message has the same rows, because rqt_robot_monitor shows a missing row as stale. The rows of
+the board and of its battery appear when the board first reports a value for them, and then they
+stay.
 """
 
 from __future__ import annotations
@@ -44,8 +40,7 @@ from acsard.core.values import (
 OK, WARN, ERROR = 0, 1, 2
 
 OF_MODE = {"stopped": WARN, "fault": ERROR}
-"""Diagnostic level of the modes in which the robot waits for a person to clear a latch. The other
-modes have the level OK."""
+"""Level of the modes in which the robot waits for a person to clear a latch. Other modes are OK."""
 
 BOARD = {
     "": (OK, "no emergency-stop input"),
@@ -85,13 +80,9 @@ def diagnostics(
 ) -> DiagnosticArray:
     """Return the message with all rows.
 
-    Args:
-        config: the configuration of the daemon.
-        outputs: the outputs of the last step.
-        snapshot: the state of the robot.
-        certificate: the level and the description of the certificate's validity, as `expiry`
-            returns them. The description is "" without a certificate, and then there is no row.
-        speed_limit: the speed limit that lowers a setting, in words; "" if none does.
+    `certificate` is the level and the description that `expiry` returns. The description is ""
+    without a certificate, and then there is no row. `speed_limit` is the speed limit that lowers a
+    setting, in words; "" if none does.
     """
     mode = {"mode": outputs.mode, "source": outputs.source}
     rows = [
@@ -190,10 +181,7 @@ def _wheels(doubt: WheelsStatus, counters: dict[str, int]) -> Row:
 
 
 def _board(config: Config, snapshot: Snapshot) -> list[Row]:
-    """Return a list with the row of the board's inputs.
-
-    The list is empty if the board reports no input and the configuration requires none.
-    """
+    """Return the row of the board's inputs, or [] if no input is reported or required."""
     safety, bumpers = config.safety, snapshot.bumpers
     required, needed = safety.estop == "required", safety.bumpers and safety.bumper != "off"
     if not (snapshot.board or required or needed):
@@ -217,10 +205,7 @@ def _board(config: Config, snapshot: Snapshot) -> list[Row]:
 
 
 def _battery(config: Config, snapshot: Snapshot) -> list[Row]:
-    """Return a list with the row of the battery.
-
-    The list is empty if the board reports no battery and no threshold is set.
-    """
+    """Return the row of the battery, or [] if no battery is reported and no threshold is set."""
     status, bounds = snapshot.battery, config.battery.bounds
     if status is None:
         return [Row("battery", WARN, battery.MISSING, {})] if bounds else []
@@ -237,7 +222,6 @@ def _battery(config: Config, snapshot: Snapshot) -> list[Row]:
 
 
 def _gyro(config: Config, gyro: GyroStatus) -> list[Row]:
-    """Return a list with the row of the gyro, empty if no gyro is configured."""
     if gyro.does == "off":
         return []
     values, track = {"delay_s": f"{gyro.delay:.3f}"}, ""
@@ -256,7 +240,6 @@ def _gyro(config: Config, gyro: GyroStatus) -> list[Row]:
 
 
 def _routers(endpoints: Sequence[str], routers: RoutersStatus) -> list[Row]:
-    """Return a list with one row for the endpoints in `bus.connect`, empty without endpoints."""
     missing, peers = routers.missing, routers.peers
     values = dict.fromkeys(endpoints, NOT_YET) | dict.fromkeys(routers.connected, "connected")
     values |= dict.fromkeys(missing, "not connected") | dict.fromkeys(peers, NO_ROUTER)
@@ -271,7 +254,6 @@ def _routers(endpoints: Sequence[str], routers: RoutersStatus) -> list[Row]:
 
 
 def _recording(recording: Recording) -> list[Row]:
-    """Return a list with the row of the recorder, empty if recording is switched off."""
     if not recording.where:
         return []
     missing = {"steps_missing": str(recording.missing)}
@@ -280,12 +262,10 @@ def _recording(recording: Recording) -> list[Row]:
 
 
 def _latch_file(trouble: str | None) -> list[Row]:
-    """Return a list with the row of the latch file, empty if latches are not stored."""
     if trouble is None:
         return []
     return [Row("latch file", WARN if trouble else OK, trouble or "written", {})]
 
 
 def _counted(counters: dict[str, int], kind: str) -> dict[str, str]:
-    """Return the counters whose names begin with `kind`, as text."""
     return {name: str(count) for name, count in counters.items() if name.startswith(kind)}

@@ -36,10 +36,7 @@ _text = msgspec.json.Encoder()
 
 
 class DecodeError(AcsardError):
-    """Error for a payload that cannot be decoded.
-
-    `reason` is the last part of the name of the counter in which such payloads are counted.
-    """
+    """Error for a payload that cannot be decoded. `reason` is the end of its counter's name."""
 
     def __init__(self, reason: str, text: str) -> None:
         super().__init__(text)
@@ -50,18 +47,12 @@ _AT_BYTE = re.compile(r"JSON is malformed: (.*) \(byte (\d+)\)")
 
 
 def encoding_name(form: Format, type_name: str = "") -> str:
-    """Return the Zenoh Encoding of a payload that the daemon publishes.
-
-    `type_name` is the name of the message type, or "" for a payload without one.
-    """
+    """Return the Zenoh Encoding of a published payload, without a type if `type_name` is ""."""
     return f"{_MIME[form]};acsard.{type_name}.v1" if type_name else _MIME[form]
 
 
 def encode(message: object, form: Format) -> bytes:
-    """Return the encoded message.
-
-    Raises `DecodeError` if `form` is "cdr" and CDR cannot represent the type.
-    """
+    """Return the encoded message. Raises `DecodeError` if CDR cannot represent the type."""
     if form == "cdr":
         return _codec(type(message)).encode(message)
     return _pack.encode(message) if form == "msgpack" else _text.encode(message)
@@ -77,10 +68,7 @@ def _codec(cls: type[T]) -> Cdr[T]:
 
 
 def detect(encoding: str, payload: bytes) -> Format:
-    """Return the encoding of a payload. Raises `DecodeError` if the encoding is unknown.
-
-    `encoding` is the Zenoh Encoding of the payload.
-    """
+    """Return the encoding of a payload with this Zenoh Encoding, or raise `DecodeError`."""
     form = _FORM_OF.get(encoding.partition(";")[0])
     if form is not None:
         return form
@@ -106,17 +94,11 @@ class Decoder(Generic[T]):
         self._text = msgspec.json.Decoder(cls)
 
     def decode(self, encoding: str, payload: bytes) -> T:
-        """Return the message in a payload. Raises `DecodeError` if the payload is not valid.
-
-        `encoding` is the Zenoh Encoding of the payload.
-        """
+        """Return the message in a payload with this Zenoh Encoding, or raise `DecodeError`."""
         return self.decode_as(detect(encoding, payload), payload)
 
     def decode_as(self, form: Format, payload: bytes) -> T:
-        """Return the message in a payload with the encoding `form`.
-
-        Raises `DecodeError` if the payload is not valid.
-        """
+        """Return the message in a payload of the given form, or raise `DecodeError`."""
         if form == "cdr":
             return decode_cdr(self._cls, payload)
         try:

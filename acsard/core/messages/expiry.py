@@ -15,13 +15,9 @@ DAY_NS = 86400 * NS_PER_S
 def expiry(ends: Mapping[str, int], now_ns: int) -> tuple[int, str]:
     """Return the level (0 ok, 1 warning, 2 error) and a description of the validity.
 
-    Only the description of level 0 begins with "valid".
-
-    Args:
-        ends: the expiry time of each certificate that TLS needs, wall-clock ns since 1970, by the
-            name of its owner. The robot's own certificate has the name "". The mapping is empty if
-            no expiry time is known.
-        now_ns: the present time, wall-clock ns since 1970.
+    Only the description of level 0 begins with "valid". `ends` is the expiry time of each
+    certificate that TLS needs, by the name of its owner. The robot's own certificate has the name
+    "". The mapping is empty if no expiry time is known. Times are wall-clock ns since 1970.
     """
     if not ends:
         return (
@@ -42,8 +38,7 @@ def expiry(ends: Mapping[str, int], now_ns: int) -> tuple[int, str]:
 def first(ends: Mapping[str, int]) -> tuple[str, int]:
     """Return the owner and the expiry time of the certificate that expires first.
 
-    The time is wall-clock ns since 1970. The TLS gateway reports the earliest expiry time of all
-    certificates, stored under the name "". If a certificate with an owner's name has the same time,
-    return that name.
+    The TLS gateway reports the earliest expiry time of all certificates under the name "". If a
+    certificate with an owner's name has the same time, that name is returned.
     """
     return min(ends.items(), key=lambda one: (one[1], one[0] == ""))

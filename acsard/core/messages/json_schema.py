@@ -38,8 +38,7 @@ ENOUGH: dict[type, list[str]] = {
     Imu: ["angular_velocity"],
     SpeedLimit: ["speed_limit"],
 }
-"""Required fields of some received types. In other types, each field without a default is
-required."""
+"""Required fields of some received types. Other types require each field without a default."""
 
 Schema = dict[str, Any]
 

@@ -41,7 +41,6 @@ class Topic(Struct, frozen=True):
     rate: str
     """How often the daemon publishes or accepts a message, in words; "" for a query."""
     note: str
-    """Meaning of the message."""
     publish: Role | None = None
     """Lowest role that may put on the key. None means that no client may put on it."""
     subscribe: Role | None = None
@@ -72,7 +71,6 @@ class Service(NamedTuple):
     least: Role
     """Lowest role that may call the service."""
     note: str
-    """Effect of the service."""
     payload: str = ""
     """Type of the payload, a name in `MESSAGES`; "" for a service without a payload."""
     example: str = ""
@@ -126,14 +124,11 @@ SPEED_LIMIT = "speed_limit"
 """Key on which a client, such as Nav2's speed filter, lowers the robot's highest speed."""
 
 DESCRIPTION = "robot_description"
-"""Key of the robot's URDF."""
 
 WHOAMI = "whoami/<role>"
 """Pattern of the keys with which a client finds out its role. There is one key for each role.
-
 Zenoh's access rules let a client query only the keys of its own role and of lower roles. So an
-answer on a key proves that the client has at least this role.
-"""
+answer on a key proves that the client has at least this role."""
 
 
 def whoami_key(role: str) -> str:
@@ -168,10 +163,7 @@ def _out(
     simulated: bool = False,
     urdf: bool = False,
 ) -> Topic:
-    """Return the row of a key on which the daemon publishes messages of the type `kind`.
-
-    Every client may subscribe to the key and query it. The other arguments are those of `Topic`.
-    """
+    """Return the row of a key on which the daemon publishes, and which every client may read."""
     return Topic(
         key, "out", kind, rate, note,
         subscribe="viewer", query="viewer", latched=latched, simulated=simulated, urdf=urdf,
@@ -248,8 +240,7 @@ FOLLOWED: tuple[Topic, ...] = tuple(
 """The rows of keys that clients may subscribe to and query: published keys and the gyro's key."""
 
 PUBLISHED: tuple[Topic, ...] = tuple(topic for topic in FOLLOWED if topic.direction == "out")
-"""The rows of keys on which the daemon publishes. A query of such a key returns the last
-message."""
+"""The rows of keys on which the daemon publishes. A query of one returns the last message."""
 
 
 def offered(config: Config) -> tuple[Topic, ...]:
@@ -265,10 +256,7 @@ def offered(config: Config) -> tuple[Topic, ...]:
 
 
 def published(config: Config) -> tuple[Topic, ...]:
-    """Return the rows of the keys on which a daemon with this configuration publishes.
-
-    With the simulator, this includes the key of the gyro.
-    """
+    """Return the rows of the keys on which this daemon publishes, the simulator's gyro included."""
     own = config.mcu.simulated
     return tuple(t for t in offered(config) if t in PUBLISHED or (own and t.key == IMU))
 
@@ -285,31 +273,20 @@ COMMANDS = ("cmd", "wheel_cmd")
 def command_key(kind: str, source: str, certificate: str = "") -> str:
     """Return the key, below the robot's id, on which a sender puts the commands of a source.
 
-    Over TLS each certificate has its own key. The access rules let no other certificate put on it.
-
-    Args:
-        kind: "cmd" or "wheel_cmd".
-        source: the name of the source.
-        certificate: the common name of the sender's certificate, or "" for a program on the robot's
-            own machine.
+    `kind` is one of `COMMANDS`. Over TLS, only the sender with the certificate of the common name
+    `certificate` may put on the key. A program on the robot's own machine uses "".
     """
     return f"{kind}/{source}/{certificate}" if certificate else f"{kind}/{source}"
 
 
 def source_keys(sources: Iterable[str], certificate: str = "") -> list[str]:
-    """Return the keys, below the robot's id, of all kinds of commands for these sources.
-
-    `certificate` is as in `command_key`, or "*" for the keys of all certificates.
-    """
+    """Return all command keys of these sources. `certificate` may be "*" for all certificates."""
     names = list(sources)
     return [command_key(kind, name, certificate) for kind in COMMANDS for name in names]
 
 
 def unknown(key: str) -> bool:
-    """Return whether no row of the table matches a key below the robot's id.
-
-    Every key below `json/`, `cmd/` and `wheel_cmd/` counts as known.
-    """
+    """Return whether no row matches a key. Every key below `json/` or of a command is known."""
     return row_of(key) is None and not key.startswith((JSON_TREE, "cmd/", "wheel_cmd/"))
 
 
@@ -325,10 +302,7 @@ def by_key(key: str) -> Topic | None:
 
 
 def row_of(key: str) -> Topic | None:
-    """Return the row that a key below the robot's id matches, or None.
-
-    A placeholder matches any name: `cmd/app` matches the row `cmd/<source>`.
-    """
+    """Return the row that a key below the robot's id matches: `cmd/app` matches `cmd/<source>`."""
     return next((topic for topic in TOPICS if _pattern(topic.key).fullmatch(key)), None)
 
 

@@ -1,7 +1,4 @@
-"""Formats messages such as the pose and the motion of the robot in one line for a person.
-
-Covariances, stamps and frames are left out. Programs read them from the message in JSON.
-"""
+"""Formats messages in one line for a person, without covariances, stamps and frames."""
 
 from __future__ import annotations
 

@@ -23,14 +23,11 @@ MAY: dict[Role, str] = {
     "operator": "this role may stop, clear, and drive as a source that commands.sources lists",
     "maintainer": "this role has every permission",
 }
-"""The permissions of each role in words, for the error message of a tool with too low a role."""
+"""The permissions of each role in words, for error messages."""
 
 
 def has(role: str, least: Role) -> bool:
-    """Return whether `role` has the permissions of the role `least`.
-
-    A client without a role has the role "", which has no permissions.
-    """
+    """Return whether `role` has the permissions of `least`. The role "" has no permissions."""
     return role in ROLES and ROLES.index(role) >= ROLES.index(least)
 
 
@@ -38,7 +35,7 @@ def keys_for(role: Role, use: Use, rows: Iterable[Topic]) -> list[str]:
     """Return the keys of `rows` for which `role` is the lowest role with the permission `use`.
 
     The keys of commands are left out, because they contain names from the configuration.
-    `source_keys` returns the keys of commands, and `COMMAND_ROLE` is their lowest role.
+    `source_keys` returns them, and `COMMAND_ROLE` is their lowest role.
     """
     exact = (pair for row in rows if not row.local for pair in _exact(row, use))
     return [key for key, least in exact if least == role and "<" not in key]
@@ -62,8 +59,8 @@ def least_role(key: str) -> Role:
     """Return the lowest role that may use `key`, the part of the full key after the robot's id.
 
     To use a key means to put on it if clients may do that, else to query it, else to subscribe to
-    it. For an unknown key, return the lowest role. That is right only for a hint to a client that
-    has received nothing, so a caller that grants permissions must not ask for an unknown key.
+    it. For an unknown key, the result is the lowest role of all. It is only a hint, so a caller
+    that grants permissions must not ask for an unknown key.
     """
     row = row_of(key.removeprefix(JSON_TREE))
     if row is None:
@@ -74,7 +71,5 @@ def least_role(key: str) -> Role:
 
 
 SERVICE_ROLES: dict[Verb, Role] = {verb: least_role(key) for key, verb in VERBS.items()}
-"""The least role that may call each service."""
 
 COMMAND_ROLE = least_role("cmd/<source>/<certificate>")
-"""The least role that may command the robot."""

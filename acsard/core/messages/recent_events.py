@@ -2,9 +2,7 @@
 
 Events that repeat are one row with a count. If each repetition had its own row, a computer that
 misses a control period every second would push a fault out of the twenty rows within 20 s. An event
-whose `news` is true always gets its own row.
-
-The log has a line for each event that is added here.
+whose `news` is true always gets its own row. The log has a line for each event.
 """
 
 from __future__ import annotations
@@ -22,8 +20,7 @@ LAST = 20
 """Number of rows that are kept, so that a client that polls slowly seldom misses an event."""
 
 PAUSE_NS = 60 * NS_PER_S
-"""Time after which the next event of the same name gets a new row and does not count as a
-repetition, ns."""
+"""Time after which an event of the same name gets a new row and is not a repetition, ns."""
 
 
 class _Row(Struct, frozen=True):
@@ -55,7 +52,6 @@ class RecentEvents:
         return Events(_time(self._rows[-1]), self._total, [_log_event(row) for row in self._rows])
 
     def _same(self, event: Event, now: Instant) -> _Row | None:
-        """Return the row that this event repeats, or None."""
         since_ns = now.mono_ns - PAUSE_NS
         for row in self._rows:
             if row.event.name == event.name and not row.event.news and row.at.mono_ns >= since_ns:

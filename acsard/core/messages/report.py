@@ -58,7 +58,6 @@ from acsard.core.values import Twist as BodyTwist
 Look = Callable[[], Snapshot]
 
 BATTERY_HZ = 1.0
-"""Rate at which `battery` is published, Hz."""
 
 UNKNOWN_STATUS, CHARGING, DISCHARGING, NOT_CHARGING = range(4)
 """Values of `Battery.power_supply_status`."""
@@ -88,11 +87,9 @@ class Report:
         self, config: Config, start: Instant, certificate_ends: Mapping[str, int] | None = None
     ) -> None:
         self.certificate_ends = dict(certificate_ends or {})
-        """Expiry time of each TLS certificate, wall-clock ns since 1970, by the name of its owner.
-
-        The robot's own certificate has the name "". If the daemon may not read that certificate,
-        the TLS gateway reports the time.
-        """
+        """Expiry of each TLS certificate, wall-clock ns since 1970, by the name of its owner. The
+        robot's own certificate has the name "". The TLS gateway reports that time if the daemon may
+        not read it."""
         self.settings_differ = ""
         """Settings in force that differ from the configuration file, in words; "" if none does."""
         self.speed_limit = ""
@@ -118,13 +115,8 @@ class Report:
         """Return an iterator over the pairs of key and message to publish after this step.
 
         The messages of the feedback (`odom`, `tf`, `wheel_states`) come first, because `state`
-        takes ten times as long to build.
-
-        Args:
-            outputs: the outputs of the step.
-            wanted: the keys that have a subscriber.
-            look: a function that returns the state of the robot. It is called only if a message
-                needs the state.
+        takes ten times as long to build. `wanted` contains the keys that have a subscriber. `look`
+        returns the state of the robot, and is called only if a message needs it.
         """
         self._outputs = outputs
         if outputs.events:
@@ -172,10 +164,7 @@ class Report:
                     yield key, message
 
     def current(self, key: str, look: Look) -> Message | None:
-        """Return the present value of a published key, or None if it has no value yet.
-
-        `look` returns the state of the robot. It is called only if the message needs the state.
-        """
+        """Return the present value of a published key, if any. `look` is called only if needed."""
         estimate, outputs = self._estimate, self._outputs
         match key:
             case "tf_static":
@@ -222,11 +211,7 @@ class Report:
         return String(self.description) if self.description else None
 
     def _odom(self, estimate: Estimate, live: bool = True) -> Odometry:
-        """Return the odometry message of an estimate.
-
-        `live` is false if the feedback has stopped since the estimate. The twist is then zero, and
-        its covariance is `UNKNOWN`.
-        """
+        """Return the odometry. Unless `live`, the twist is zero and its covariance `UNKNOWN`."""
         frames, pose = self._config.odometry, estimate.pose
         of_pose = self._covariances.of_pose(estimate.covariance)
         of_twist = self._covariances.of_twist(estimate.twist_variances) if live else UNKNOWN
@@ -302,10 +287,7 @@ class Report:
         return round((first(self.certificate_ends)[1] - now.wall_ns) / DAY_NS, 2)
 
     def _battery(self, outputs: Outputs, snapshot: Snapshot) -> Battery | None:
-        """Return the battery message, or None if the board has never reported a battery.
-
-        The stamp is the time of the board's last report, or of the step if the reports have ended.
-        """
+        """Return the battery message, if any, as of the board's last report or else of the step."""
         battery, now = snapshot.battery, outputs.now
         if battery is None:
             return None
@@ -324,10 +306,7 @@ class Report:
         )
 
     def _certificate(self, now: Instant) -> tuple[int, str]:
-        """Return the level (0 ok, 1 warning, 2 error) and a description of the certificate.
-
-        The description is "" without TLS.
-        """
+        """Return the result of `expiry` for the certificate, or (0, "") without TLS."""
         if not self._config.bus.tls:
             return 0, ""
         return expiry(self.certificate_ends, now.wall_ns)

@@ -1,4 +1,4 @@
-"""Decodes the attachment of a command or a service call. It names the program that sends it.
+"""Decodes the attachment of a command or a service call, which names the sending program.
 
 An attachment is a map in JSON or msgpack:
 
@@ -27,16 +27,12 @@ MAX_NAME = 40
 """Largest number of characters that a public name takes from NAME in a sender id `NAME/SECRET`."""
 
 DIGITS = 16
-"""Number of hexadecimal digits of the hash in a public name: 64 bits.
-
-With so many bits, nobody can find another sender id with the same hash.
-"""
+"""Number of hexadecimal digits of the hash in a public name. They are 64 bits, so nobody can find
+another sender id with the same hash."""
 
 MARKS = " @._-:/+"
-"""Characters besides letters and digits that a public name may contain. Others become "?".
-
-Brackets and commas become "?" too, because they surround and separate names in the log.
-"""
+"""Characters besides letters and digits that a public name may contain. All others become "?".
+Brackets and commas are not allowed, because they surround and separate names in the log."""
 
 
 class Signature(Struct, frozen=True, omit_defaults=True):
@@ -78,15 +74,13 @@ def unpack(attachment: bytes) -> Signature | None:
 def public_name(sender: str, certificate: str = "") -> str:
     """Return the public name of a sender, such as "joystick/0b5d6c1f22a94e37 [laptop]".
 
-    It consists of the name before the last "/" of the id, the first 16 hexadecimal digits of the
-    SHA-256 of the whole id, and the common name of the certificate. If the id has no
-    name, the public name is the digits alone. Without a certificate there are no brackets.
+    It is the name before the last "/" of the id, the first 16 hexadecimal digits of the SHA-256 of
+    the whole id, and the common name of the certificate. Parts that do not exist are left out.
 
     Args:
         sender: the sender id or, without one, the id of the Zenoh session that set the sample's
             timestamp.
-        certificate: the common name of the certificate with which the sender commands over TLS, or
-            "".
+        certificate: the common name of the sender's TLS certificate, or "".
     """
     digits = sha256(sender.encode("utf-8", "surrogatepass")).hexdigest()[:DIGITS]
     name = _cleaned(sender.rpartition("/")[0][:MAX_NAME]).strip()

@@ -1,8 +1,8 @@
 """Lists the warnings about a robot, such as a low battery.
 
-A robot in the mode `ready` may have warnings, too. If nobody reacts to a warning, its cause may end
-the robot's work hours or weeks later. The same words appear in `acsard fleet`, `acsard top`,
-`acsard echo --short`, `/metrics` and on the web page. Programs find the same facts in `state`.
+A robot in the mode `ready` may have warnings, too. The same words appear in `acsard fleet`, `acsard
+top`, `acsard echo --short`, `/metrics` and on the web page. Programs find the same facts in
+`state`.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ What = Literal[
 ]  # fmt: skip
 
 WHATS: tuple[What, ...] = get_args(What)
-"""Every subject of a warning; the most urgent one is the first."""
+"""Every subject of a warning, from the most to the least urgent."""
 
 WARNING = "WARNING"
-"""The word in front of the warnings if they are part of a line of text."""
+"""Prefix of the warnings in a line of text."""
 
 ESTOP = {"pressed": "emergency stop pressed", "silent": "emergency stop not reported"}
 
@@ -47,7 +47,6 @@ class StateWarning(Struct, frozen=True):
     """The details that the robot reports; "" if `brief` already says everything."""
 
     def __str__(self) -> str:
-        """Return the warning as one printable line."""
         return printable(f"{self.brief}: {self.text}" if self.text else self.brief)
 
 
@@ -57,19 +56,13 @@ def warnings(state: RobotState) -> list[StateWarning]:
 
 
 def brief(found: Sequence[StateWarning]) -> str:
-    """Return the warnings as one short printable text, such as "WARNING: recording fails".
-
-    Returns "" if there are no warnings.
-    """
+    """Return the warnings as text, such as "WARNING: recording fails", or "" without any."""
     words = ", ".join(printable(one.brief) for one in found)
     return f"{WARNING}: {words}" if words else ""
 
 
 def charge(battery: BatterySummary | None) -> str:
-    """Return the state of charge of a battery as text, or its voltage if the charge is unknown.
-
-    Returns "" if neither is reported.
-    """
+    """Return the charge of a battery as text, or its voltage if the charge is unknown, or ""."""
     if battery is None:
         return ""
     if battery.percent is not None:

@@ -11,8 +11,7 @@ live while one of its senders is.
 - A source that sends zeros holds the robot still for any length of time. The arbiter cannot tell
   whether an operator wants that or a controller has failed, so `state` and the log report it.
 
-`Objection` lists a short name for each reason to refuse a command, and `arbiter_text.py` contains
-the sentences for people. `values.Command` explains source, sender and clock.
+`values.Command` explains source, sender and clock.
 """
 
 from __future__ import annotations
@@ -28,15 +27,14 @@ from acsard.core.motion.neutral import Sender
 from acsard.core.values import NS_PER_S, REST, Command, SourceStatus, Twist, Wait
 
 MAX_SENDERS = 16
-"""Largest number of senders that one source remembers. A sender that is live and armed is never
-replaced."""
+"""Largest number of senders that one source remembers. Live, armed senders are never replaced."""
 
 Objection = Literal["", "unknown_source", "not_finite", "too_many_senders", "unproven", "stale"]
 """The reason to refuse a command, or "" if the arbiter accepts it."""
 
 LASTING_S = (3.0, 10.0, 60.0, 600.0, 3600.0)
-"""`state` reports how long a sender has sent only zeros, or has sent without being armed. The time
-is rounded down to one of these durations, s."""
+"""`state` reports for how long a sender has sent only zeros, or has sent without being armed. The
+time is rounded down to one of these durations, s."""
 
 NOTHING, COMMAND = Wait("nothing"), Wait("command")
 
@@ -44,9 +42,8 @@ NOTHING, COMMAND = Wait("nothing"), Wait("command")
 class Choice(Struct, frozen=True):
     """The choice of the arbiter in one step.
 
-    If a sender may drive, `twist` is the twist to follow, `arrived_ns` is the monotonic time at
-    which it arrived, and `source` and `sender` name its origin. Otherwise `twist` is None and
-    `wait` is the reason.
+    `arrived_ns` is the monotonic time at which `twist` arrived. If no sender may drive, `twist` is
+    None and `wait` is the reason.
     """
 
     source: str = ""
@@ -61,8 +58,6 @@ IDLE = Choice()
 
 
 class _Source:
-    """One configured source and its senders."""
-
     def __init__(self, settings: Source, neutral_first: bool, pause: float) -> None:
         self.name, self.priority = settings.name, settings.priority
         self.neutral_first = neutral_first
@@ -70,10 +65,7 @@ class _Source:
         self.use(settings, pause)
 
     def use(self, settings: Source, pause: float) -> None:
-        """Apply the command timeout of `settings` from now on, also to the known senders.
-
-        `pause` is `commands.neutral_pause`, s.
-        """
+        """Apply new settings, also to the known senders. `pause` is in s."""
         self.pause_ns = int(pause * NS_PER_S)
         self.timeout_ns = int(settings.timeout * NS_PER_S)
         self.proof = Wait("proof", settings.name, min(self.timeout_ns, LONGEST_PROOF_NS) / NS_PER_S)
@@ -82,11 +74,7 @@ class _Source:
             sender.use(self.timeout_ns, self.pause_ns)
 
     def add(self, name: str, now_ns: int) -> Sender | None:
-        """Add a sender of this name and return it.
-
-        If the table is full, the new sender replaces the sender that `_account` ranks lowest.
-        Return None if all senders in the full table are live and armed.
-        """
+        """Add a sender and return it, or None if `MAX_SENDERS` senders are live and armed."""
         if len(self.senders) >= MAX_SENDERS:
             least = min(self.senders, key=lambda other: self._account(other, now_ns))
             if self._account(least, now_ns)[0]:
@@ -96,20 +84,13 @@ class _Source:
         return added
 
     def _account(self, name: str, now_ns: int) -> tuple[bool, bool, int]:
-        """Return the rank of a sender. `add` replaces the sender with the lowest rank.
-
-        A sender that is armed and live ranks highest. A sender that is only armed comes next, and
-        then all others. Among equals, the sender that sent most recently ranks highest.
-        """
+        """Return the rank of a sender. `add` replaces the sender with the lowest rank."""
         sender = self.senders[name]
         armed = sender.armed(now_ns)
         return armed and sender.live(now_ns), armed, sender.noticed_ns
 
     def doubt(self, name: str, was_set: bool) -> None:
-        """Disarm the sender `name` if it was armed only by zeros with unproven stamps.
-
-        If `was_set` is true, the sender's clock seems to have been set, so disarm it in any case.
-        """
+        """Disarm a sender whose clock was set, or that zeros with unproven stamps armed."""
         sender = self.senders.get(name)
         if sender is None:
             return
@@ -119,43 +100,28 @@ class _Source:
             sender.unlearn()
 
     def live(self, now_ns: int) -> list[Sender]:
-        """Return the senders whose last command is not older than the timeout.
-
-        Armed senders come before others. Among equals, the one that began to send first comes
-        first.
-        """
+        """Return the live senders: first the armed ones, each group in order of arrival."""
         live = [sender for sender in self.senders.values() if sender.live(now_ns)]
         if len(live) < 2:
             return live
         return sorted(live, key=lambda sender: (not sender.armed(now_ns), sender.came_ns))
 
     def latest_ns(self) -> int | None:
-        """Return the monotonic time at which the source's last accepted command arrived, ns.
-
-        Return None if no command has been accepted since `require_neutral`.
-        """
+        """Return the monotonic time, ns, of the last accepted command, or None without one."""
         times = [s.arrived_ns for s in self.senders.values() if s.arrived_ns is not None]
         return max(times, default=None)
 
     def require_neutral(self) -> None:
-        """Require a zero from every sender before it drives again."""
         for sender in self.senders.values():
             sender.require_neutral()
 
     def neutral(self, sender: Sender, lasts: float = 0.0) -> Wait:
-        """Return the `Wait` of a sender that must send a zero first.
-
-        `lasts` is the time for which the sender has sent speeds, s, or 0.0 while that time is too
-        short to report.
-        """
+        """Return the `Wait` of a sender that must send a zero first. `lasts` is in s."""
         pause = self.pause_ns / NS_PER_S
         return Wait("neutral", self.name, pause, lasts=lasts, ros=sender.ros, shared=sender.shared)
 
     def doubted(self, now_ns: int) -> Wait | None:
-        """Return why the robot does not follow a recent command with a doubtful stamp.
-
-        Return None if the source has sent no such command recently.
-        """
+        """Return why the robot does not follow a recent command with a doubtful stamp, or None."""
         doubtful = [sender for sender in self.senders.values() if sender.doubtful(now_ns)]
         if not doubtful:
             return None
@@ -176,15 +142,13 @@ class Arbiter:
         self._ranking = sorted(self._sources.values(), key=lambda source: -source.priority)
         self._holder: _Source | None = None
         self._followed: Sender | None = None
-        """The sender that the robot followed in the last step."""
         self._since_ns = 0
         self._freshness = Freshness()
 
     def use(self, commands: CommandsConfig) -> None:
         """Apply the timeouts and `neutral_pause` of `commands` from now on.
 
-        The last commands, the arming and the clocks of all senders stay as they are. The names and
-        priorities of the sources must be those that the arbiter was constructed with.
+        Armed senders stay armed. The names and priorities of the sources must not change.
         """
         for settings in commands.sources:
             self._sources[settings.name].use(settings, commands.neutral_pause)
@@ -228,8 +192,8 @@ class Arbiter:
     def notice(self, source: str, sender: str, arrived_ns: int) -> None:
         """Record a lost or unusable message, which may have commanded motion.
 
-        It prevents an earlier zero from arming a shared identity whose `commands.neutral_pause` is
-        not over yet. If `sender` is "", the message may come from any sender of `source`.
+        A shared identity whose `commands.neutral_pause` is not over yet must then send a zero
+        again. If `sender` is "", the message may come from any sender of `source`.
         """
         known = self._sources.get(source)
         if known is None:
@@ -279,11 +243,7 @@ class Arbiter:
         return Choice(source.name, sender.twist, wait, sender.arrived_ns, sender.name)
 
     def _kept(self, holder: _Source, now_ns: int) -> str:
-        """Return the name of a source whose speeds have no effect because `holder` sends zeros.
-
-        If they come from `holder` itself, return "another sender of" and its name. Return "" if
-        no other sender sends speeds.
-        """
+        """Return the source whose speeds have no effect because `holder` sends zeros, or ""."""
         for source in self._ranking:
             senders = (each for each in source.live(now_ns) if each is not self._followed)
             if any(sender.twist != REST for sender in senders):
@@ -292,8 +252,7 @@ class Arbiter:
 
     @property
     def forgiven_ns(self) -> int:
-        """Sum of the rises of command delays, ns, that were trusted although no adjustment of the
-        sender's clock was visible (`freshness.py`)."""
+        """Total rise of command delays, ns, accepted without a visible clock adjustment."""
         return self._freshness.forgiven_ns
 
     def sources(self, now_ns: int) -> tuple[SourceStatus, ...]:

@@ -1,7 +1,6 @@
-"""Creates sentences and events about modes, commands and the senders that drive the robot.
+"""Creates the sentences and events about modes, commands and the senders that drive the robot.
 
-The sentences go into `state`, `diagnostics` and the log. `event_throttle.py` decides how often an
-event becomes a line of the log.
+They go into `state`, `diagnostics` and the log. `event_throttle.py` limits the lines of the log.
 """
 
 from __future__ import annotations
@@ -20,12 +19,10 @@ REFUSED = {
     "stale": "the command is older than the source's timeout allows, or older than one that was "
     "accepted: the network delayed it, or the sender's clock was set",
 }
-"""The words for each reason to refuse a command."""
 
 MAX_SENDER = 124
-"""Largest number of characters of a sender's name that an event shows. A public name has up to 57
-characters, and a certificate adds up to 67. A sender may also be named after its key, which can be
-longer. The event cuts such a name."""
+"""Largest number of characters of a sender's name in an event. A public name has up to 57, and a
+certificate adds up to 67. A name made from a key can be longer and is cut."""
 
 ROS_NEVER = (
     ' (`ros2 topic pub` of a speed never sends a zero; "After a clear" in deploy/ros2/README.md '
@@ -41,7 +38,7 @@ def chosen(choice: Choice) -> str:
 
 
 def waiting(wait: Wait) -> str:
-    """Return a sentence with the condition that a source waits for, "" if it need not wait."""
+    """Return the condition that a source waits for, in words; "" if it need not wait."""
     match wait.what:
         case "nothing":
             return ""
@@ -87,11 +84,7 @@ def missed(periods: int) -> Event:
 
 
 def refused(refusal: Refusal) -> Event:
-    """Return the event for a refused command.
-
-    The event is `new_sender` if the only reason is that a new sender's delays are not proven
-    constant yet. It is `command_refused` for every other reason.
-    """
+    """Return the event of a refusal: `new_sender` if `unproven`, otherwise `command_refused`."""
     by, kind = refusal.sender[:MAX_SENDER], refusal.reason
     if kind == "unproven":
         return Event("new_sender", refusal.text, by=by, news=False)
@@ -110,12 +103,8 @@ class CommandEvents:
         """Return the events for changes since the last call.
 
         The events report a new mode, a new commander (the source and sender that drive the robot),
-        and speeds without effect. A commander that drives again after a pause is not new.
-
-        Args:
-            mode: The present mode.
-            choice: The present choice of the arbiter.
-            why: The reason of the mode, in words.
+        and speeds without effect. A commander that drives again after a pause is not new. `why` is
+        the reason of the mode, in words.
         """
         drives, before, last = mode is Mode.DRIVING, self._mode, self._commander
         if drives:
@@ -130,11 +119,7 @@ class CommandEvents:
         return events + self._kept_waiting(mode, choice)
 
     def _kept_waiting(self, mode: Mode, choice: Choice) -> list[Event]:
-        """Return an event if the speeds of a source have had no effect for a while.
-
-        The same source is not reported again until its speeds have had an effect, or until another
-        source has been reported.
-        """
+        """Return an event if a source's speeds have had no effect for a while, but only once."""
         wait, kept = choice.wait, ""
         if mode not in (Mode.READY, Mode.DRIVING) or wait.what not in ("neutral", "zeros"):
             self._kept = ""

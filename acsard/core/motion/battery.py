@@ -19,7 +19,7 @@ from acsard.core.link.board_status import BoardStatus
 from acsard.core.values import NS_PER_S, BatteryLevel, BatteryStatus, Event
 
 TIME_CONSTANT_S = 10.0
-"""Time constant of the mean, s. A drop of 2 V for 0.3 s, as when motors start, lowers it by 0.06 V.
+"""Time constant of the mean, s. A drop of 2 V for 0.3 s at a motor start lowers the mean by 0.06 V.
 A battery takes minutes from one level to the next, so the robot reacts soon enough."""
 
 SETTLE_S = 3.0
@@ -28,20 +28,17 @@ between two reports counts as at most `LONGEST_NS`. A motor start within this ti
 by up to a tenth of the voltage drop."""
 
 SILENT_S = 5.0
-"""Age at which the daemon drops a value, s. If a board reports its battery once a second, four
-reports in a row may be lost before that."""
+"""Age at which a value is dropped, s. At one report a second, four in a row may be lost."""
 
 LONGEST_NS = 300_000_000
-"""Largest weight of a report in the mean, ns. The weight is the time since the previous report, but
-at most this value, the duration of a motor start. Otherwise a report during a motor start would
-weigh too much if it follows a gap or if reports are rare. If a board reports once a second, its
-mean therefore follows the voltage about three times as slowly."""
+"""Largest weight of a report in the mean, ns: the duration of a motor start. The weight is the time
+since the previous report. Without this bound, a report during a motor start would weigh too much
+after a gap. At one report a second, the mean follows the voltage about three times as slowly."""
 
 ORDER: tuple[BatteryLevel, ...] = get_args(BatteryLevel)[:4]
 """The battery levels without "unknown", from the best to the worst."""
 
 MISSING = "the board has not reported its battery, but [battery] has thresholds"
-"""The message if `[battery]` has thresholds and the board has never reported its battery."""
 
 SILENT = f"the board has not reported its battery for {SILENT_S:g} s"
 
@@ -79,16 +76,13 @@ class Battery:
         self._config = config
         self._bounds = config.bounds
         self.status: BatteryStatus | None = None
-        """The values and the level of the battery; None if the board has never reported its voltage
-        or its charge."""
+        """The values and the level; None if the board has never reported its voltage or charge."""
         self.stopped_now = False
         """Whether the level fell to "stop" in the last `look`."""
         self._values: dict[str, tuple[float, int]] = {}
-        """The last values by name, each with its monotonic time of arrival, ns. Values older than
-        `SILENT_S` are removed."""
+        """The last values by name, each with its monotonic time of arrival, ns."""
         self._known: BatteryLevel = "ok"
-        """The last level that was not "unknown". It does not change while the board is silent,
-        because silence does not end a stop."""
+        """The last level that was not "unknown": silence of the board does not end a stop."""
         self._told: BatteryLevel | None = None
         """The level in the last event, None before the first one."""
         self._mean: float | None = None
@@ -117,9 +111,7 @@ class Battery:
     def look(self, reports: Iterable[tuple[int, BoardStatus]], now_ns: int) -> list[Event]:
         """Process the status lines since the last step, and return an event if the level changed.
 
-        Args:
-            reports: The status lines, each with its monotonic time of arrival, ns.
-            now_ns: Monotonic time of this step, ns.
+        `reports` has each status line with its monotonic time of arrival, ns.
         """
         self.stopped_now = False
         news = False
@@ -163,11 +155,7 @@ class Battery:
             self._mean_ns = at_ns
 
     def _level(self, now_ns: int) -> BatteryLevel | None:
-        """Update the level from the mean and return it, or None during the first `SETTLE_S`.
-
-        The level is "unknown" if the board does not report the quantity, voltage or charge, for
-        which thresholds are configured.
-        """
+        """Update the level from the mean and return it, or None during the first `SETTLE_S`."""
         measure, values = self._config.measure, self._values
         if measure not in values:
             self._mean = None

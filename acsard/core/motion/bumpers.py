@@ -1,15 +1,13 @@
 """Follows the bumpers that the board reports, and decides which motion they allow.
 
 A pressed bumper brings the robot to rest at once. With `safety.bumper = "stop"`, the press also
-latches a stop, as the emergency stop does. With "away", the press latches nothing, but each sender
-must send a zero before the robot moves again. Until the bumper is released, the robot drives only
-straight away from it, at `AWAY_SPEED` or less. No turn is allowed until then, because a corner of
-the robot could sweep into the obstacle. A robot with four wheels cannot move sideways, so no motion
-leads away from a bumper at the left or the right.
+latches a stop. With "away", each sender must send a zero before the robot moves again. Until the
+bumper is released, the robot then drives only straight away from it, at `AWAY_SPEED` or less. It
+may not turn, because a corner could sweep into the obstacle. No motion leads away from a bumper at
+the left or the right, because the robot cannot move sideways.
 
-If a board has reported bumpers and no longer does, a stop is latched with "stop" and with "away".
-Like the emergency-stop input, a bumper is not a safety function, because the status line may be
-lost or late.
+If a board has reported bumpers and no longer does, a stop is latched with "stop" and with "away". A
+bumper is not a safety function, because the status line may be lost or late.
 """
 
 from __future__ import annotations
@@ -44,12 +42,7 @@ def missing(safety: SafetyConfig) -> str:
 
 
 def pressed_words(places: Sequence[Place], pressed: Sequence[bool]) -> str:
-    """Return words that list the pressed bumpers.
-
-    Args:
-        places: The configured places of the bumpers. If empty, the words use the bumpers' numbers.
-        pressed: Whether each bumper is pressed.
-    """
+    """Return words that list the pressed bumpers, by their numbers if `places` is empty."""
     numbers = [i for i, on in enumerate(pressed) if on]
     if not places:
         joined = " and ".join(str(i + 1) for i in numbers)
@@ -72,7 +65,7 @@ class Bumpers(BoardInput):
         self._places = safety.bumpers
         self._away = safety.bumper == "away" and len(safety.bumpers) > 0
         self._count = 0
-        """Number of bumpers in the last status line that reported any."""
+        """Number of bumpers in the last status line that reported bumpers."""
 
     @property
     def limiting(self) -> bool:
@@ -81,8 +74,7 @@ class Bumpers(BoardInput):
 
     @property
     def latching(self) -> bool:
-        """Whether bumpers that count as pressed latch a stop. They do not if the board reports the
-        press and `safety.bumper` is "away"."""
+        """Whether pressed bumpers latch a stop. With "away", only the silence of the board does."""
         return not self._away or self.state == "silent"
 
     @property
@@ -93,8 +85,7 @@ class Bumpers(BoardInput):
     def away(self, twist: Twist) -> Twist | None:
         """Return the part of a twist that the pressed bumpers allow, None if they allow none of it.
 
-        Rest is always allowed. Of a twist that leads away from every pressed bumper, only the
-        straight part is allowed, up to `AWAY_SPEED`. Every other twist is forbidden.
+        They allow rest, and the straight part of a twist away from all of them, up to `AWAY_SPEED`.
         """
         if twist == REST:
             return REST
@@ -114,10 +105,9 @@ class Bumpers(BoardInput):
     def read(self, status: BoardStatus) -> tuple[bool, ...] | None:
         """Return whether each bumper is pressed according to a status line.
 
-        Return None if the line reports no bumpers or an unexpected number of them. Such a line may
-        lack a bumper that is pressed, so it must not release any. The expected number is that of
-        the configured places. Without configured places, it is the number in the previous report,
-        and a line that reports a press is accepted with any number.
+        Return None if the line reports no bumpers or an unexpected number, because it may lack a
+        pressed one. The expected number is that of the configured places. Without places, it is
+        that of the previous report, and a line that reports a press is accepted with any number.
         """
         bumpers = status.bumpers
         if bumpers is None:
@@ -129,7 +119,7 @@ class Bumpers(BoardInput):
         return None
 
     def words(self) -> str:
-        """Return words that list the pressed bumpers, as the reason of a stop."""
+        """Return words that list the pressed bumpers."""
         return pressed_words(self._places, self.pressed or ())
 
     def advice(self) -> str:
@@ -137,10 +127,7 @@ class Bumpers(BoardInput):
         return self.note().partition(": ")[2] if self.limiting else super().advice()
 
     def released(self, before: EstopState) -> str:
-        """Return the log text for a release or, if `before` is "", for the first report.
-
-        `before` is the state of the bumpers before this report.
-        """
+        """Return the log text for a release or, if `before` is "", for the first report."""
         if not before:
             count = len(self.pressed or ())
             return f"the board reports {many(count, 'bumper')}, and none is pressed"

@@ -1,12 +1,9 @@
 """Compares the wheels with each other, with their commands and with a gyro.
 
-`ConsistencyChecks` is the only interface to these checks. For each feedback line, it reports to the
-odometry which wheels to believe, whether they slip, and by how much the robot turned according to
-the gyro. It uses three modules:
+`ConsistencyChecks` is the only interface to these checks. It uses three modules:
 
-- `wheel_faults.py` compares the two wheels of each side with each other and with their command. It
-  ignores a wheel whose encoder is faulty. If a contradiction lasts, it reports a fault, which stops
-  the robot.
+- `wheel_faults.py` ignores a wheel whose encoder is faulty. If the wheels contradict each other or
+  their commands for long, it reports a fault, which stops the robot.
 - `gyro.py` takes the heading from a gyro, and compares the gyro with the believed wheels.
 - `learned_track.py` chooses the effective track (the distance between the wheels that makes turns
   come out right): the configured one, or one learned from the comparison with a gyro.
@@ -41,15 +38,7 @@ class ConsistencyChecks:
         encoder_counts: int,
         feedback: FeedbackConfig,
     ) -> None:
-        """Create the checks of one robot.
-
-        Args:
-            odometry: The table `[odometry]`, which says whether there is a gyro, and whether the
-                effective track is learned from it.
-            kinematics: The kinematics of the base.
-            encoder_counts: Counts per wheel turn, 0 if unknown.
-            feedback: The table `[feedback]` with the wheels' response time and fault time.
-        """
+        """Create the checks. `encoder_counts` is per wheel turn; 0 means unknown."""
         self._kinematics = kinematics
         self.wheels = WheelFaults(kinematics, encoder_counts, feedback)
         self.gyro = Gyro() if odometry.gyro else None
@@ -58,11 +47,9 @@ class ConsistencyChecks:
         self._by_wheels = 0.0
         """Turn of the robot during the last feedback line according to the wheels, rad."""
         self.turn: Turn | None = None
-        """Turn of the robot during the last feedback line according to the gyro. None means that
-        the odometry must use the turn of the wheels."""
+        """Turn during the last feedback line by the gyro; None if the wheels provide it."""
         self.on_trial = False
-        """Whether the wheels provided the turn of the last feedback line because the gyro is not
-        proven yet. Once gyro and wheels agree in a turn, the gyro corrects the pose."""
+        """Whether the last turn came from the wheels because the gyro is not proven yet."""
         self.slips = False
         """Whether the wheels slip: they contradict each other or the gyro."""
         self.events: list[Event] = []
@@ -80,7 +67,7 @@ class ConsistencyChecks:
             self.gyro.hear(samples)
 
     def forgive(self) -> None:
-        """Cancel the pending correction of the pose by the gyro. Call this when the pose is set."""
+        """Cancel the pending correction of the pose by the gyro, because the pose has been set."""
         if self.gyro is not None:
             self.gyro.forgive()
 
@@ -106,11 +93,7 @@ class ConsistencyChecks:
         return found
 
     def taken_back(self, turn: float) -> float:
-        """Account for a change of `turn` rad in the total turn of the recomputed `on_trial` lines.
-
-        Return the angle that the caller must subtract from the heading, rad. If the gyro is proven
-        by now, it has already corrected the heading, so this angle is `turn`. Otherwise it is 0.
-        """
+        """Account for recomputed `on_trial` lines; see `Gyro.taken_back`."""
         return 0.0 if self.gyro is None else self.gyro.taken_back(turn)
 
     def learn(self, turned: float) -> Track | None:

@@ -32,17 +32,15 @@ TABLE: dict[tuple[EstopState, Sign], EstopState] = {
     ("silent", "ok"): "released",
     ("silent", "pressed"): "pressed",
 }
-"""Maps (state, sign) to the next state. The sign is `ok` or `pressed` if the board reports that,
-and `silence` if the board has not reported the input for `SILENT_S`. A pair without an entry does
-not change the state."""
+"""Maps (state, sign) to the next state. The sign is `silence` if the board has not reported the
+input for `SILENT_S`. A pair without an entry does not change the state."""
 
 SILENT_S = 0.5
-"""Seconds without a report of the input after which it counts as pressed. A board reports the input
-ten times a second, so five lines in a row are lost by then."""
+"""Time without a report after which an input counts as pressed, s: five lines at 10 Hz."""
 
 LATE_NS = 150_000_000
-"""If two steps are further apart than this time, ns, this computer was late. The longest control
-period that can be configured is 100 ms."""
+"""If two steps are further apart than this, ns, this computer was late. The longest control period
+that can be configured is 100 ms."""
 
 EXCUSE_NS = 100_000_000
 """If this computer was late, the board counts as silent only after this further time, ns. In this
@@ -55,18 +53,14 @@ SILENT = (
 )
 
 RELEASE, CHECK = "release it at the robot", "check the board and its cable"
-"""What the operator must do before the call `clear`: the first if an input is pressed, the second
-if the board does not report it."""
 
 MISSING = (
     'safety.estop = "required", but the microcontroller has not reported an emergency-stop input: '
     "does its firmware send status lines with `estop=`?"
 )
-"""The message for a robot that is not ready because the board has never reported the input."""
 
 DRIVER_FAULT = "the board reports a fault of a motor driver"
 DRIVER_MEND = "repair the driver, or switch the robot off and on"
-"""What the operator must do before the call `clear` if the board reports `driver=fault`."""
 
 
 class BoardInput(ABC):
@@ -109,9 +103,7 @@ class BoardInput(ABC):
     def look(self, reports: Iterable[tuple[int, BoardStatus]], now_ns: int) -> list[Event]:
         """Process the status lines since the last step, and return the events of the changes.
 
-        Args:
-            reports: Each status line with its monotonic time of arrival, ns.
-            now_ns: Monotonic time of this step, ns.
+        `reports` has each status line with its monotonic time of arrival, ns.
         """
         self.pressed_now = ""
         if self.use == "off":
@@ -132,10 +124,7 @@ class BoardInput(ABC):
 
     @abstractmethod
     def read(self, status: BoardStatus) -> tuple[bool, ...] | None:
-        """Return whether each input is pressed according to a status line.
-
-        Return None if the line does not report the inputs.
-        """
+        """Return whether each input is pressed, or None if the line does not report the inputs."""
 
     @abstractmethod
     def words(self) -> str:
@@ -143,10 +132,7 @@ class BoardInput(ABC):
 
     @abstractmethod
     def released(self, before: EstopState) -> str:
-        """Return the log text for a release or, if `before` is "", for the first report.
-
-        `before` is the state of the inputs before this report.
-        """
+        """Return the log text for a release or, if `before` is "", for the first report."""
 
     def advice(self) -> str:
         """Return what the operator must do after a press, for the log."""
@@ -171,10 +157,7 @@ class EmergencyStop(BoardInput):
     silent, events = SILENT, ("emergency_stop", "emergency_stop_released")
 
     def read(self, status: BoardStatus) -> tuple[bool, ...] | None:
-        """Return whether a status line reports a press, as a tuple with one element.
-
-        Return None if the line does not report the input.
-        """
+        """Return `status.estop` in a tuple, or None if the status line does not report it."""
         return None if status.estop is None else (status.estop,)
 
     def words(self) -> str:

@@ -4,7 +4,7 @@ In a step, the left and the right side of the robot roll the distances dl and dr
 these distances are independent and have the variances k |dl| and k |dr|, where k is in m (Siegwart,
 Nourbakhsh & Scaramuzza, Introduction to Autonomous Mobile Robots, 5.2.4). The step has the distance
 d = (dl + dr) / 2 and the turn dyaw = (dr - dl) / L, where L is the effective track, m. The errors
-of these two are therefore
+of d and dyaw therefore have
 
     var(d) = k (|dl| + |dr|) / 4
     var(dyaw) = k (|dl| + |dr|) / L^2
@@ -17,11 +17,7 @@ the robot as a whole. In addition, skidding gives each turn the variance `yaw_va
 
 The errors of parameters, such as a wheel radius, do not average out, so they are not noise
 (Borenstein & Feng, Measurement and Correction of Systematic Odometry Errors in Mobile Robots,
-1996). `columns` returns one column for each parameter: the error of a step if this parameter is off
-by one standard deviation.
-
-`ErrorModel` holds the noise and the columns for the settings and the track in use. The covariance
-of the pose (`uncertainty.py`) and that of the twist (`TwistUncertainty`) use both.
+1996). `columns` returns one `Column` for each parameter.
 """
 
 from __future__ import annotations
@@ -56,10 +52,8 @@ PERIOD = 0.01
 """Period of the feedback lines that is assumed before one is measured, s."""
 
 SMOOTHED = 0.05
-"""Weight of the newest period in the mean period of the feedback lines.
-
-A single period means little, because several lines may be read at the same time.
-"""
+"""Weight of the newest period in the mean period of the feedback lines. It is small because several
+lines may be read at the same time."""
 
 
 class Noise:
@@ -80,9 +74,7 @@ class Noise:
         self._to_both = wheels / (2 * track)
 
     def of(self, distance: float, turn: float, turned: float) -> tuple[float, float, float]:
-        """Return the noise of a step: var(distance), var(turn) and their covariance.
-
-        The units of the result are m2, rad2 and m rad.
+        """Return var(distance), var(turn) and their covariance for a step, in m2, rad2 and m rad.
 
         Args:
             distance: the distance of the step, m.
@@ -99,10 +91,7 @@ class Noise:
 
 
 class ErrorModel:
-    """The noise of a step, and the effects of the parameters' errors.
-
-    Both follow from the settings and from the effective track in use.
-    """
+    """The noise of a step and the effects of parameter errors, for the track in use."""
 
     def __init__(self, odometry: OdometryConfig, kinematics: Kinematics) -> None:
         """Start with the configured track."""
@@ -113,10 +102,7 @@ class ErrorModel:
         self.turn_by(CONFIGURED if odometry.learned_track else None)
 
     def use(self, odometry: OdometryConfig) -> None:
-        """Use the noise of these settings from now on.
-
-        The uncertainty of the parameters stays as it was configured at the start.
-        """
+        """Use the noise of these settings from now on, but the same errors of parameters."""
         self.settings = odometry
         self.noise = Noise(odometry, self.track)
 
@@ -140,7 +126,7 @@ def columns(
     where r is `wheel_radius`, b is `wheel_separation`, and phi_l and phi_r are the wheel angles.
     The parameters are the multipliers m_l, m_r and m_L, the ratio m_r / m_l, a scale that
     multiplies all lengths, and the fraction of each distance that the wheels lose by slip. The
-    last two share one column. A parameter with a standard deviation of 0 has no column.
+    scale and the slip share one column. A parameter with a standard deviation of 0 has no column.
 
     If `learned` is given, the last column is the error of the learned track. It is zero while the
     configured track is in use.
@@ -245,10 +231,7 @@ class TwistUncertainty:
         )
 
     def slipping(self, variances: TwistVariances) -> TwistVariances:
-        """Return the variances multiplied by `SLIPPING`, because the wheels slip.
-
-        The lateral variance grows too, because the robot may move sideways.
-        """
+        """Return all variances times `SLIPPING`, because wheels may slip in any direction."""
         return TwistVariances(
             min(SLIPPING * variances.linear, MOST),
             min(SLIPPING * variances.lateral, MOST),
@@ -256,8 +239,5 @@ class TwistUncertainty:
         )
 
     def with_gyro(self, variances: TwistVariances, angular: float) -> TwistVariances:
-        """Return the variances with the variance of the turn rate replaced by `angular`.
-
-        `angular` is the variance of a gyro's turn rate, rad2/s2.
-        """
+        """Return the variances, with `angular` (rad2/s2, from a gyro) as that of the turn rate."""
         return TwistVariances(variances.linear, variances.lateral, min(max(LEAST, angular), MOST))

@@ -14,12 +14,10 @@ from typing import get_args
 from acsard.core.values import NS_PER_S, Event, EventName, Level
 
 BURST = 5
-"""Number of log lines of one event name that may be written at once: enough for a person who
-presses buttons."""
+"""Log lines of one name that may be written at once: enough for a person who presses buttons."""
 
 MOST = 8
-"""Largest number of event kinds, and of client names, that one log line lists. The line combines
-the rest as "others", because a client may use any number of names."""
+"""Largest number of event kinds, and of client names, in one log line. The rest are "others"."""
 
 LEVELS: tuple[Level, ...] = get_args(Level)
 
@@ -41,7 +39,6 @@ class _Held:
         _count(self._by, event.by, event.count)
 
     def line(self) -> Event:
-        """Return one event for all waiting ones, with the worst level and the last text."""
         last, what = self.last, _numbered(self._kinds)
         if self.count > last.count and last.text:
             what = f"{what or f'{self.count} times'}; the last"
@@ -60,10 +57,7 @@ class EventThrottle:
         rate of one line per second. Each written line adds one second."""
 
     def lines(self, events: list[Event], now_ns: int) -> tuple[Event, ...]:
-        """Add new events, and return the events to log now.
-
-        A returned event may combine several events, including earlier ones that had to wait.
-        """
+        """Add new events, and return the events to log now, which may combine several events."""
         if not (events or self._held):
             return ()
         for event in events:
@@ -72,11 +66,7 @@ class EventThrottle:
         return tuple([self._held.pop(name).line() for name in told])
 
     def _may(self, name: EventName, news: bool, now_ns: int) -> bool:
-        """Return whether a line of this name may be written now, and if so, count it as written.
-
-        `news` is true if at least one waiting event reports something new (`Event.news`). Only then
-        may up to `BURST` lines be written at once.
-        """
+        """Return whether a line of this name may be written now; if so, count it as written."""
         free_ns = self._free_ns.get(name, now_ns)
         if free_ns > now_ns + (BURST - 1 if news else 0) * NS_PER_S:
             return False
@@ -89,10 +79,7 @@ NUMBERED = re.compile(r"\A\d+ (?:x [^:;]*|times)(?:; the last)?: ")
 
 
 def together(before: Event, line: Event) -> Event:
-    """Merge `before` and the later `line` of the same event name into one line.
-
-    The result contains the total number of events and the text of `line`.
-    """
+    """Merge two lines of one name into one, with the total number of events and the later text."""
     count, last = before.count + line.count, NUMBERED.sub("", line.text, count=1)
     level = max(before.level, line.level, key=LEVELS.index)
     names = dict.fromkeys(filter(None, [*before.by.split(", "), *line.by.split(", ")]))

@@ -32,52 +32,46 @@ from typing import Literal
 from acsard.core.values import NS_PER_S, Command
 
 DRIFT = 5000
-"""The sender's clock may run faster or slower than ours by one part in this number. One part in
-5000 is twice the error of a bad crystal."""
+"""Two clocks may drift apart by one part in this number: twice the error of a bad crystal."""
 
 FORGET_NS = 250 * NS_PER_S
-"""Pause of a sender, ns, after which its clock counts as new, because it may have drifted by 50 ms.
-Both the arrivals and the stamps must show the pause. If only the arrivals show it, the network held
-the commands back, and the clock stays known."""
+"""Pause of a sender, ns, after which its clock counts as new: it may have drifted by 50 ms. If only
+the arrivals show the pause, the network held commands back, and the clock stays known."""
 
 KEEP_NS = 3600 * NS_PER_S
 """Silence of a sender, ns, after which its clock is forgotten to save memory."""
 
 EARLY_NS = NS_PER_S // 20
-"""A fall of the delay by more than this, ns, is not jitter: a backlog has ended, or a clock was
-set."""
+"""A larger fall of the delay, ns, is not jitter: a backlog has ended, or a clock was set."""
 
 WAVER_NS = NS_PER_S
-"""A rise of the delay by more than this, ns, is not jitter: the network held commands back."""
+"""A larger rise of the delay, ns, is not jitter: the network held commands back."""
 
 EVEN, CREPT = 200, 20
 """A proof (a test whether the delay is constant) compares the minimum delays of its two halves.
 They may differ by the duration of the proof divided by `EVEN`, or divided by `CREPT` if the delay
-creeps (see `CREEP`). The centres of the halves are half a duration apart, so the delay may change
-by 10 ms per second, or by 100 ms per second if it creeps. NTP slews a clock by up to 83 ms per
-second."""
+creeps (see `CREEP`). So the delay may change by 10 ms per second, or by 100 ms per second if it
+creeps. NTP slews a clock by up to 83 ms per second."""
 
 CREEP, JITTER_NS = 10, NS_PER_S // 200
 """A delay creeps if its change between two commands is at most the time between them divided by
 `CREEP`, plus `JITTER_NS`. Otherwise the delay jumps."""
 
 LONGEST_PROOF_NS = 2 * NS_PER_S
-"""Longest nominal duration of a proof (a test whether the delay is constant), ns. If the timeout of
-the source is shorter, the timeout is the nominal duration."""
+"""Nominal duration of a proof (a test whether the delay is constant), ns. The timeout of the source
+applies instead if it is shorter."""
 
 JUMP_PROOF_NS = 3 * NS_PER_S // 2
 """Shortest time for which the delay must be constant after it has jumped, ns. The jump is more
 likely a backlog that arrives in bursts than a clock that was set."""
 
 GAP_NS = 2 * NS_PER_S
-"""Silence of a sender, ns, that ends a proof (a test whether the delay is constant). If both the
-stamps and the arrivals show a pause of this length, a foreign clock (one that may be adjusted) may
-have been set by any amount meanwhile. Sequence numbers distinguish a pause from lost commands."""
+"""Silence of a sender, ns, that ends a test of its delay. If stamps and arrivals show the pause, a
+foreign clock (one that may be adjusted) may have been set by any amount meanwhile."""
 
 STANDS_NS = 10_000
-"""If two successive commands arrive more than `APART_NS` apart, but the second stamp is later by at
-most this, ns, the clock was set back by about the time between the arrivals. The second stamp may
-be slightly later, because Zenoh's own clock never goes back: it advances by a fraction of a
+"""A clock was set back if two commands arrive more than `APART_NS` apart, but the second stamp is
+later by at most this, ns. Zenoh's own clock never goes back: it advances by a fraction of a
 microsecond for each message until the wall clock has caught up."""
 
 APART_NS = NS_PER_S // 500
@@ -85,18 +79,15 @@ APART_NS = NS_PER_S // 500
 
 TOGETHER_NS = NS_PER_S // 2000
 """Commands that arrive within this time of each other, ns, come from one queue, the oldest first. A
-proof waits for the last of them before it compares delays. No sender may send more than 1000
-commands a second."""
+test of the delay waits for the last one. No sender may send more than 1000 commands a second."""
 
 FORGIVE_NS, FORGIVE_RATE = NS_PER_S, 60
-"""Budget, ns, for rises of the delay that are trusted although no adjustment of the clock was
-visible. Only a foreign clock (one that may be adjusted) has a budget. It is refilled by one second
-in `FORGIVE_RATE` seconds."""
+"""Budget, ns, for delay rises of a foreign clock (one that may be adjusted) that are trusted
+without a visible adjustment. It is refilled by one second in `FORGIVE_RATE` seconds."""
 
 MAX_CLOCKS = 1024
-"""Largest number of clocks that are remembered. If there are more, usually the one that was silent
-for longest is forgotten. To make the daemon forget the clock of a sender that sends at 20 Hz, a
-client would have to use this many names within 0.05 s."""
+"""Largest number of clocks. If there are more, usually the longest silent one is forgotten. To make
+the daemon forget a sender at 20 Hz, a client would need this many names within 0.05 s."""
 
 State = Literal["new", "known"]
 Verdict = Literal["fresh", "first", "unproven", "stale", "set"]
@@ -113,16 +104,14 @@ Verdict = Literal["fresh", "first", "unproven", "stale", "set"]
 class _Proof:
     """A test whether the delays have become constant, starting with one command.
 
-    The test divides the time into intervals. An interval is called a half, because it lasts half of
-    the nominal duration of a proof, but a test may take more than two. The test compares the
-    minimum delays of the halves, because minima have less jitter than single delays.
+    The test compares the minimum delays of successive intervals. An interval is called a half,
+    because it lasts half of the nominal duration of the test, but a test may take more than two.
 
-    - For a known clock (`again`), the test compares the first half with the second. If they differ,
-      the test begins again with the second half.
-    - For a new clock, it compares the first two halves. If they differ, it compares the last eight
-      halves in four pairs. The minima of the pairs must agree within the same limit (`EVEN`), or
-      differ by at most `EARLY_NS` without a trend. A trend means that the minima only fall, as
-      while a backlog arrives, or only rise, as while a queue grows.
+    - For a known clock (`again`), the test restarts with the second half if the first two differ.
+    - For a new clock whose first two halves differ, the test compares the last eight halves in
+      four pairs. The minima of the pairs must agree within the same limit (`EVEN`), or differ by
+      at most `EARLY_NS` without a trend. A trend means that the minima only fall, as while a
+      backlog arrives, or only rise, as while a queue grows.
     """
 
     def __init__(self, delay: int, at_ns: int, needed_ns: int, share: int, again: bool) -> None:
@@ -130,19 +119,13 @@ class _Proof:
         self._length_ns, self._share, self._again = needed_ns // 2, share, again
         self._begun_ns = self._last_ns = at_ns
         self._halves: list[tuple[int, int]] = []
-        """Start (monotonic) and minimum delay of each of the latest halves (see the class), ns."""
+        """Start (monotonic) and minimum delay of the latest halves, ns."""
 
     def add(self, delay: int, at_ns: int, timeout_ns: int) -> Literal["proven", "open", "failed"]:
         """Add a command, and return whether the delays are proven constant.
 
-        "open" means that the test goes on. "failed" means that a new test must begin with this
-        command. A command whose delay exceeds the lowest one by more than the timeout cannot
-        complete the test.
-
-        Args:
-            delay: Delay of the command, ns.
-            at_ns: Monotonic time at which the command arrived, ns.
-            timeout_ns: Timeout of the command's source, ns.
+        "failed" means that a new test must begin with this command. A command whose delay exceeds
+        the lowest one by more than the timeout cannot complete the test.
         """
         if not -EARLY_NS <= delay - self._first <= WAVER_NS:
             return "failed"
@@ -159,7 +142,6 @@ class _Proof:
         return "proven" if proven and delay - self.least <= timeout_ns else "open"
 
     def _constant(self, at_ns: int) -> bool:
-        """Return whether the minimum delays of the completed halves are constant."""
         minima, count = [least for _, least in self._halves], len(self._halves)
         lasted = at_ns - self._halves[0][0]
         if count == 2:
@@ -186,8 +168,7 @@ class _Clock:
         self.at_ns = at_ns
         """Arrival of the last command, monotonic ns."""
         self.forgiven_ns = 0
-        """Rise of the delay at the last verdict `set`, ns, without the part that visible
-        adjustments of the clock explain."""
+        """Rise of the delay, ns, that no visible adjustment explains, at the last verdict `set`."""
         self._stamp_ns = 0
         self._delay = 0
         self._number: int | None = None
@@ -197,20 +178,16 @@ class _Clock:
         self._early = 0
         """Amount by which the minimum has fallen recently, ns."""
         self._floor: int | None = None
-        """Lowest delay of a steady (never adjusted) clock, ns. It rises with time by the largest
-        possible drift. None for a foreign clock."""
+        """Lowest delay of a steady clock, ns, plus the possible drift; None for a foreign clock."""
         self._before: int | None = None
-        """Delay just before the first visible adjustment of the clock, ns; None if none was visible
-        since the last command that was on time."""
+        """Delay before the first visible adjustment since the last command that was on time, ns."""
         self._shown = 0
         """Sum of the clock's visible adjustments since the last command that was on time, ns."""
         self._doubted: tuple[int, int, int] | None = None
-        """An adjustment of the clock that the next command must confirm, because the network may
-        have swapped or repeated a command. The numbers are, in ns: the delay before the
-        adjustment, the amount of the adjustment, and the stamp before the adjustment."""
+        """An adjustment that the next command must confirm, because the network may have swapped or
+        repeated a command: the delay before it, its amount, and the stamp before it, ns."""
         self._paused = False
-        """Whether the sender has paused since the last command that was on time. Its clock may then
-        have been set by any amount."""
+        """Whether the sender paused since its last timely command. Its clock may have been set."""
         self._budget, self._budget_at_ns = FORGIVE_NS, at_ns
         self._proof: _Proof | None = None
         self._accepted: tuple[int, int] | None = None
@@ -222,11 +199,7 @@ class _Clock:
         return self._accepted is not None
 
     def judge(self, command: Command, stamp_ns: int, timeout_ns: int) -> Verdict:
-        """Return the verdict on the next command of this clock, and update the minimum delay.
-
-        `stamp_ns` is the time of sending by this clock, ns. `timeout_ns` is the timeout of the
-        command's source.
-        """
+        """Return the verdict on the next command of this clock, and update the minimum delay."""
         at_ns, delay = command.arrived_ns, command.arrived_ns - stamp_ns
         silence, departed = at_ns - self.at_ns, stamp_ns - self._stamp_ns
         if silence > FORGET_NS and departed > FORGET_NS:
@@ -250,18 +223,12 @@ class _Clock:
         return verdict
 
     def _superseded(self, mark: tuple[int, int]) -> bool:
-        """Return whether a command newer than the one with this stamp and number was accepted.
-
-        Of two commands with equal stamps and without sequence numbers, neither is newer.
-        """
+        """Return whether a command newer than the one with this stamp and number was accepted."""
         last = self._accepted
         return last is not None and (mark < last or (mark == last and mark[1] >= 0))
 
     def _later_than_lowest(self, delay: int, silence: int) -> int:
-        """Return by how much this delay of a steady (never adjusted) clock exceeds the lowest, ns.
-
-        `silence` is the time since the command before, ns.
-        """
+        """Return by how much this delay of a steady clock exceeds the lowest one, ns."""
         floor = delay if self._floor is None else self._floor + silence // DRIFT
         self._floor = min(floor, delay)
         return delay - self._floor
@@ -270,14 +237,8 @@ class _Clock:
         """Record a pause of the sender, or an adjustment of its clock.
 
         A stamp that goes back or stands still shows an adjustment. The next command must confirm
-        the adjustment: its stamp must also go back or stand still, or must not be later than the
-        stamp before the adjustment.
-        Nothing is recorded if the sequence numbers show that commands were lost.
-
-        Args:
-            stamp_ns: Stamp of this command, ns.
-            silence: Time between the arrivals of the previous command and of this one, ns.
-            number: Sequence number of this command, None without one.
+        it: its stamp must also go back or stand still, or must not be later than the stamp before
+        the adjustment. Nothing is recorded if the sequence numbers show that commands were lost.
         """
         doubted, self._doubted = self._doubted, None
         if number is not None and self._number is not None and number != self._number + 1:
@@ -331,10 +292,9 @@ class _Clock:
         return "stale"
 
     def _forgive(self, proof: _Proof, at_ns: int) -> Verdict:
-        """Trust the delay that the proof has shown if that is allowed, and return the verdict.
+        """Trust the proven delay if that is allowed, and return the verdict.
 
-        A rise of the delay is allowed if an adjustment of the clock was visible, if the sender has
-        paused, or if the budget is large enough.
+        A rise is allowed after a visible adjustment or a pause, or within the budget.
         """
         self._accrue(at_ns, FORGET_NS)
         hidden = proof.least - self._least
@@ -367,23 +327,19 @@ class Freshness:
     def __init__(self) -> None:
         self._clocks: dict[str, _Clock] = {}
         self._newcomers: dict[str, _Clock] = {}
-        """Foreign clocks (they may be adjusted) without an accepted command. They are forgotten
-        after a silence of `GAP_NS`."""
+        """Foreign clocks without an accepted command, forgotten after `GAP_NS` of silence."""
         self._unproved: dict[str, _Clock] = {}
-        """Steady clocks (never adjusted) without an accepted command. They are kept for a silence
-        of `KEEP_NS`, because their lowest delay is valid from the first command on."""
+        """Steady clocks without an accepted command. They are kept for `KEEP_NS` of silence,
+        because their lowest delay is valid from the first command on."""
         self._numbers: dict[str, tuple[int, int]] = {}
-        """Sequence number and monotonic arrival, ns, of the last command of each sender whose
-        commands have numbers but no stamps."""
+        """Last number and monotonic arrival, ns, of each sender with numbers but without stamps."""
         self.forgiven_ns = 0
-        """Sum of the rises of the delay that were trusted although no adjustment of the clock was
-        visible, ns."""
+        """Total rise of command delays, ns, accepted without a visible clock adjustment."""
 
     def judge(self, command: Command, timeout_ns: int) -> Verdict:
         """Return the verdict on a command, and remember its stamp and sequence number.
 
-        A command without a stamp is never too old, but it is stale if its sequence number is out of
-        order. `timeout_ns` is the timeout of the command's source.
+        A command without a stamp is stale only if its sequence number is out of order.
         """
         if command.stamp_ns is None:
             return self._in_order(command)
@@ -403,10 +359,7 @@ class Freshness:
         return verdict
 
     def _in_order(self, command: Command) -> Verdict:
-        """Judge a command without a stamp by its sequence number, and return the verdict.
-
-        After a pause of `GAP_NS` the sender may start again with lower numbers.
-        """
+        """Judge a command without a stamp by its number. After `GAP_NS`, numbers may restart."""
         number, at_ns = command.sequence, command.arrived_ns
         if number is None:
             return "fresh"
@@ -420,11 +373,10 @@ class Freshness:
         return "fresh"
 
     def _forget(self, now_ns: int) -> None:
-        """Forget clocks that were silent for long. Forget another if over `MAX_CLOCKS` are left.
+        """Forget clocks that were silent for long, and one more if over `MAX_CLOCKS` are left.
 
-        This other clock is the longest silent one in `_unproved` if it was silent for `GAP_NS`,
-        otherwise the longest silent one of all. The number of clocks is limited, because
-        a recording begins with all of them, and the control loop writes them in one step.
+        The number is limited, because a recording begins with all clocks, and the control loop
+        writes them in one step.
         """
         limits = (self._newcomers, GAP_NS), (self._unproved, KEEP_NS), (self._clocks, KEEP_NS)
         for held, silent_ns in limits:

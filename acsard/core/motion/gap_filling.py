@@ -7,9 +7,6 @@ no line covers, it assumes the speed before the gap for the first half of the ga
 after the gap for the second half. If the daemon commanded rest during the gap, it assumes the speed
 before the gap only until that command. The motion during implausible lines is computed with the
 next plausible line.
-
-`Gaps` estimates how much the true motion in a gap differs from a constant acceleration between the
-two known speeds.
 """
 
 from __future__ import annotations
@@ -23,24 +20,22 @@ from acsard.core.link.feedback import Feedback
 from acsard.core.values import REST, Twist, WheelSpeeds
 
 MAX_LOST_S, MAX_LOST = 0.05, 1
-"""Limits for implausible lines in a row that have no encoder counts. If they last at most
-`MAX_LOST_S` s in total, or if there are at most `MAX_LOST` of them, the robot is assumed to have
-moved at the speed of the next plausible line. Otherwise, its motion during them is unknown."""
+"""If implausible lines in a row without encoder counts last at most `MAX_LOST_S` s, or are at most
+`MAX_LOST`, the robot is assumed to have moved at the speed of the next plausible line. Otherwise,
+its motion during them is unknown."""
 
 NOWHERE = (0.0, 0.0, 0.0, 0.0)
 
 GUESS = Twist(0.125, 0.5)
 """Standard deviation of the acceleration that is assumed before any measurement, m/s2 and rad/s2.
-
-It is an eighth of the default acceleration limits. Random driving rarely exceeds it.
-"""
+It is an eighth of the default acceleration limits. Random driving rarely exceeds it."""
 
 SPAN = 0.2
 """Time over which the deviation from constant acceleration is measured, s."""
 
 FIRST, MOST = 4.0, 300.0
-"""Weights in numbers of spans of `SPAN` s. `FIRST` is the weight of `GUESS`, and `MOST` is the
-largest weight of the mean of all measurements. 300 spans are a minute of driving."""
+"""Weight of `GUESS`, and largest weight of the mean of all measurements, in numbers of spans
+(`SPAN`). A minute of driving has 300 spans."""
 
 GROWTH = 5
 """Exponent in the growth of a gap's variance with the duration of the gap (`Gaps`)."""
@@ -50,20 +45,17 @@ class Rolled(Struct, frozen=True, gc=False):
     """Wheel angles since the last plausible line, rad, in the order of `WHEELS`."""
 
     pieces: tuple[Motors, ...]
-    """The angles that follow from speeds, in the order of time, rad. Each piece becomes an arc of
-    the path. No piece is zero for all wheels."""
+    """Angles from speeds, rad, in the order of time. Each is an arc of the path and not zero."""
     turned: Motors
-    """The angles according to the encoder counts in the lines, rad. This motion came before that
-    of `pieces`."""
+    """Angles from encoder counts, rad. This motion came before that of `pieces`."""
     seen: Motors
-    """The angles during `seconds` according to the speeds or counts in the last line, rad. They
-    contain the rounding errors of that line."""
+    """Angles during `seconds` according to the last line, rad, with its rounding errors."""
     seconds: float
     """Duration of the motion `seen`, s."""
     bridged: float
     """Part of `seconds` that no line covers, and for which the speeds were assumed, s."""
     unknown: float
-    """Further time, in addition to `seconds`, in which the motion of the robot is unknown, s."""
+    """Time in addition to `seconds` in which the motion of the robot is unknown, s."""
     known: float
     """Duration of `pieces` and `turned` together, s; 0 if a part of the motion is unknown."""
 
@@ -75,8 +67,8 @@ class Rolling:
         """Start. The daemon commands rest after `quiet` s without feedback."""
         self._quiet = quiet
         self._lost = self._gap = self._counted = 0.0
-        """Three sums of durations, s: of implausible lines without counts, of the gaps before these
-        lines, and of implausible lines with counts."""
+        """Durations, s: of implausible lines without counts, of the gaps before these lines, and of
+        implausible lines with counts."""
         self._turned, self._skipped = NOWHERE, 0
 
     def skip(self, line: Feedback) -> None:
@@ -189,8 +181,7 @@ class Gaps:
         """Return the variances of distance (m2) and turn (rad2) that a filled gap adds.
 
         The gap lasts `seconds` s. Gaps that directly follow each other count as one longer gap, and
-        the result is then only the increase. `before` and `after` are the speeds before and after
-        this gap.
+        the result is then only the increase.
         """
         bridged, given = self._bridged + seconds, self._given
         along, yaw = self.unseen(bridged, before, after)
@@ -199,10 +190,7 @@ class Gaps:
         return max(0.0, along - given[0]), max(0.0, yaw - given[1])
 
     def unseen(self, seconds: float, before: Twist, after: Twist) -> tuple[float, float]:
-        """Return the variances of the distance (m2) and the turn (rad2) in a gap.
-
-        The gap lasts `seconds` s, and `before` and `after` are the speeds before and after it.
-        """
+        """Return the variances of the distance (m2) and the turn (rad2) in a gap of `seconds` s."""
         scale = (seconds / SPAN) ** GROWTH
         fastest = max(abs(before.linear), abs(after.linear)) * seconds
         turning = max(abs(before.angular), abs(after.angular)) * seconds

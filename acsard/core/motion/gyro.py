@@ -10,8 +10,7 @@ corrects it afterwards. A gyro that reads the opposite sign, degrees or zero is 
 used (`gyro_trial.py`). If a gyro is silent, or its rate is out of all proportion to the wheels, the
 heading comes from the wheels.
 
-The module remembers the angle that it has returned so far, not the time of its last result. So a
-sample that arrives late is included in the turn of the next line, and no turn is lost.
+A sample that arrives late is included in the turn of the next line, so no turn is lost.
 """
 
 from __future__ import annotations
@@ -32,22 +31,18 @@ REST_S = 0.2
 """Time for which all four wheels must report zero speed before the robot counts as standing, s."""
 
 SILENT_NS = NS_PER_S // 5
-"""Age of the last sample, ns, at which the gyro counts as silent. Until then, the robot is assumed
-to turn at the rate of the last sample."""
+"""Age of the last sample, ns, at which the gyro counts as silent. Its rate holds until then."""
 
 LATEST_NS = NS_PER_S // 4
-"""If the delay of a sample exceeds the least delay so far by more than this, ns, the clock of its
-sender must have been set."""
+"""If the delay of a sample exceeds the least one by more than this, ns, its clock was set."""
 
 SET_BACK_NS = NS_PER_S // 50
-"""If a stamp is earlier than the previous one by more than this, ns, the clock of the sender was
+"""A stamp earlier than the previous one by more than this, ns, shows that the sender's clock was
 set. Samples arrive in order, but a driver may swap two of them or measure their times with some
-jitter.
-"""
+jitter."""
 
 DELAYS_NS = (-NS_PER_S // 10, 3 * NS_PER_S // 10)
-"""Least and greatest delay of the gyro relative to the wheels, ns. An early gyro has a negative
-delay."""
+"""Range of the gyro's delay relative to the wheels, ns. An early gyro has a negative delay."""
 
 LEAST_DELAY_S = 0.002
 """Smallest correction of the delay that is applied, s."""
@@ -56,12 +51,10 @@ SLIP_S = 0.5
 """Seconds for which the wheels count as slipping after they last contradicted the gyro."""
 
 MOST_SLIP_S = 5.0
-"""Longest slip of the wheels, s. A gyro that contradicts the wheels for longer is stuck, or is not
-a gyro."""
+"""Longest slip of the wheels, s. A gyro that contradicts them for longer is not believed."""
 
 ENOUGH_BLOCKS = 20.0
-"""Number of blocks, each of 0.1 s of turning (`gyro_match.py`), after which the ratio of the gyro's
-turn to the wheels' turn is trusted."""
+"""Number of blocks of turning, 0.1 s each, after which the ratio of the turns is trusted."""
 
 WORDS: dict[GyroDoes, str] = {
     "off": "",
@@ -91,15 +84,12 @@ class Turn(Struct, frozen=True, gc=False):
     angle: float
     variance: float
     rate: float
-    """The turn rate that the gyro measures, rad/s. `angle` may include late samples, so it need not
-    be this rate times the duration of the line."""
+    """Turn rate according to the gyro, rad/s. `angle` may also include late samples."""
     rate_variance: float
     wheels: float | None = None
-    """The angle that wheels without a fault would report for this turn, rad. Wheels that skid
-    report more than the turn of the robot."""
+    """Turn that sound wheels would report, rad. Wheels that skid report more than `angle`."""
     slips: bool = False
-    """Whether the wheels slip: within the last half second, they reported another turn than the
-    gyro."""
+    """Whether the wheels reported another turn than the gyro within the last half second."""
 
 
 class Gyro:
@@ -110,8 +100,7 @@ class Gyro:
         self._learned: Track | None = None
         """The effective track that was learned with an earlier gyro, None without one."""
         self.owes = False
-        """Whether the wheels provided the turn of the last feedback line because the gyro is not
-        proven yet. Once gyro and wheels agree in a turn, the gyro corrects the pose."""
+        """Whether the wheels provided the last turn because the gyro is not proven yet."""
         self._does: GyroDoes = "silent"
         self.events: list[Event] = []
         """Events of the last `turn`, for the log."""
@@ -121,26 +110,22 @@ class Gyro:
         """Start over with a gyro whose bias, delay and direction are unknown."""
         self._bias, self._match, self._trial = Bias(), Match(), Trial()
         self._heard: deque[tuple[int, GyroSample]] = deque(maxlen=256)
-        """Samples that no `turn` has used yet, each with the monotonic time of its measurement,
-        ns."""
+        """Samples that no `turn` has used yet, each with its monotonic time of measurement, ns."""
         self._promptest = MinimumDelay()
         self._last: GyroSample | None = None
         self._delay_ns = 0
         self._told_ns: int | None = None
-        """Monotonic time of the last sample that `_angle` contains, ns; None before the first
-        one."""
+        """Monotonic time of the last sample in `_angle`, ns; None before the first one."""
         self._rate = 0.0
         self._angle = self._given = 0.0
-        """Sum of the turns of all samples that were used, and the angle that `turn` has returned so
-        far, rad."""
+        """Turn of all samples that were used, and the part that `turn` has returned so far, rad."""
         self._variance = 0.0
         """Variance of the angle that `turn` has not returned yet, rad2."""
         self._slip_s = self._slipped_s = 0.0
         self._noise = 0.0
         """Variance of the present rate, rad2/s2."""
         self._hole = False
-        """Whether samples are missing since the last feedback line, or the gyro was silent at that
-        line."""
+        """Whether samples are missing since the last line, or the gyro was silent at that line."""
         self.forgive()
 
     @property
@@ -208,16 +193,16 @@ class Gyro:
         return Turn(angle, variance, self._rate, noise, rolled, self._does == "disagrees")
 
     def forgive(self) -> None:
-        """Cancel the pending correction of the pose by the gyro. Call this when the pose is set."""
+        """Cancel the pending correction of the pose by the gyro, because the pose has been set."""
         self._owed = self._owed_variance = 0.0
-        """The pending correction of the heading: the gyro's turn minus the wheels' turn while the
-        gyro was not proven, rad, and its variance, rad2. It is applied once the gyro is proven."""
+        """The gyro's turn minus the wheels' turn while the gyro was not proven, rad, and its
+        variance, rad2. The difference is added to the heading once the gyro is proven."""
 
     def taken_back(self, turn: float) -> float:
-        """Account for a change of `turn` rad in the total turn of the lines with `owes`.
+        """Account for recomputed lines with `owes`, whose total turn has changed by `turn` rad.
 
-        Return the angle that the caller must subtract from the heading, rad. If the gyro is proven
-        by now, it has already corrected the heading, so this angle is `turn`. Otherwise it is 0.
+        Return the angle that the caller must subtract from the heading, rad. It is `turn` if the
+        gyro is proven by now and has corrected the heading, otherwise 0.
         """
         verdict = self._trial.verdict
         if verdict == "none yet":
@@ -227,11 +212,7 @@ class Gyro:
     # Samples.
 
     def _time_of(self, sample: GyroSample) -> int:
-        """Return the monotonic time at which a sample was measured, plus a constant delay, ns.
-
-        This is the time of arrival minus the jitter of the network, which the sample's stamp
-        reveals. For a sample without a stamp, it is the time of arrival.
-        """
+        """Return the monotonic arrival of a sample, ns, minus the jitter that its stamp reveals."""
         last, self._last = self._last, sample
         if last is None or sample.stamp_ns is None or last.stamp_ns is None:
             return sample.at_ns
@@ -266,8 +247,7 @@ class Gyro:
     def _try(self, wheels: float, angle: float, variance: float, dt: float, resting: bool) -> bool:
         """Test the gyro if it is not proven yet, and return whether the wheels provide this turn.
 
-        They do until the gyro is proven, except at rest. There the gyro provides the turn, because
-        the wheels do not show whether a person turns the robot.
+        At rest the gyro provides it, because the wheels do not show that a person turns the robot.
         """
         trial, known = self._trial, self._bias.known
         if not trial.open or resting:
@@ -294,10 +274,7 @@ class Gyro:
         self._slipped_s = self._slipped_s + dt if self._slip_s > 0.0 else 0.0
 
     def _shift(self) -> None:
-        """Correct the assumed delay of the gyro.
-
-        Call this only at rest, when a new delay does not change the heading.
-        """
+        """Correct the assumed delay. Only for use at rest: elsewhere the heading would jump."""
         delay = self._match.delay()
         if delay is not None and abs(delay) >= LEAST_DELAY_S:
             earliest, latest = DELAYS_NS

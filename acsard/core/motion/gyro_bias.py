@@ -18,23 +18,18 @@ WALK = 1e-4
 """Random walk of a cheap gyro's bias with temperature, rad/s per square root of a second."""
 
 UNLIKELY = 5.0
-"""Number of standard deviations. A sample at rest that differs from the bias by more is not noise.
-"""
+"""A sample at rest that differs from the bias by more standard deviations is not noise."""
 
 SLACK = 0.01
 """Further allowed difference of a sample from the bias, rad/s. A robot that stands may vibrate."""
 
 LEAST_NOISE = 1e-5
-"""Smallest assumed standard deviation of a sample, rad/s. A gyro that repeats one value still has
-errors, because its resolution is coarse."""
+"""Smallest assumed standard deviation of a sample, rad/s. Coarse gyros may repeat one value."""
 
 ANEW_S = 1.0
 """If the reading at rest differs from the bias but stays constant for this time, s, it becomes the
-new bias.
-
-Possible causes are a restart of the gyro, a change of its temperature, or a robot that was turned
-while the first bias was learned.
-"""
+new bias. The gyro may have restarted or warmed up, or the robot may have turned while the first
+bias was learned."""
 
 LEARNING = 0.02
 """Weight of a new sample in the estimate of the noise. About the last fifty samples count."""
@@ -66,10 +61,8 @@ class Bias:
     def rest(self, rate: float, variance: float, dt: float) -> bool:
         """Learn from a sample while the wheels stand; return False if it shows a turning robot.
 
-        Args:
-            rate: the turn rate of the sample, rad/s.
-            variance: the variance that the gyro declares, rad2/s2; 0 if it declares none.
-            dt: the time since the sample before, s.
+        `rate` is in rad/s, `dt` is the time since the sample before, s, and `variance` is the one
+        that the gyro declares, rad2/s2; 0 if it declares none.
         """
         if not self.known:
             return self._average(rate, variance, dt)
@@ -87,11 +80,7 @@ class Bias:
         return True
 
     def _doubt(self, rate: float, variance: float, dt: float, noise: float) -> bool:
-        """Process a sample that contradicts the bias, and return whether the bias has changed.
-
-        The bias has changed if such samples are constant for `ANEW_S`. Until then, the robot is
-        assumed to turn.
-        """
+        """Process a sample that contradicts the bias; return True if it changes the bias."""
         other = self._other = self._other or Bias()
         if not other.rest(rate, variance, dt) or other._rested_s < ANEW_S:
             return False
@@ -102,10 +91,7 @@ class Bias:
         return True
 
     def _average(self, rate: float, variance: float, dt: float) -> bool:
-        """Update the mean and the variance of the first samples by Welford's method.
-
-        Return False if the sample shows a turn.
-        """
+        """Update mean and variance by Welford's method; return False if the sample shows a turn."""
         if abs(rate) > MAX_BIAS:
             return False
         self._rested_s += dt

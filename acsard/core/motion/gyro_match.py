@@ -21,8 +21,7 @@ from collections import deque
 from msgspec import Struct
 
 BLOCK_S = 0.1
-"""Duration of a block, over which mean rates are compared, s. A single line has too few encoder
-counts."""
+"""Duration of a block of mean rates, s. A single line has too few encoder counts."""
 
 LEAST_RATE = 0.05
 """Smallest turn rate according to the wheels, rad/s, at which the robot counts as turning."""
@@ -32,8 +31,7 @@ LEAST_CHANGE = 0.3
 changes more slowly, the change of the wheels' rate counts as 0."""
 
 MEMORY = 0.995
-"""Factor by which each new block of turning reduces the weight of the earlier ones. The last 20 s
-of turning have most of the weight."""
+"""Factor by which each block of turning reduces the weight of earlier ones: 20 s of memory."""
 
 ROUGH, FINE = 0.5, 0.1
 """Standard deviation of the ratio of the gyro's turn to the wheels' turn. `ROUGH` is assumed before
@@ -58,12 +56,10 @@ BEFORE, BEHIND = 2, 3
 earlier or `BEHIND` blocks later. This covers every delay in `gyro.DELAYS_NS`."""
 
 BLOCK_NOISE, BLOCK_SHARE = 0.01, 0.03
-"""Standard deviation of a block's mean turn rate: a constant in rad/s, plus a fraction of the rate.
-"""
+"""Standard deviation of a block's mean rate: a constant, rad/s, plus a fraction of the rate."""
 
 LAG_S = 0.05
-"""Standard deviation of the gyro's delay, s, that the test for a contradiction assumes until the
-delay has been measured."""
+"""Standard deviation of the gyro's delay that `contradiction` assumes until it is measured, s."""
 
 CERTAIN_S = 0.004
 """`Match.delay` returns a delay only if its standard deviation is below this, s."""
@@ -76,15 +72,11 @@ LEAST_SLIP = 0.015
 without slip. Encoder counts and vibration cause it."""
 
 CERTAIN = 3.0
-"""Gyro and wheels contradict each other if their turns over `WINDOW_S` differ by more than this
-number of standard deviations."""
+"""Turns over `WINDOW_S` that differ by more standard deviations contradict each other."""
 
 
 class Block(Struct, frozen=True, gc=False):
-    """The turn of the robot during one block of time according to wheels and gyro, rad.
-
-    `change` is the change of the turn rate according to the wheels, rad/s2.
-    """
+    """Turns in one block by wheels and gyro, rad, and change of the wheels' turn rate, rad/s2."""
 
     wheels: float
     gyro: float
@@ -100,16 +92,13 @@ class Match:
 
     def __init__(self) -> None:
         self._ww, self._wg = 1.0 / ROUGH**2, 1.0 / ROUGH**2
-        """Least-squares sums. Their initial values stand for a ratio of 1 with the standard
-        deviation `ROUGH`."""
+        """Least-squares sums. They start with a ratio of 1 and its standard deviation `ROUGH`."""
         self._wd, self._dg, self._dd = NO_DELAY
         self._off = self._way = 0.0
-        """In the present stretch (see `STRETCH`): the turn of the gyro minus the turn that the fit
-        predicted, and the turn of the wheels, rad."""
+        """In this stretch: the gyro's turn minus the fitted one, and the wheels' turn, rad."""
         self._ways = PRIOR * STRETCH**2
         self._offs = ROUGH**2 * self._ways
-        """Weighted sum of `_off` squared over the completed stretches, rad2. `_ways` is the same
-        sum of `_way` squared."""
+        """Weighted sums of `_way` squared and `_off` squared over the completed stretches, rad2."""
         self._lag = LAG_S
         self.blocks = 0.0
         """Number of blocks in which the robot turned; older blocks count less (`MEMORY`)."""
@@ -130,8 +119,7 @@ class Match:
     def delay(self) -> float | None:
         """Return the delay of the gyro minus the assumed delay, s, or None if it is uncertain.
 
-        If the result is a number, the measurement of the delay has started over, so the caller must
-        add this number to the assumed delay.
+        The caller must add this delay to the assumed one, because the measurement starts over.
         """
         ratio, slope = self.ratio, self._slope
         spread = self._dd - self._wd * self._wd / self._ww
@@ -144,14 +132,7 @@ class Match:
         return -slope / ratio
 
     def add(self, wheels: float, gyro: float, dt: float, slips: bool) -> None:
-        """Add a feedback line.
-
-        Args:
-            wheels: the turn according to the wheels, rad.
-            gyro: the turn according to the gyro, rad.
-            dt: the duration of the line, s.
-            slips: whether the wheels slip. If they do, nothing is learned from the line.
-        """
+        """Add a feedback line (turns in rad, `dt` in s). If `slips` is true, nothing is learned."""
         self._slide(wheels, gyro, dt)
         rate = wheels / dt
         # Use the mean of two lines, because the rate of one line jumps with each encoder count.
@@ -168,9 +149,9 @@ class Match:
             self._began = smooth
 
     def contradiction(self, variance: float) -> bool:
-        """Return whether the gyro contradicts the wheels over the last `WINDOW_S` s.
+        """Return whether gyro and wheels contradict each other in the last `WINDOW_S` s.
 
-        `variance` is the variance of the gyro's turn over this time, rad2.
+        `variance` is that of the gyro's turn, rad2.
         """
         wheels, gyro, time = self._sums
         if time < WINDOW_S * 0.95:
@@ -224,5 +205,4 @@ class Match:
         """The ratio a: the turn of the gyro divided by the turn of the wheels."""
         self._slope = (self._dg * self._ww - self._wg * self._wd) / det
         self.deviation = max(FINE, ROUGH / math.sqrt(1.0 + self.blocks))
-        """Assumed standard deviation of `ratio`. It falls from `ROUGH` to `FINE` with more blocks.
-        """
+        """Assumed standard deviation of `ratio`. It falls from `ROUGH` to `FINE`."""

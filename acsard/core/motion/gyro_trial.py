@@ -11,14 +11,12 @@ from __future__ import annotations
 from typing import Literal
 
 LEAST_RATE = 0.1
-"""Turn rate according to the wheels, rad/s. If a line shows at least this rate in the opposite
-direction, a new turn begins: a lower rate may come from a single encoder count. A gyro that reads
-zero is called dead only above this rate, because wheels with unequal tyres report a slow turn on a
-straight drive."""
+"""Turn rate according to the wheels, rad/s, from which a line in the opposite direction begins a
+new turn: a lower rate may come from a single encoder count. A gyro that reads zero is called dead
+only above this rate, because unequal tyres report a slow turn on a straight drive."""
 
 SLOWEST, STRETCH_S = 0.05, 0.5
-"""Smallest mean turn rate according to the wheels, rad/s, that counts as a turn, and the time over
-which the mean is taken, s."""
+"""Least mean turn rate by the wheels that counts as a turn, rad/s, and time of the mean, s."""
 
 PROPORTIONS = (0.25, 2.5)
 """Range of the robot's true turn divided by the turn according to the wheels, on any floor."""
@@ -31,27 +29,21 @@ REFUTED_S = 0.3
 """Least time of turning before a gyro is refuted, s. No gyro has a delay as long as this."""
 
 DEGREES = (15.0, 150.0)
-"""Range of the gyro's turn divided by the wheels' turn for a gyro that reads degrees. This ratio is
-about 57.3 times that of a sound gyro."""
+"""Range of the gyro's turn divided by the wheels' turn if the gyro reads degrees: near 57."""
 
 Verdict = Literal["none yet", "good", "reversed", "in degrees", "dead", "not believed"]
 
 
 class Trial:
-    """Compares a gyro with the wheels, line by line, until the gyro is proven to work.
-
-    A gyro that is refuted may still be proven later.
-    """
+    """Compares a gyro with the wheels until the gyro is proven, even if it was refuted before."""
 
     def __init__(self) -> None:
         self.verdict: Verdict = "none yet"
         self._wheels = self._gyro = self._seconds = 0.0
         self._stretch = self._stretch_s = self._stretch_gyro = 0.0
-        """The present stretch, which ends after `STRETCH_S`: the turn according to the wheels, rad,
-        the duration, s, and the turn according to the gyro, rad."""
+        """The present stretch: turn of the wheels, rad; duration, s; and turn of the gyro, rad."""
         self._fast = self._fast_gyro = 0.0
-        """Turns according to wheels and gyro, rad, over all stretches of this turn that were fast
-        enough to call a gyro dead."""
+        """Turns of wheels and gyro, rad, over the stretches fast enough to call a gyro dead."""
 
     @property
     def open(self) -> bool:
@@ -59,14 +51,10 @@ class Trial:
         return self.verdict != "good"
 
     def add(self, wheels: float, gyro: float, dt: float, certain: bool = True) -> None:
-        """Add the turn of the robot in one feedback line, and update the verdict.
+        """Add the turn in one feedback line by wheels and gyro, rad, and update the verdict.
 
-        Args:
-            wheels: The turn according to the wheels, rad.
-            gyro: The turn according to the gyro, rad.
-            dt: Duration of the line, s.
-            certain: Whether the gyro's bias is known. If not, the only new verdict can be "in
-                degrees".
+        If `certain` is false, the gyro's bias is unknown, and the only new verdict can be "in
+        degrees".
         """
         self._stretch += wheels
         self._stretch_gyro += gyro

@@ -54,9 +54,8 @@ class Kinematics:
     def moved(self, wheels: tuple[float, float, float, float]) -> tuple[float, float]:
         """Return the distance (m) and the turn (rad) of the base for these wheel angles (rad).
 
-        `wheels` is in the order of `WHEELS`. For wheel speeds (rad/s), the result is a linear speed
-        (m/s) and a turn rate (rad/s). It runs several times for each feedback line, so it uses
-        plain tuples, which are faster than `Twist`.
+        `wheels` is in the order of `WHEELS`. For wheel speeds (rad/s), the result is in m/s and
+        rad/s.
         """
         front_right, front_left, rear_left, rear_right = wheels
         left = self._left_radius * (front_left + rear_left) / 2
@@ -64,12 +63,10 @@ class Kinematics:
         return (right + left) / 2, (right - left) / self.track
 
     def opposite(self, left: float, right: float, turn: float) -> tuple[float, float]:
-        """Compute the wheel angle of each side from the other side and the turn, rad.
+        """Compute the wheel angles (left, right), each from the other side and the turn, rad.
 
-        The first result is the angle of the left side, computed from `right` and `turn`. The second
-        is the angle of the right side, computed from `left` and `turn`. `left` and `right` are the
-        mean wheel angles of the sides, rad, and `turn` is the turn of the base, rad. The method
-        applies equation (3) of the module to angles.
+        `left` and `right` are the mean wheel angles of the sides, and `turn` is the turn of the
+        base, rad (equation (3) of the module).
         """
         across = turn * self.track
         return (
@@ -78,10 +75,7 @@ class Kinematics:
         )
 
     def saturate(self, twist: Twist, wheel_speed: float) -> Twist:
-        """Return the twist, scaled down until no wheel exceeds `wheel_speed` rad/s.
-
-        The curvature of the motion stays the same.
-        """
+        """Return the twist scaled down until no wheel exceeds `wheel_speed` rad/s."""
         speeds = self.wheel_speeds(twist)
         fastest = max(abs(speeds.front_right), abs(speeds.front_left))
         if fastest <= wheel_speed:

@@ -13,27 +13,20 @@ from msgspec import Struct
 from acsard.core.values import Event, GyroStatus, Level, TrackUse
 
 LEAST = 0.05
-"""Smallest relative standard deviation of a learned track. It is not 0, because the floor and the
-turn rate may change. `gyro_match.FINE` is the error at one moment. The mean error of a whole drive
-is smaller, so this is half of `FINE`."""
+"""Smallest relative standard deviation of a learned track, because floor and turn rate may change.
+It is half of `gyro_match.FINE`: the mean error of a drive is smaller than that of a moment."""
 
 CERTAIN, UNCERTAIN = 0.1, 0.2
-"""Relative standard deviations of the learned track: below the first, an uncertain track becomes
-certain, and above the second, a certain track becomes uncertain."""
+"""Relative standard deviations. An uncertain track becomes certain below `CERTAIN`, and a certain
+track becomes uncertain above `UNCERTAIN`."""
 
 BOUNDS = (0.5, 2.5)
-"""Range of the learned track, divided by the configured one.
-
-The effective track is 1.4 to 1.9 times the wheel separation on most floors, and 2.5 times on
-slippery ones. Beyond the range, one of the two tracks must be wrong.
-"""
+"""Range of the learned track, divided by the configured one. The effective track is 1.4 to 1.9
+times the wheel separation on most floors, and 2.5 times on slippery ones."""
 
 INWARDS = 1.05
-"""A learned track comes into use only if it is inside `BOUNDS` by this factor.
-
-It stays in use until it leaves `BOUNDS`. Without this hysteresis, a track near a bound could go in
-and out of use again and again.
-"""
+"""A learned track comes into use only if it is inside `BOUNDS` by this factor. Otherwise a track
+near a bound could go in and out of use again and again."""
 
 NOTES: dict[TrackUse, str] = {
     "shown": "(only shown)",
@@ -49,10 +42,7 @@ class Track(Struct, frozen=True):
     share: float = 1.0
     """The effective track divided by the configured one."""
     deviation: float = 0.0
-    """Relative standard deviation of the track.
-
-    It is 0 for the configured track, whose standard deviation is a setting of `[odometry]`.
-    """
+    """Relative standard deviation; 0 for the configured track, whose deviation is a setting."""
 
 
 CONFIGURED = Track()
@@ -95,7 +85,7 @@ def _use(learned: Track | None, before: TrackUse) -> TrackUse:
 
 
 def beside(learned: Track, multiplier: float, use: TrackUse) -> str:
-    """Return words with the learned and the configured track, and which of them is in use.
+    """Return the learned and the configured track in words, and which of them is in use.
 
     Both tracks are given as multiples of the wheel separation. `multiplier` is the configured one.
     """
@@ -108,10 +98,7 @@ def beside(learned: Track, multiplier: float, use: TrackUse) -> str:
 
 
 def tracks(gyro: GyroStatus, multiplier: float) -> str:
-    """Return words with the learned and the configured track, "" if no track is learned yet.
-
-    Both tracks are given as multiples of the wheel separation. `multiplier` is the configured one.
-    """
+    """Return words with the learned and the configured track, "" if no track is learned yet."""
     if gyro.track is None:
         return ""
     return beside(Track(gyro.track, gyro.track_deviation), multiplier, gyro.track_use)

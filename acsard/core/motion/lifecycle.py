@@ -12,9 +12,6 @@ that its sender has not seen, even if the network delivers the request late:
 
 A pressed emergency stop at the robot, a pressed bumper and an empty battery latch a stop too, and a
 fault of a motor driver latches a fault. `clear` releases nothing while one of these causes lasts.
-`emergency_stop.py`, `bumpers.py` and `battery.py` decide how long such a cause lasts.
-
-`modes.py` derives the mode. `core/robot.py` decides how the wheels follow it.
 """
 
 from __future__ import annotations
@@ -35,8 +32,7 @@ LONG_AGO_NS = -(2**62)
 """Monotonic time before every other one, ns."""
 
 _DAYS_TO_1970 = 719_468
-"""Days from 0000-03-01 to 1970-01-01. The calculation starts each year in March, so the leap day is
-the last day of a year."""
+"""Days from 0000-03-01 to 1970-01-01. Years start in March, so they end with the leap day."""
 
 _DAYS_PER_400_YEARS = 146_097
 
@@ -45,10 +41,7 @@ class Lifecycle:
     """Latches and mode of one robot. A request that is not allowed raises `RefusedError`."""
 
     def __init__(self, active: bool, latches: Latches = Latches()) -> None:  # noqa: B008
-        """Start with these latches, which may come from an earlier run of the daemon.
-
-        If `active` is False, the robot is also switched off until the first call `activate`.
-        """
+        """Start with these latches. If not `active`, the robot is also switched off."""
         self.latches = latches
         self.mode = Mode.WAITING
         self._shutting_down = self._linked = self._commanded = False
@@ -57,23 +50,20 @@ class Lifecycle:
         found = (latches.stop, latches.fault, latches.inactive)
         self._number = max([latch.number for latch in found if latch is not None], default=0)
         self._numbered = False
-        """Whether this run of the daemon has set a latch. The first latch of a run gets a number
-        that no earlier run used."""
+        """Whether this run has set a latch. The first one gets a number that is not used yet."""
         self._stopped_ns = self._faulted_ns = LONG_AGO_NS
         """Monotonic times at which the last stop and the last fault were latched, ns."""
         self._cleared_ns = LONG_AGO_NS
-        """Monotonic time at which a fault was last cleared, ns. For `LOOK_FIRST_S` after that, a
-        call `clear` without a number does not release a stop."""
+        """Monotonic time at which a fault was last cleared, ns (see `_require_seen_stop`)."""
         self._stop_asked_ns = LONG_AGO_NS
         """Monotonic time at which the request for the last stop arrived, ns."""
         self._off_ns = LONG_AGO_NS
         """Monotonic time at which the robot was last switched off, ns."""
         self._held = self._mend = ""
-        """Why the call `clear` is refused, and what the operator must do about it. Both are ""
-        while the reports of the board permit the call."""
+        """Why the call `clear` is refused, and what to do about it; "" while it is permitted."""
         self._freed_ns = LONG_AGO_NS
-        """Monotonic time, ns, of the last step in which the board began to permit the call `clear`,
-        or in which the cause of a latched fault occurred again. Earlier calls are refused."""
+        """Monotonic time, ns, of the last step that ended or repeated the cause of a latch. Earlier
+        calls `clear` are refused."""
         self._began_ns: int | None = None
         """Monotonic time of the first step, ns; None before that step."""
         self._derive()
@@ -98,31 +88,18 @@ class Lifecycle:
             self._derive()
 
     def press(self, why: str, now: Instant) -> None:
-        """Latch a stop that the board causes, for example by its emergency-stop input.
-
-        The latch gets a new number. `why` is the reason as a whole sentence.
-        """
+        """Latch a stop that the board causes, under a new number. `why` is a whole sentence."""
         self._stopped_ns = self._stop_asked_ns = now.mono_ns
         self._latch(stop=self._made(now, "", why))
 
     def hold(self, why: str, mend: str, now_ns: int) -> None:
-        """Record whether the reports of the board forbid the call `clear`.
-
-        Args:
-            why: Why `clear` is refused, "" if the board permits the call.
-            mend: What the operator must do first, "" if the board permits the call.
-            now_ns: Monotonic time of this step, ns.
-        """
+        """Record why the board forbids `clear`, and what to do; "" if `clear` is allowed."""
         if self._held and not why:
             self._freed_ns = now_ns
         self._held, self._mend = why, mend
 
     def caused_again(self, now_ns: int) -> None:
-        """Record that the cause of the latched fault occurred again in this step.
-
-        A call `clear` that arrived before this step does not release the fault. `now_ns` is the
-        monotonic time of this step, ns.
-        """
+        """Record that the cause of the fault came again. Earlier calls `clear` are then refused."""
         self._freed_ns = now_ns
 
     def leave(self) -> None:
@@ -131,10 +108,7 @@ class Lifecycle:
         self._derive()
 
     def fault(self, why: str, now: Instant) -> bool:
-        """Latch a fault for the reason `why`, and return True.
-
-        If a fault is latched already, keep that one and return False.
-        """
+        """Latch a fault and return True, or keep a fault that is latched and return False."""
         if self.latches.fault is not None:
             return False
         self._faulted_ns = now.mono_ns
@@ -147,11 +121,8 @@ class Lifecycle:
         """Latch a stop under a new number, and return the answer for the client.
 
         If the latched stop was requested at the same time as this one or later, keep that latch.
-
-        Args:
-            by: Name of the client, "" if unknown.
-            asked_ns: Monotonic time at which the request arrived, ns.
-            now: Both clocks at this step.
+        `asked_ns` is the monotonic time at which the request arrived. `by` is "" if the client is
+        unknown.
         """
         repeated = self.latches.stop is not None and asked_ns <= self._stop_asked_ns
         if not repeated:
@@ -166,12 +137,9 @@ class Lifecycle:
     def clear(self, number: int | None, asked_ns: int, now: Instant) -> str:
         """Release the fault if one is latched, otherwise the stop, and return the answer.
 
-        The answer is "" if neither is latched. Raise `RefusedError` if the call is refused.
-
-        Args:
-            number: Number of the latch that the sender has seen, None if the request has none.
-            asked_ns: Monotonic time at which the request arrived, ns.
-            now: Both clocks at this step.
+        The answer is "" if neither is latched. `number` is that of the latch that the sender has
+        seen, None without one. `asked_ns` is the monotonic time at which the request arrived.
+        Raises `RefusedError`.
         """
         require_allowed(self.mode, "clear")
         if self._held:
@@ -209,14 +177,9 @@ class Lifecycle:
     def activate(self, number: int | None, asked_ns: int, now: Instant) -> bool:
         """Switch the robot on; return True if it was off.
 
-        Args:
-            number: The number of the latch that the sender has seen; None if the request has none.
-                0 stands for a robot that is off only because `auto_activate` is False.
-            asked_ns: Monotonic time at which the request arrived, ns.
-            now: Both clocks at this step.
-
-        Raises:
-            RefusedError: The request is not allowed now, or its sender may not know the latch.
+        `number` is that of the latch that the sender has seen, None without one. 0 stands for a
+        robot that is off only because `auto_activate` is False. Raises `RefusedError` if the mode
+        refuses the request, or if its sender may not know the latch.
         """
         require_allowed(self.mode, "activate")
         if not self._off:
@@ -237,20 +200,14 @@ class Lifecycle:
         return True
 
     def deactivate(self, by: str, now: Instant) -> str:
-        """Switch the robot off under a new number, even if it is off already; return the answer.
-
-        `by` is the name of the client, "" if unknown.
-        """
+        """Switch the robot off under a new number, even if it is off; return the answer."""
         require_allowed(self.mode, "deactivate")
         self._off_ns = now.mono_ns
         self._latch(inactive=self._made(now, by, f"switched off by {by or 'request'}"))
         return "inactive: the robot ramps to zero; srv/activate switches it on"
 
     def lower(self, limits: dict[str, float]) -> None:
-        """Store the limits that the service `set` has lowered, so that they survive a restart.
-
-        `limits` contains the lowered keys of `[limits]` with their values.
-        """
+        """Store the lowered keys of `[limits]` with their values, to survive a restart."""
         if limits != self.latches.lowered:
             self.latches = replace(self.latches, lowered=limits)
 
@@ -304,10 +261,7 @@ class Lifecycle:
         )
 
     def _require_seen_stop(self, asked_ns: int) -> None:
-        """Raise `RefusedError` if the sender of a call `clear` may not know the latched stop.
-
-        `asked_ns` is the monotonic time at which the call arrived, ns.
-        """
+        """Raise `RefusedError` if the sender of a call `clear` may not know the latched stop."""
         stop = self.latches.stop
         if stop is None:
             return
@@ -322,12 +276,8 @@ class Lifecycle:
     def _require_seen(self, latch: Latch, set_ns: int, asked_ns: int, call: str) -> None:
         """Raise `RefusedError` if the latch is so new that the sender may not know it.
 
-        Args:
-            latch: The latch that the request would release.
-            set_ns: Monotonic time at which this run set the latch, ns; `LONG_AGO_NS` if an earlier
-                run set it.
-            asked_ns: Monotonic time at which the request arrived, ns.
-            call: Name of the service, for the message.
+        `set_ns` is the monotonic time at which the latch was set, `LONG_AGO_NS` if an earlier run
+        set it.
         """
         began_ns = LONG_AGO_NS if self._began_ns is None else self._began_ns
         since = asked_ns - max(set_ns, began_ns)
@@ -348,14 +298,10 @@ class Lifecycle:
 def number_after_restart(kept: int, now: Instant) -> int:
     """Return a latch number that no earlier run of the daemon has used.
 
-    The number is the wall-clock time in ms. If that is not above `kept`, because the wall clock was
-    set back, the number is `kept` + 1 plus the time since the computer started in ms. `kept` + 1
-    alone could be the number of a released latch, which the latch file does not contain. A late
-    call `clear` for that latch would then release the new one.
-
-    Args:
-        kept: The largest number of the latches in the latch file, or less than 1 without any.
-        now: Both clocks at this step.
+    The number is the wall-clock time in ms. If that is not above `kept`, the largest number in the
+    latch file, the wall clock was set back. The number is then `kept` + 1 plus the time since the
+    computer started in ms: `kept` + 1 alone could be a released latch, for which a late call
+    `clear` may come.
     """
     number = now.wall_ns // 1_000_000
     return number if number > kept else kept + 1 + now.mono_ns // 1_000_000
@@ -383,7 +329,6 @@ def _asked_for(latch: Latch) -> bool:
 
 
 def _said(latch: Latch) -> str:
-    """Return the reason of a latched stop or `deactivate` in words, with its time."""
     if not _asked_for(latch):
         return f"{latch.why} (latched {_when(latch)})"
     return f"{'was ' if latch.kept else ''}{latch.why} {_when(latch)}"

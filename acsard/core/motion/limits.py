@@ -37,15 +37,14 @@ class Limiter:
     def __init__(self, limits: LimitsConfig, kinematics: Kinematics) -> None:
         self._kinematics = kinematics
         self.state = _State(REST, 0.0, 0.0)
-        """Everything that the limiter remembers from earlier steps. `Robot` restores an earlier
-        value to undo a step whose command line was not written to the port."""
+        """State from earlier steps. `Robot` restores it if a line was not written to the port."""
         self.use(limits)
 
     def use(self, limits: LimitsConfig) -> None:
-        """Use these limits from now on.
+        """Use these limits from now on, and brake to them at the configured deceleration.
 
-        A twist above the new limits slows down at the configured deceleration. A lower limit of the
-        wheel speed takes effect at once, so the caller may lower it only at rest.
+        A lower limit of the wheel speed takes effect at once, so the caller may lower it only at
+        rest.
         """
         self._linear = _Axis(
             limits.linear_speed,
@@ -71,10 +70,7 @@ class Limiter:
         return self.state.twist
 
     def follow(self, wished: Twist, dt: float) -> Twist:
-        """Move the allowed twist towards `wished` for `dt` s, and return it.
-
-        `wished` must not contain NaN or infinity.
-        """
+        """Move the allowed twist towards `wished`, which must be finite, for `dt` s; return it."""
         if wished is not self._wished:  # the daemon steps more often than a sender sends
             self._wished = wished
             self._goal = self._kinematics.saturate(self._within_speed(wished), self._wheel_speed)
@@ -95,8 +91,7 @@ class Limiter:
         """Slow down towards rest for `dt` s, and return the allowed twist.
 
         Linear and angular speed fall in the same proportion. If `stop` is true, the limits
-        `*_stop_deceleration` apply. A negative `dt` counts as 0, so that it cannot speed up the
-        robot.
+        `*_stop_deceleration` apply. A negative `dt` counts as 0.
         """
         dt, twist = max(0.0, dt), self.twist
         seconds = max(
@@ -114,11 +109,7 @@ class Limiter:
         return REST
 
     def _within_speed(self, wished: Twist) -> Twist:
-        """Return the twist scaled down to the speed limits, with the same curvature.
-
-        An axis (linear or angular) with the limit 0 is set to zero first, and does not slow down
-        the other axis.
-        """
+        """Return the twist scaled down to the limits. An axis with the limit 0 is set to 0."""
         linear = wished.linear if self._linear.speed else 0.0
         angular = wished.angular if self._angular.speed else 0.0
         scale = 1.0

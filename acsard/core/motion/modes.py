@@ -8,9 +8,7 @@
     driving   the robot follows a fresh command
     ready     the robot is active and linked, and it follows no command
 
-The first mode whose condition holds is the robot's mode. It follows from the latches, which
-`lifecycle.py` sets and releases, from the link and from the commands. So the mode itself needs no
-memory and no transitions.
+The first mode whose condition holds is the robot's mode, so the mode itself needs no memory.
 """
 
 from __future__ import annotations

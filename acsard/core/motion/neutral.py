@@ -9,10 +9,6 @@ does not. The sender stays armed until `require_neutral` or `unlearn` is called.
   Then a zero arms the identity only if no speed follows for `commands.neutral_pause`. Further zeros
   and silence do not restart this time. Without the pause, the zero of one program would arm another
   program that never stopped.
-
-This module holds one sender's last command, and whether the sender is armed. `arbiter.py` decides
-which sender is followed and when a sender must be armed again. `freshness.py` decides whether a
-command counts.
 """
 
 from __future__ import annotations
@@ -29,20 +25,16 @@ class Sender:
         self._neutral_first = neutral_first
         self._armed = self._proven_armed = not neutral_first
         self._zero_ns: int | None = None
-        """Monotonic time, ns, at which a zero of a shared identity arrived; None if there is none
-        or if a speed has arrived since."""
+        """Arrival of a shared identity's zero, monotonic ns; None if a speed has arrived since."""
         self._proven_zero_ns: int | None = None
         self.name = ""
         self.twist = REST
         self.arrived_ns: int | None = None
-        """Monotonic time at which the last accepted command arrived, ns; None if no command has
-        been accepted since `require_neutral`."""
+        """Arrival of the last accepted command since `require_neutral`, monotonic ns."""
         self.came_ns = 0
-        """Monotonic time, ns, of the command that ended the sender's last silence. The arbiter
-        prefers the sender that came first."""
+        """Arrival of the command that ended the sender's last silence, monotonic ns."""
         self.zeros_ns: int | None = None
-        """Monotonic time, ns, of the first zero since the last speed or silence; None if the last
-        accepted command was a speed."""
+        """Arrival of the first zero since the last speed or silence, monotonic ns, or None."""
         self.ros = False
         """Whether the last command came from ROS, whose tools send no zero by themselves."""
         self.shared = False
@@ -76,18 +68,11 @@ class Sender:
         self._armed = self._proven_armed = not self._neutral_first
 
     def unlearn(self) -> None:
-        """Undo the effect of zeros with unproven stamps.
-
-        The network may have delayed such a zero, and the sender may command motion by now.
-        """
+        """Undo the effect of zeros with unproven stamps, which the network may have delayed."""
         self._armed, self._zero_ns = self._proven_armed, self._proven_zero_ns
 
     def notice(self, at_ns: int) -> None:
-        """Record a refused message, which may have commanded motion.
-
-        It prevents an earlier zero from arming a shared identity whose `commands.neutral_pause` is
-        not over yet. `at_ns` is the monotonic time at which the message arrived, ns.
-        """
+        """Record a refused message, which has the same effect as a lost one (see `missed`)."""
         self._settle(at_ns)
         self._zero_ns = self._proven_zero_ns = None
         self.noticed_ns = at_ns
@@ -108,9 +93,9 @@ class Sender:
     def take(self, command: Command, since_ns: int, verdict: Verdict = "fresh") -> None:
         """Process a command that was not refused. `verdict` is the verdict on its stamp.
 
-        A command of an unproven clock ("first", "unproven") does not drive the robot yet. But if it
-        is a zero, it arms the sender until `unlearn` undoes that. A zero that arrived before
-        `since_ns`, the time of the last `require_neutral`, does not arm the sender.
+        A command from an unproven clock ("first", "unproven") does not drive the robot yet, but a
+        zero arms the sender until `unlearn`. A zero that arrived before `since_ns`, the time of the
+        last `require_neutral`, does not arm the sender.
         """
         now_ns, zero = command.arrived_ns, is_zero(command)
         self._settle(now_ns)

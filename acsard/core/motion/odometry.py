@@ -8,9 +8,8 @@ The equations of one step of dt s, where left and right are the mean wheel speed
     (8)  x += d cos(yaw)                 (9)  y += d sin(yaw)
     (10) yaw += dyaw, wrapped            (11) v = d / dt, w = dyaw / dt
 
-Equations (8) and (9) step along a straight line; `path.py` integrates the exact arc instead. Both
-agree in the limit dyaw -> 0. `uncertainty.py` computes the errors of the pose, and `error_model.py`
-those of the twist.
+Equations (8) and (9) step along a straight line; `path.py` integrates the exact arc instead. Line
+and arc agree in the limit dyaw -> 0.
 """
 
 from __future__ import annotations
@@ -47,10 +46,7 @@ TAKEN_BACK = 128
 
 
 class Step(Struct, frozen=True, gc=False):
-    """The motion that one feedback line added to the pose.
-
-    The odometry keeps the last steps, to recompute the pose when a wheel proves faulty.
-    """
+    """The motion that one feedback line added to the pose, kept to recompute the pose."""
 
     pose: Pose
     """The pose before the line."""
@@ -59,12 +55,10 @@ class Step(Struct, frozen=True, gc=False):
     gyro: Turn | None
     """The turn that a gyro measured, None if the wheels provided it."""
     speeds: WheelSpeeds
-    """The wheel speeds in the line."""
     turn: float
     """Change of the heading by the line, rad."""
     on_trial: bool
-    """Whether the turn came from the wheels because the gyro was not proven yet. The gyro corrects
-    such turns once it is proven."""
+    """Whether the turn came from the wheels because the gyro was not proven yet."""
     share: float = 1.0
     """The effective track in use, divided by the configured one."""
 
@@ -82,22 +76,16 @@ class Odometry:
     ) -> None:
         """Start at the origin.
 
-        Args:
-            odometry: The table `[odometry]`.
-            kinematics: The kinematics of the base.
-            encoder_counts: Counts per wheel turn, 0 if unknown.
-            feedback: The table `[feedback]` with the wheels' response time and fault time.
-            quiet: Duration of silence after which the daemon commands rest, s.
+        `encoder_counts` is per wheel turn, 0 if unknown. After `quiet` s of silence, the daemon
+        commands rest.
         """
         self._kinematics, self._track = kinematics, CONFIGURED
         self._positions = NOWHERE
         self._rolling = Rolling(quiet)
         self._held = NOWHERE
-        """Angles by which the wheels turned at rest, rad. The pose does not contain them until the
-        direction of their encoder counts is clear."""
+        """Wheel angles at rest, rad, that are added to the pose once their direction is clear."""
         self._steps_of, self._coarsest = NOWHERE, 0.0
-        """Quantization steps of the wheel speeds in the last line, and the largest known one of
-        them, rad/s."""
+        """Quantization steps of the speeds in the last line, and the largest known one, rad/s."""
         self._path = Path()
         self._errors = ErrorModel(odometry, kinematics)
         self._uncertainty = PoseUncertainty(self._errors, encoder_counts)
@@ -105,7 +93,6 @@ class Odometry:
         self._gaps = Gaps()
         self.checks = ConsistencyChecks(odometry, kinematics, encoder_counts, feedback)
         self._steps: deque[Step] = deque(maxlen=TAKEN_BACK)
-        """The last lines, for recomputation."""
         self._unsettled = 2 * math.tau / (encoder_counts or COARSE_COUNTS)
         """Angle of two encoder counts, rad. A wheel at rest that rocks between the edges of one
         count reports no larger angle."""
@@ -116,16 +103,13 @@ class Odometry:
         self.speeds = STILL
         """Wheel speeds in the last feedback line, rad/s."""
         self.gaps, self.unseen, self.bridged = 0, 0.0, 0.0
-        """Number of gaps in which the robot moved but the pose stood still, the sum of their
-        durations, s, and the sum of the times that gap filling covered, s."""
+        """Number and duration, s, of the gaps in which the robot moved but the pose stood still,
+        and the time, s, that gap filling covered."""
         self.travelled = 0.0
         """Distance since the start, forwards and backwards, m."""
 
     def use(self, odometry: OdometryConfig) -> None:
-        """Use the variances of these settings from now on.
-
-        The variances of the initial pose take effect at the next `set_pose`.
-        """
+        """Use these variances from now on. Those of the initial pose wait for `set_pose`."""
         self._errors.use(odometry)
 
     def turn_by(self, track: Track) -> None:
@@ -137,10 +121,7 @@ class Odometry:
             self._twist_uncertainty.bend()
 
     def set_pose(self, pose: Pose) -> None:
-        """Set the pose of base_link in odom, with the uncertainty of an initial pose.
-
-        The wheel angles do not change.
-        """
+        """Set the pose of base_link in odom, with the uncertainty of an initial pose."""
         self._path.set(pose)
         self._steps.clear()
         self._uncertainty.set(pose.yaw)
@@ -161,10 +142,10 @@ class Odometry:
         return {name: count for name, count in ({"gaps": self.gaps} | ms).items() if count}
 
     def skip(self, feedback: Feedback) -> None:
-        """Ignore the speeds of an impossible feedback line, but remember the time that it covers.
+        """Ignore the speeds of an impossible feedback line.
 
-        The next possible line then adds the motion of both lines to the pose. If the impossible
-        line has encoder counts, they are used for its motion.
+        The next possible line adds the motion of both lines to the pose. It uses the encoder counts
+        of this line if there are any.
         """
         self._rolling.skip(feedback)
 
@@ -216,10 +197,7 @@ class Odometry:
         )
 
     def _settled(self, rolled: Rolled, at_rest: bool) -> tuple[Motors, ...]:
-        """Return the wheel angles by which to advance the pose, one set for each arc, rad.
-
-        While the robot is at rest, hold encoder counts back until their direction is clear.
-        """
+        """Return the wheel angles by which to advance the pose, one set for each arc, rad."""
         turned = rolled.turned
         if self._held != NOWHERE:
             turned = plus(self._held, turned)
@@ -235,8 +213,7 @@ class Odometry:
     def _take_back(self) -> None:
         """Recompute the pose from the recent lines in which a wheel, now found faulty, was wrong.
 
-        The pose jumps by the error that this wheel caused. If a gyro on trial has already corrected
-        the turns of these lines, the heading keeps that correction.
+        If a gyro on trial has already corrected the turns, the heading keeps that correction.
         """
         was_faulty = self.checks.wheels.was_faulty
         wrong = list(takewhile(lambda step: was_faulty(step.speeds), reversed(self._steps)))
@@ -260,8 +237,7 @@ class Odometry:
         """Return the arcs, each as distance (m) and turn (rad), for these wheel angles in rad.
 
         If a gyro provides the turn, the result is one arc for all pieces. Otherwise it is one arc
-        for each piece, with an effective track of `share` times the configured one. Equations (4)
-        to (7) also hold for angles, because they are linear.
+        for each piece, with an effective track of `share` times the configured one.
         """
         believed, kinematics = self.checks.wheels.believed, self._kinematics
         moved = [kinematics.moved(believed(one)) for one in pieces]
@@ -276,14 +252,7 @@ class Odometry:
         speeds: WheelSpeeds,
         slips: bool,
     ) -> float:
-        """Advance the pose by the wheel angles of a line, and return the turn of the pose, rad.
-
-        Args:
-            pieces: The wheel angles, rad, one set for each arc.
-            turn: The turn that a gyro measured, None if the wheels provide it.
-            speeds: The wheel speeds in the line, rad/s.
-            slips: Whether the wheels slip.
-        """
+        """Advance the pose by the wheel angles of a line, and return the turn of the pose, rad."""
         path, turned = self._path, 0.0
         pose, variance = path.pose, None if turn is None else turn.variance
         for piece in pieces:
@@ -298,11 +267,7 @@ class Odometry:
         return turned
 
     def _go_on(self, bridged: float, feedback: Feedback, before: Twist, twist: Twist) -> None:
-        """Add the uncertainty of a filled gap. Without a gap, measure how the twist changes.
-
-        `bridged` is the duration of the filled gap, s, or 0 without one. `before` is the twist of
-        the line before, and `twist` is that of this line.
-        """
+        """Add the uncertainty of a filled gap. Without a gap, measure how the twist changes."""
         if bridged > 0.0:
             self.bridged += bridged
             self._uncertainty.doubt(*self._gaps.bridge(bridged, before, twist))
@@ -326,10 +291,7 @@ class Odometry:
         return variances
 
     def _stand(self, seconds: float, before: Twist, after: Twist) -> None:
-        """Add the uncertainty of `seconds` s of unknown motion, without moving the pose.
-
-        `before` and `after` are the twists before and after this time.
-        """
+        """Add the uncertainty of `seconds` s of unknown motion, without moving the pose."""
         if before != REST or after != REST:
             self.gaps += 1
             self.unseen += seconds

@@ -33,8 +33,7 @@ class Path:
     def advance(self, distance: float, turn: float) -> tuple[float, float, float]:
         """Add an arc of length `distance` m through `turn` rad.
 
-        Returns:
-            The chord of the arc: its components along x and y, m, and its direction, rad.
+        Return the chord of the arc: its components along x and y, m, and its direction, rad.
         """
         half = turn / 2
         # sin(h)/h is accurate in doubles down to tiny h. Only h = 0 needs its limit.

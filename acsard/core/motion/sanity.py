@@ -29,8 +29,7 @@ SLACK = 2.0
 robot at rest can cause changes of this size."""
 
 STEPS = 2
-"""Number of encoder counts by which two reports may differ although the wheel moves steadily: each
-report may be wrong by one count."""
+"""Encoder counts by which two reports of a steady wheel may differ: each may be wrong by one."""
 
 SHORTEST_S = 0.004
 """Shortest time that is expected between two lines, s. Lines follow each other this quickly while a
@@ -45,9 +44,8 @@ class Sanity:
         self._last: WheelSpeeds | None = None
         self._since = 0.0
         self._longest = 0.0
-        """Longest time that one of the recent lines covers, s. A line after a pause reports the
-        mean speed of the whole pause. Such a line counts as recent until the length of the pause
-        has passed again."""
+        """Longest time that a recent line covers, s. After a pause, a line reports the mean speed
+        of the pause, and is recent until the same time has passed again."""
         self._impossible = 0
         self._lines = self._dropped = 0
         """Numbers of all lines and of impossible lines in the present window."""
@@ -66,10 +64,9 @@ class Sanity:
     def impossible(self, feedback: Feedback) -> str:
         """Return why no wheel can do what this line reports, "" if the line is possible.
 
-        The change of each speed is compared with the time since the last possible line. Therefore a
-        real jump of the speed is accepted as soon as enough time for it has passed. Each speed is a
-        mean over the time of its line, so the change may have lasted from the middle of one line to
-        the middle of the next.
+        The change of each speed is compared with the time since the last possible line, so a real
+        jump is accepted after enough time. Each speed is a mean over the time of its line, so the
+        change may have lasted from the middle of one line to the middle of the next.
         """
         since = max(feedback.dt, feedback.since)
         self._since += since
@@ -86,10 +83,7 @@ class Sanity:
         return ""
 
     def _count(self, why: str) -> None:
-        """Count a line in the window, and set the warning if it is due.
-
-        `why` is the reason if the line is impossible, otherwise "".
-        """
+        """Count a line in the window, and set the warning if it is due."""
         self._lines += 1
         self.warning = None
         if why:

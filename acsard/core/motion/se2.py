@@ -77,19 +77,13 @@ def twice_bracketed(p: PoseCovariance, a: Vector) -> PoseCovariance:
 
 
 def seen_from(error: Vector, dx: float, dy: float) -> Vector:
-    """Return a pose error after the robot has moved by `dx`, `dy` m in odom.
-
-    The axes of the error are parallel to odom, with the origin at the robot.
-    """
+    """Return a pose error, in axes parallel to odom, after a motion by `dx`, `dy` m in odom."""
     x, y, yaw = error
     return x - dy * yaw, y + dx * yaw, yaw
 
 
 def carried(p: PoseCovariance, dx: float, dy: float) -> PoseCovariance:
-    """Return the covariance of a pose error after the robot has moved by `dx`, `dy` m in odom.
-
-    `p` is the covariance before the motion.
-    """
+    """Return the covariance `p` of a pose error after a motion by `dx`, `dy` m in odom."""
     return PoseCovariance(
         p.xx - 2 * dy * p.xyaw + dy * dy * p.yawyaw,
         p.xy + dx * p.xyaw - dy * p.yyaw - dx * dy * p.yawyaw,
@@ -105,13 +99,8 @@ def added(
 ) -> PoseCovariance:
     """Return the covariance `p` of the pose plus the noise of a step.
 
-    Args:
-        p: the covariance without that noise.
-        along: the variance of the distance, m2.
-        yaw: the variance of the turn, rad2.
-        both: the covariance of distance and turn, m rad.
-        c: the cosine of the direction of the step in odom.
-        s: the sine of the direction of the step in odom.
+    `along` is the variance of the distance, m2, `yaw` that of the turn, rad2, and `both` their
+    covariance, m rad. `c` and `s` are the cosine and the sine of the direction of the step in odom.
     """
     cc, cs = along * c, along * s
     return PoseCovariance(

@@ -49,10 +49,8 @@ from acsard.core.motion.se2 import (
 from acsard.core.values import PoseCovariance
 
 MAX_HEADING_VARIANCE = 1.0
-"""Largest variance of the heading for which the terms are computed, rad2.
-
-With a larger one the series does not converge, and nothing is added.
-"""
+"""Largest variance of the heading for which the terms are computed, rad2. With a larger one the
+series does not converge."""
 
 NOTHING = PoseCovariance(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -64,19 +62,14 @@ class SecondOrder:
         self._noise: Vector = ORIGIN
         """Covariance (xx, xy, yy), m2, of the sum of all [x, n] / 2 and M_i of the module."""
         self._with_x: list[tuple[Vector, Vector]] = []
-        """Covariance E[M_i x'] of M_i with the noise x (see the module), for each parameter i. Each
-        is a pair of rows: one for the x axis and one for the y axis."""
+        """Covariance of M_i with the noise x (see the module), as rows for the x and the y axis."""
         self._bent: dict[tuple[int, int], Planar] = {}
-        """C_ik of the module for each pair of parameters, m. The keys are pairs of their indices,
-        the larger one first."""
+        """C_ik of the module for each pair of parameters, m. The larger index comes first."""
         for _ in range(columns):
             self.widen()
         self.xx = self.xy = self.yy = 0.0
-        """The terms of second order in the covariance of x and y, m2, in the axes of odom.
-
-        A motion of the robot does not change them, because it changes x and y of an error only in
-        proportion to its yaw (`se2.seen_from`), and these terms have no yaw.
-        """
+        """Terms of second order in the covariance of x and y, m2, in the axes of odom. A motion
+        does not change them, because they have no yaw (`se2.seen_from`)."""
 
     def widen(self) -> None:
         """Add a parameter that has had no effect on the pose so far."""
@@ -97,11 +90,8 @@ class SecondOrder:
         arguments must be expressed at the robot's place at the end of the stretch
         (`se2.seen_from`). The caller must first call `carry` with the displacement of the stretch.
 
-        Args:
-            p: the covariance of the noise on the path before the stretch.
-            q: the covariance of the noise on the stretch.
-            j: the effects of the parameters on the path before the stretch, one column for each.
-            w: the effects of the parameters on the stretch, one column for each.
+        `p` and `q` are the covariances of the noise on the path before and on the stretch. `j` and
+        `w` have a column for each parameter: its effects on the path before and on the stretch.
         """
         xyaw, yyaw, yawyaw = p.xyaw, p.yyaw, p.yawyaw
         for x, y, yaw in j:
@@ -125,10 +115,7 @@ class SecondOrder:
     def _bend_noise(
         self, i: int, p: PoseCovariance, q: PoseCovariance, column: Vector, new: Vector
     ) -> None:
-        """Add ([J_i, n] + [x, W_i]) / 2 to M_i of the module.
-
-        `column` is J_i, and `new` is W_i. `p` and `q` are the covariances of x and n.
-        """
+        """Add ([J_i, n] + [x, W_i]) / 2 to M_i of the module. J_i is `column`, and W_i is `new`."""
         x, y = self._with_x[i]
         by_new_x, by_new_y = brackets(new, p, -0.5)
         by_noise_x, by_noise_y = brackets(column, q, 0.5)

@@ -24,14 +24,11 @@ FAULT_S, FAULT_LINES = 0.025, 2
 the time takes three lines, so one bad reading is not enough."""
 
 FAULT_COUNTS, FAULT_ANGLE = 3.5, 0.05
-"""Least difference between the angles of the two wheels for calling one faulty: a number of encoder
-counts plus an angle in rad."""
+"""Least difference of two wheels for calling one faulty: encoder counts plus an angle in rad."""
 
 FOLLOWED_COUNTS, FOLLOWED_ANGLE = 2.5, 0.01
-"""After a change of the command, a wheel is called stuck only when the expected angle of a healthy
-wheel differs enough from its angle at the old speed: by this number of encoder counts plus this
-angle in rad.
-"""
+"""After a new command, a wheel is called stuck only if the expected angle of a healthy wheel
+differs from its angle at the old speed by this number of encoder counts plus this angle in rad."""
 
 LEAVES = 0.05
 """Least change of the command, rad/s, after which a healthy wheel must report another speed."""
@@ -46,9 +43,8 @@ hand cannot turn a wheel as evenly as this."""
 
 DEAD, REVERSED = 0.1, 0.3
 """Shares of the turn of the other wheel on the same side. A wheel is dead if it turns by less than
-the first share. It is reversed if it turns in the opposite direction and the sizes of the two turns
-differ by less than the second share.
-"""
+the share `DEAD`. It is reversed if it turns in the opposite direction, and the sizes of the two
+turns differ by less than the share `REVERSED`."""
 
 STUCK = 0.3
 """Least difference between the two wheels for calling one stuck, as a share of the faster wheel's
@@ -64,21 +60,12 @@ WORDS: dict[WheelFault, str] = {
 
 
 class _Ballot:
-    """The comparison of two wheels with one reference, which is a gyro or the command.
-
-    It holds four sums over several lines, rad: the turn of each wheel, and the lower and the upper
-    bound of the true turn according to the reference.
-    """
+    """Sums over lines, rad: turns of two wheels, and bounds of the true turn by a reference."""
 
     def __init__(self) -> None:
         self._own = self._other = self._low = self._high = 0.0
 
     def add(self, own: float, other: float, low: float, high: float) -> None:
-        """Add one line.
-
-        `own` and `other` are the turns of the suspect wheel and of the other one. `low` and `high`
-        are the bounds of the true turn. All are in rad.
-        """
         self._own += own
         self._other += other
         self._low += low
@@ -116,20 +103,14 @@ class Suspect:
         self._seconds = self._apart = 0.0
         self._command, self._gyro = _Ballot(), _Ballot()
         self._begun: float | None = None
-        """Size of the angle that the wheel turned in the first line of the test, rad; None before
-        that line."""
+        """Size of the angle that the wheel turned in the first line of the test, rad."""
         self._known = False
         """Whether the command could serve as a reference in any line of the test."""
 
     def looks(self, own: float, other: float, same: bool, dt: float, count: float) -> bool:
         """Add a line, and return whether the wheel shows a sign of a fault.
 
-        Args:
-            own: The angle by which this wheel turned in the line, rad.
-            other: The angle by which the other wheel of its side turned, rad.
-            same: Whether this wheel repeats the speed of the line before.
-            dt: Duration of the line, s.
-            count: Angle of an encoder count, rad.
+        All angles are in rad. `same` is true if this wheel repeats the speed of the line before.
         """
         sign = self._sign(own, other, same, count)
         if sign != self.sign:
@@ -141,10 +122,7 @@ class Suspect:
         return sign is not None
 
     def _sign(self, own: float, other: float, same: bool, count: float) -> WheelFault | None:
-        """Return the sign of a fault in this line, None without one.
-
-        At rest and while the speed crosses zero, all signs look alike, so the previous one stays.
-        """
+        """Return the sign of a fault in this line. At rest and near zero, the old sign stays."""
         if self.sign == "stuck" and same:
             return "stuck"
         if reverses(own, other, count) or (self.sign == "reversed" and own * other == 0.0):
@@ -164,13 +142,8 @@ class Suspect:
     ) -> None:
         """Compare both wheels with the references in this line.
 
-        Args:
-            own: The angle by which this wheel turned in the line, rad.
-            other: The angle by which the other wheel of its side turned, rad.
-            dt: Duration of the line, s.
-            count: Angle of an encoder count, rad.
-            expected: The commanded and the expected speed of this side.
-            gyro: The true angle of this side according to a gyro, rad; None without a gyro.
+        `own`, `other` and `gyro` are the angles of this wheel, of the other wheel of its side, and
+        of the side according to a gyro, rad.
         """
         slow, command = expected.speed, expected.commanded
         self._begun = abs(own) if self._begun is None else self._begun
@@ -184,10 +157,7 @@ class Suspect:
             self._gyro.add(own, other, gyro, gyro)
 
     def is_faulty(self, count: float) -> bool:
-        """Return whether the test has shown that this wheel, and not the other one, is faulty.
-
-        `count` is the angle of an encoder count, rad.
-        """
+        """Return whether this wheel, and not the other one, is faulty. `count` is in rad."""
         enough = FAULT_COUNTS * count + FAULT_ANGLE
         if self._lines < FAULT_LINES or self._seconds < FAULT_S or abs(self._apart) < enough:
             return False
@@ -205,10 +175,10 @@ class Suspect:
 class Stuck:
     """The test of one wheel for a speed that stays the same although it must change.
 
-    At a steady speed, a stuck encoder reports the same as a sound one. Nothing can detect the fault
-    then, and it does not harm the pose. When the command changes, a healthy wheel must report
-    another speed as soon as its expected angle differs by a few counts from the angle at the old
-    speed. If only the other wheel of the side reports another speed, this encoder is stuck.
+    At a steady speed, nothing can detect a stuck encoder, and it does not harm the pose. After a
+    change of the command, a healthy wheel must report another speed as soon as its expected angle
+    differs by a few counts from the angle at the old speed. If only the other wheel of the side
+    does so, this encoder is stuck.
     """
 
     def __init__(self) -> None:
@@ -225,12 +195,8 @@ class Stuck:
     def says(self, same: bool, apart: float, dt: float, count: float, expected: Expected) -> bool:
         """Add a line, and return whether the encoder is stuck.
 
-        Args:
-            same: Whether the wheel turns and repeats the speed of the line before.
-            apart: Angle by which the other wheel turned further than this one reports, rad.
-            dt: Duration of the line, s.
-            count: Angle of an encoder count, rad.
-            expected: The commanded and the expected speed of this side.
+        `same` is true if the wheel turns and repeats the speed of the line before. `apart` is the
+        angle by which the other wheel turned further, and `count` is that of an encoder count, rad.
         """
         slow, command = expected.speed, expected.commanded
         leaves = command - self._command
@@ -250,27 +216,20 @@ class Stuck:
 
 
 def stands(own: float, other: float) -> bool:
-    """Return whether a wheel that turned `own` rad counts as standing.
-
-    `other` is the turn of the other wheel of the same side, rad.
-    """
+    """Return whether a wheel that turned `own` rad stands, while the other turned `other` rad."""
     return own == 0.0 or abs(own) <= DEAD * abs(other)
 
 
 def reverses(own: float, other: float, count: float) -> bool:
-    """Return whether a wheel that turned `own` rad reports about the opposite of the other one.
-
-    `other` is the turn of the other wheel of the same side, and `count` is the angle of an encoder
-    count, both in rad.
-    """
+    """Return whether `own` is about the opposite of `other`. All arguments are in rad."""
     return own * other < 0.0 and abs(own + other) <= REVERSED * abs(other) + FAULT_COUNTS * count
 
 
 def was_faulty(fault: WheelFault, own: float, other: float, now: float) -> bool:
     """Return whether the fault may already have been present in an earlier line.
 
-    `own` and `other` are the speeds of the faulty wheel and of the other one in that line, rad/s.
-    `now` is the present speed of the faulty wheel, rad/s.
+    `own` and `other` are the speeds of the faulty wheel and of the other one in that line. `now` is
+    the present speed of the faulty wheel. All are in rad/s.
     """
     if fault == "reversed":
         return own * other <= 0.0

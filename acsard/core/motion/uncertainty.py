@@ -54,50 +54,36 @@ MAX_VARIANCE = 1e9
 """Largest variance of the pose, m2 or rad2. A variance of this size means "unknown"."""
 
 COARSE_COUNTS = 400
-"""Encoder counts per wheel turn that are assumed if the configuration has no number. Few encoders
-have fewer."""
+"""Encoder counts per wheel turn that are assumed without a setting. Few encoders have fewer."""
 
 NOWHERE = PoseCovariance(MAX_VARIANCE, 0.0, 0.0, MAX_VARIANCE, 0.0, MAX_VARIANCE)
 
 GYRO_SCALE = 0.004
-"""Relative standard deviation of a gyro's scale.
-
-It causes a heading error of 1.4 degrees after one turn and of 29 degrees after twenty turns to the
-same side. The error is 0 again after as many turns back.
-"""
+"""Relative standard deviation of a gyro's scale. It causes a heading error of 1.4 degrees after one
+turn, and no error after as many turns to the left as to the right."""
 
 NO_EFFECT: Column = (0.0, 0.0, 0.0, 0.0)
 
 STRETCH = 0.2
-"""Distance that the wheels roll between two updates of the second-order terms, m.
-
-These terms change slowly, so they need no update in each step.
-"""
+"""Distance that the wheels roll between two updates of the second-order terms, m."""
 
 
 class PoseUncertainty:
     """Computes the covariance of the pose, in plain floats because it is updated at 100 Hz."""
 
     def __init__(self, model: ErrorModel, counts: int) -> None:
-        """Start at the pose 0, 0, 0.
-
-        `counts` is the number of encoder counts per wheel turn, 0 if unknown.
-        """
+        """Start at the origin. `counts` is the encoder counts per wheel turn, 0 if unknown."""
         self._model = model
         self._parameters = self._effects = model.columns
         self._counted = counts > 0
         self._count = 0.0
         self._stand_within(math.tau / (counts or COARSE_COUNTS))
         self._dx = self._dy = self._rolled = 0.0
-        """Since the last update of the second-order terms: motion along the x and y axes of odom,
-        and distance that the wheels rolled, m."""
+        """Motion in odom and rolled distance since the last update of the second-order terms, m."""
         self.set(0.0)
 
     def bend(self) -> None:
-        """Use the present effective track of the error model, and its columns, from now on.
-
-        The number of columns must not have changed. The errors from earlier steps stay.
-        """
+        """Use the present track and columns of the error model, whose number must be unchanged."""
         beside = self._effects[len(self._parameters) :]
         self._parameters = self._model.columns
         self._effects = (*self._parameters, *beside)
@@ -122,11 +108,7 @@ class PoseUncertainty:
             self._p = added(self._p, *self._phase, self._cos, self._sin)
         self._effects = self._parameters
         self._columns: list[Vector] = [ORIGIN for _ in self._effects]
-        """The columns of J: the error of the pose if one parameter is off by a standard deviation.
-
-        Two further columns, for the gyro's scale and for motion in gaps, are added when they first
-        have an effect.
-        """
+        """The columns of J. Those for the gyro's scale and for gaps are added when needed."""
         self._of_gyro = self._of_gaps = -1
         """Indices in `_columns` for the gyro's scale and for motion in gaps; -1 without one."""
         self._columns_before = self._columns
@@ -142,18 +124,12 @@ class PoseUncertainty:
         self, distance: float, turn: float, dx: float, dy: float, heading: float,
         variance: float | None = None, slips: bool = False, scale: float = GYRO_SCALE,
     ) -> None:  # fmt: skip
-        """Update the covariance after a step, which is an arc.
+        """Update the covariance after a step, which is an arc of `distance` m through `turn` rad.
 
-        Args:
-            distance: the length of the arc, m.
-            turn: the turn along the arc, rad.
-            dx: the displacement along the x axis of odom, m.
-            dy: the displacement along the y axis of odom, m.
-            heading: the direction of the chord in odom, rad.
-            variance: the variance of the turn, rad2, if a gyro measured it; None if the wheels did.
-                With a gyro, the errors of the parameters affect only the distance.
-            slips: whether the wheels slip.
-            scale: the relative standard deviation of the gyro's scale.
+        `dx` and `dy` are the displacement in odom, m, and `heading` is the direction of the chord,
+        rad. If a gyro measured the turn, `variance` is its variance, rad2, and `scale` is the
+        relative standard deviation of the gyro's scale. The errors of the parameters then affect
+        only the distance.
         """
         if self._lost:
             self._forget_where(distance, turn)
@@ -177,10 +153,7 @@ class PoseUncertainty:
         self._publish()
 
     def doubt(self, along: float, yaw: float) -> None:
-        """Make the last step more uncertain.
-
-        `along` is the further variance of its distance, m2, and `yaw` that of its turn, rad2.
-        """
+        """Make the last step more uncertain, by variances of its distance, m2, and turn, rad2."""
         if not self._lost:
             self._p = added(self._p, along, yaw, 0.0, self._cos, self._sin)
             self._publish()
@@ -189,13 +162,8 @@ class PoseUncertainty:
         """Add the uncertainty of a gap in the feedback, during which the pose was not updated.
 
         The motions that the pose missed in several gaps add up and do not average out, so they are
-        treated like the error of a parameter.
-
-        Args:
-            distance: the distance that the robot probably moved in the gap, m.
-            turn: the angle that the robot probably turned in the gap, rad.
-            along: the variance of the distance, m2.
-            yaw: the variance of the turn, rad2.
+        treated like the error of a parameter. `distance`, m, and `turn`, rad, are the probable
+        motion, and `along`, m2, and `yaw`, rad2, are their variances.
         """
         if self._lost:
             self._forget_where(distance, turn)
@@ -223,11 +191,7 @@ class PoseUncertainty:
         return len(self._columns) - 1
 
     def _forget_where(self, distance: float, turn: float) -> None:
-        """Make the whole pose unknown if the robot moves.
-
-        Call this only if the position or the heading is unknown already, because any motion then
-        makes the other one unknown too.
-        """
+        """Make the whole pose unknown if the robot moves while its place or heading is unknown."""
         if distance or turn:
             self.covariance = NOWHERE
 

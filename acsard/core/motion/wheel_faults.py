@@ -34,8 +34,7 @@ from acsard.core.motion.wheel_witness import FAULTS, SLACK, Expected, Witness
 from acsard.core.values import STILL, WHEELS, Event, WheelSpeeds, WheelsStatus
 
 COARSEST, FINEST = math.tau / 16, math.tau / 2000
-"""Range in which the angle of one encoder count is learned if it is not configured, rad. A wheel
-that turns slowly reports one count or none per line."""
+"""Range in which the angle of one encoder count is learned if it is not configured, rad."""
 
 RECUR, SOUGHT = 3, 1000
 """Number of times that a small wheel angle must occur to be taken as one encoder count, and number
@@ -55,8 +54,7 @@ SLIP_REPORTED_S = 0.1
 """Duration of a contradiction between two wheels of a side after which it is logged as slip, s."""
 
 BACK_S = 0.5
-"""Duration of rolling for which an ignored wheel must agree with the other one before the pose uses
-it again, s."""
+"""An ignored wheel that agrees for this time of rolling, s, is used for the pose again."""
 
 Same = tuple[bool, bool, bool, bool]
 """Whether each wheel reports the same speed as in the line before, in `WHEELS` order."""
@@ -86,7 +84,6 @@ class _Side:
         """Seconds for which the ignored wheel has contradicted the other one and its command."""
         self.slip_s = self._odd_s = self._agreed_s = 0.0
         self.event: Event | None = None
-        """The event of the last line, if any."""
 
     @property
     def left_out(self) -> str:
@@ -121,15 +118,7 @@ class _Side:
             part.forget()
 
     def watch(self, seen: Motors, dt: float, most: float, count: float, still: bool) -> bool:
-        """Compare both wheels with their command, and return whether one of them may be faulty.
-
-        Args:
-            seen: The reported speeds of all wheels, rad/s.
-            dt: Time since the line before, s.
-            most: Longest time for which one line counts as evidence, s.
-            count: Angle of an encoder count, rad.
-            still: Whether all wheels are commanded to stand.
-        """
+        """Compare both wheels with their command, and return whether one of them may be faulty."""
         i, j = self.wheels
         front, rear = self.witnesses
         bad = front.look(seen[i], self.expected, dt, most, count, still)
@@ -138,10 +127,7 @@ class _Side:
         return bad or self._out_s > 0.0
 
     def fault(self, seen: Motors, limit: float) -> str:
-        """Return words for a wheel fault that has lasted longer than `limit` s, "" without one.
-
-        `seen` contains the reported speeds of all wheels, rad/s, which the words quote.
-        """
+        """Return words for a wheel fault that has lasted longer than `limit` s, "" without one."""
         for i, witness in enumerate(self.witnesses):
             evidence = dict(witness.evidence)
             if i == self.out:
@@ -174,14 +160,7 @@ class _Side:
             self.out, self._out_s, self.residual.learns = None, 0.0, True
 
     def stands_still(self, turned: Motors, same: Same, dt: float, count: float) -> bool:
-        """Test both wheels for a stuck encoder; return whether the pose now ignores one of them.
-
-        Args:
-            turned: The angles of all wheels in this line, rad.
-            same: Whether each wheel reports the same speed as in the line before.
-            dt: Duration of the line, s.
-            count: Angle of an encoder count, rad.
-        """
+        """Test both wheels for a stuck encoder; return whether the pose now ignores one of them."""
         if self.out is not None:
             return False
         for i, stuck in enumerate(self._stuck):
@@ -205,13 +184,7 @@ class _Side:
         """Process a line in which the two wheels contradict each other.
 
         Return whether this line has proved a wheel faulty, so that the pose now ignores this wheel.
-
-        Args:
-            turned: The angles of all wheels in this line, rad.
-            same: Whether the front and the rear wheel report the same speed as in the line before.
-            dt: Duration of the line, s.
-            count: Angle of an encoder count, rad.
-            by_gyro: The angle of this side according to a gyro, rad; None without a trusted one.
+        `by_gyro` is the angle of this side according to a trusted gyro, rad.
         """
         self._agreed_s, fault = 0.0, None if self.out is None else self._fault
         if self.out is not None and self.expected.clear:
@@ -244,10 +217,7 @@ class _Side:
         return False
 
     def was_faulty(self, before: WheelSpeeds, now: WheelSpeeds) -> bool:
-        """Return whether the ignored wheel may already have been wrong in an earlier line.
-
-        `before` contains the speeds of that line, and `now` the speeds of the last line, rad/s.
-        """
+        """Return whether the ignored wheel may already have been wrong in an earlier line."""
         if self.out is None:
             return False
         own, other = self.wheels[self.out], self.wheels[1 - self.out]
@@ -271,30 +241,21 @@ class WheelFaults:
     """Checks all wheels, and decides which to ignore and whether any slips."""
 
     def __init__(self, kinematics: Kinematics, counts: int, feedback: FeedbackConfig) -> None:
-        """Create the checks of all wheels of one robot.
-
-        Args:
-            kinematics: The kinematics of the base.
-            counts: Encoder counts per wheel turn, 0 if unknown.
-            feedback: The table `[feedback]` with the response time and the fault time.
-        """
+        """Start. `counts` are the encoder counts per wheel turn, 0 if unknown."""
         self._kinematics, self._settings = kinematics, feedback
         self._count = math.tau / counts if counts else COARSEST
         self._seeking, self._period = not counts, PERIOD
         self._least, self._looked = [COARSEST] * RECUR, 0
-        """The `RECUR` smallest angles by which a front wheel turned in one line, rad, among the
-        last `_looked` lines."""
+        """The `RECUR` smallest angles of a front wheel in the last `_looked` lines, rad."""
         self._sides = self._left, self._right = _Side("left", LEFT), _Side("right", RIGHT)
         self._last = STILL
         self._busy = self._leaves_out = self._stands = False
         self.slips = False
-        """Whether wheels slip: the two wheels of a side contradict each other, or did so in the
-        last `SLIP_S`."""
+        """Whether the wheels of a side contradict each other or did so in the last `SLIP_S`."""
         self._rolled, self._unreported = 0.0, REPEATED_S
         self.pushed = ""
         """The message if the last line shows that a hand or a slope turns wheels, otherwise ""."""
         self._late = False
-        """Whether a wheel turns too slowly."""
         self._found: _Side | None = None
         """The side on which the last line proved a wheel faulty, None without one."""
         self.events: list[Event] = []
@@ -334,15 +295,11 @@ class WheelFaults:
             side.forget()
 
     def watch(self, commanded: WheelSpeeds | None, seen: WheelSpeeds, dt: float) -> str:
-        """Compare the wheel speeds in a line with their commands. Call this before `look`.
+        """Compare the wheel speeds in a line with their commands. The caller then calls `look`.
 
         If a wheel has contradicted its command for `feedback.fault_time`, return the reason of the
-        fault, which names the wheel. Otherwise return "".
-
-        Args:
-            commanded: The commanded speeds, rad/s; None if the motors have no power.
-            seen: The speeds in the line, rad/s.
-            dt: Time since the line before, s.
+        fault, which names the wheel. Otherwise return "". `commanded` is None if the motors have no
+        power. `dt` is the time since the line before, s.
         """
         self.pushed = ""
         if commanded is None:
@@ -388,14 +345,8 @@ class WheelFaults:
         """Compare the wheels of each side, and return whether this line proves a wheel faulty.
 
         The pose then ignores this wheel, and the caller must find the earlier lines in which it was
-        wrong (`was_faulty`).
-
-        Args:
-            turned: The angles of the wheels in the line, rad.
-            speeds: The speeds in the line, rad/s.
-            dt: Duration of the line, s.
-            turn: The turn that the wheels should show according to a gyro, rad; None without a
-                gyro that is trusted.
+        wrong (`was_faulty`). `turned` contains the wheel angles in the line, rad. `turn` is the
+        turn that the wheels should show according to a gyro, rad; None without a trusted one.
         """
         slow = self._left.late or self._right.late
         if self.events or slow != self._late:
@@ -452,17 +403,11 @@ class WheelFaults:
         return Event("wheel_fault", text, "warning", kind="slow")
 
     def was_faulty(self, before: WheelSpeeds) -> bool:
-        """Return whether the newly faulty wheel may already have been wrong in an earlier line.
-
-        `before` contains the speeds of the earlier line, rad/s.
-        """
+        """Return whether the newly faulty wheel may already have been wrong in an earlier line."""
         return self._found is not None and self._found.was_faulty(before, self._last)
 
     def _seek(self, speeds: WheelSpeeds, dt: float) -> None:
-        """Learn the angle of an encoder count from the speeds in a line.
-
-        The smallest angle that a wheel repeatedly turns in one line is at least one count.
-        """
+        """Learn the encoder count: the smallest angle that a wheel often turns in a line."""
         self._period += SMOOTHED * (dt - self._period)
         self._looked += 1
         if self._looked > SOUGHT:
@@ -475,14 +420,9 @@ class WheelFaults:
                 self._seeking = self._count > FINEST
 
     def _by_gyro(self, i: int, turned: Motors, turn: float) -> float:
-        """Return the angle of one side according to the gyro and the other side, rad.
+        """Return the angle of one side, rad, from the gyro and the other side.
 
-        The result is valid only while the two wheels of the other side agree.
-
-        Args:
-            i: The side whose angle is needed: 0 for the left one, 1 for the right one.
-            turned: The angles of all wheels, rad.
-            turn: The turn that the wheels should show according to the gyro, rad.
+        `i` is 0 for the left side and 1 for the right one. The wheels of the other side must agree.
         """
         front_right, front_left, rear_left, rear_right = turned
         return self._kinematics.opposite(

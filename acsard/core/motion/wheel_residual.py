@@ -35,8 +35,7 @@ MEMORY_S = 0.14
 """Time after which the weight of an angle in the sums has fallen to 1 / e, s."""
 
 SHARE = 0.05
-"""Allowed difference of two wheels as a fraction of their angle: half of 10 %, the slip that must
-be found."""
+"""Allowed fraction by which two wheels differ: half of 10 %, the slip that must be found."""
 
 COUNTS = 1.2
 """Allowed difference of two wheels in encoder counts. Wheels without slip rarely exceed it."""
@@ -70,19 +69,14 @@ class Residual:
         """Learned fraction by which the front wheel turns further than the rear one."""
         self.learns = True
         self.slips = False
-        """Whether the wheels differ by more than a motor that reacts later can cause. Valid only if
-        the last `add` returned False."""
+        """Whether the wheels differ by more than a late motor causes. Valid if `add` was False."""
         self._off = self._way = self._net = 0.0
 
     def add(self, front: float, rear: float, keep: float, dt: float, count: float) -> bool:
         """Add a feedback line, and return whether the wheels agree.
 
-        Args:
-            front: the angle of the front wheel, rad.
-            rear: the angle of the rear wheel, rad.
-            keep: the factor by which the line reduces the weight of the earlier angles.
-            dt: the duration of the line, s.
-            count: the angle of an encoder count, rad.
+        `keep` is the factor by which the line reduces the weight of the earlier angles. `front`,
+        `rear` and the encoder count `count` are angles in rad.
         """
         mean = (front + rear) / 2
         size = abs(mean) if front * rear >= 0.0 else (abs(front) + abs(rear)) / 2
@@ -102,10 +96,7 @@ class Residual:
         return True
 
     def stand_in(self, front: bool) -> float:
-        """Return the learned ratio of the wheel angles: front / rear if `front`, else rear / front.
-
-        The rear wheel's angle times front / rear replaces the angle of a faulty front wheel.
-        """
+        """Return the ratio of the wheel angles: front / rear, or its inverse if not `front`."""
         more = 1.0 + self.ratio / 2, 1.0 - self.ratio / 2
         return more[0] / more[1] if front else more[1] / more[0]
 

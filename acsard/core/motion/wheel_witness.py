@@ -30,14 +30,13 @@ CLEAR = 1.0
 which a wheel at this speed turns by one encoder count."""
 
 NEARER = 1.0
-"""A wheel that contradicts its command counts as obeying if its speed has approached the command by
-more than this, rad/s."""
+"""A wheel counts as obeying if its speed has approached the command by more than this, rad/s."""
 
 RATIO_S = 2.0
 """Duration of driving over which a wheel's angle is compared with the expected one, s."""
 
 TOO_SLOW, FAST_ENOUGH = 0.7, 0.8
-"""Ratios of measured to expected speed: below the first a wheel is too slow, and above the second
+"""Ratios of measured to expected speed. Below `TOO_SLOW`, a wheel is too slow. Above `FAST_ENOUGH`,
 it no longer is."""
 
 FaultKind = Literal["dead", "reversed", "runaway", "stuck"]
@@ -60,21 +59,14 @@ class Expected:
         self._begins = self.settled = self.clear = False
 
     def forget(self) -> None:
-        """Start over, with the speed in the next feedback line as the expected speed.
-
-        The wheels may still coast, so 0 would be a wrong start.
-        """
+        """Start over with the speed in the next line, because the wheels may still coast."""
         self.commanded, self._begins, self.clear = 0.0, True, False
 
     def follow(self, commanded: float, front: float, rear: float, dt: float, lag: float) -> None:
         """Update the expected speeds with a line, `dt` s after the one before.
 
-        Args:
-            commanded: The commanded speed of this side, rad/s.
-            front: The reported speed of the front wheel, rad/s.
-            rear: The reported speed of the rear wheel, rad/s.
-            dt: Time since the line before, s.
-            lag: Response time of a healthy wheel, s.
+        `front` and `rear` are reported speeds, rad/s. `lag` is the response time of a healthy
+        wheel, s.
         """
         if self._begins:
             self._begins = False
@@ -90,18 +82,13 @@ class Expected:
 
 
 class Witness:
-    """The evidence that one wheel does not obey its command.
-
-    It also measures whether the wheel is slower than expected.
-    """
+    """The evidence that one wheel does not obey its command, or is slower than expected."""
 
     def __init__(self) -> None:
         self.driven = False
-        """Whether any wheel is commanded to turn, or this wheel still turns since such a command.
-        """
+        """Whether any wheel is commanded to turn, or this one still turns after such a command."""
         self.ratio = 1.0
-        """Angle that the wheel turned in the right direction during the last `RATIO_S` s of
-        driving, divided by the expected angle."""
+        """Angle turned in the last `RATIO_S` s of driving, divided by the expected one."""
         self.slow = False
         """Whether the wheel turns in the right direction, but too slowly."""
         self.forget()
@@ -118,9 +105,8 @@ class Witness:
         # already too fast would never count as slowing down: slow motors latched "runaway" that
         # way.
         self._nearest = math.inf
-        """Deviation from the command when the wheel last approached the command, rad/s. The
-        deviation is the speed of a wheel that is too fast, otherwise the speed of the wheel against
-        the commanded direction."""
+        """Deviation from the command when the wheel last approached it, rad/s. It is the speed of a
+        wheel that is too fast, otherwise the speed of the wheel against the commanded direction."""
         self._wrong = False
         """Whether the wheel was too fast, stood, or turned against its command in the last line."""
         self._seconds = self._went = self._way = 0.0
@@ -130,13 +116,8 @@ class Witness:
     ) -> bool:
         """Check a line that reports `seen` rad/s; return whether it is evidence of a fault.
 
-        Args:
-            seen: The reported speed of this wheel, rad/s.
-            expected: The expected speed of the wheels of this side.
-            dt: Time since the line before, s.
-            most: Longest time for which one line counts as evidence, s.
-            count: Angle of an encoder count, rad.
-            still: Whether all wheels are commanded to stand.
+        `most` is the longest time for which one line counts as evidence, s. `count` is the angle of
+        an encoder count, rad. `still` is true if all wheels are commanded to stand.
         """
         goal, command = expected.speed, expected.commanded
         if self._begins:

@@ -93,12 +93,9 @@ acsard/msg/RobotState: \
     string emergency_stop, bool[] bumpers, \
     string recording_error, string certificate_expiry, acsard/msg/Counter[] counters
 """
-"""Message definitions, one type in each line.
-
-A line consists of the name of the type, a colon, and a list separated by commas. The list contains
-constants as `type NAME=value`, and fields as `type name` or `type name default`. `[]` marks a
-sequence and `[n]` an array.
-"""
+"""Message definitions, one type in each line: its name, a colon, and a list separated by commas.
+The list contains constants as `type NAME=value`, and fields as `type name` or `type name default`.
+`[]` marks a sequence and `[n]` an array."""
 
 
 def _parsed(text: str) -> dict[str, tuple[tuple[str, str], ...]]:
@@ -111,8 +108,7 @@ def _parsed(text: str) -> dict[str, tuple[tuple[str, str], ...]]:
 
 
 _DECLARED = _parsed(_TEXT)
-"""The constants and fields of each type, in order. Each constant or field is a pair: its type, and
-the text after the type."""
+"""The constants and fields of each type, in order: pairs of the type and the text after it."""
 
 DEFINITIONS: dict[str, tuple[Field, ...]] = {
     name: tuple((kind, rest.split()[0]) for kind, rest in declared if "=" not in rest)
@@ -159,10 +155,7 @@ SOURCE = "<source>"
 
 
 class Channel(Struct, frozen=True):
-    """A topic of MCAP files and live viewers.
-
-    If its name contains `<source>`, there is one such topic for each command source.
-    """
+    """A topic in MCAP files and viewers. `<source>` in its name stands for each command source."""
 
     name: str
     """Topic name relative to the namespace."""
@@ -214,8 +207,5 @@ CHANNELS: tuple[Channel, ...] = (*BY_KEY.values(), CMD_VEL_IN, LOG)
 
 
 def published_channels(silent: Container[str]) -> tuple[Channel, ...]:
-    """Return the channels on which a robot publishes.
-
-    `silent` contains the native keys to leave out, as `transports.left_out` returns them.
-    """
+    """Return the channels on which a robot publishes, except the native keys in `silent`."""
     return tuple(channel for channel in CHANNELS if channel.native not in silent)

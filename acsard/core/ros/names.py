@@ -56,11 +56,8 @@ TYPE_HASHES: dict[str, str] = {
         "RIHS01_0e192ef259c07fc3c07a13191d27002222e65e00ccec653ca05e856f79285fcd",
 }
 # fmt: on
-"""RIHS01 hashes of the ROS types in use, for Jazzy, Kilted and Lyrical.
-
-They are literals because they are part of the wire format. A test computes them again from the
-message definitions.
-"""
+"""RIHS01 hashes of the ROS types in use, for Jazzy, Kilted and Lyrical. They are literals because
+they are part of the wire format. A test computes them again from the message definitions."""
 
 
 def full_name(namespace: str, name: str) -> str:
@@ -101,11 +98,8 @@ class Qos(Struct, frozen=True):
     transient: bool = False
     """Whether a subscriber that joins later receives the kept samples."""
     best_effort: bool = False
-    """Whether the endpoint is best effort; if not, it is reliable.
-
-    A best-effort subscription accepts every publisher. A reliable subscription accepts only
-    reliable publishers.
-    """
+    """Whether the endpoint is best effort, otherwise reliable. A best-effort subscription accepts
+    every publisher. A reliable subscription accepts only reliable publishers."""
 
 
 class Node(Struct, frozen=True):
@@ -126,12 +120,8 @@ class Node(Struct, frozen=True):
     def endpoint_token(self, number: int, kind: Kind, name: str, type_name: str, qos: Qos) -> str:
         """Return the liveliness token of an endpoint.
 
-        Args:
-            number: the number of the endpoint in its session, from 1.
-            kind: the kind of the endpoint.
-            name: the fully qualified name of the topic or service.
-            type_name: the type as `pkg/msg/Name`.
-            qos: the QoS profile.
+        `number` is that of the endpoint in its session, from 1. `name` is fully qualified, and
+        `type_name` is the type as `pkg/msg/Name`.
         """
         return (
             f"{self._head}/{number}/{kind}/%/{_mangled('/' + self.namespace)}/{self.name}"

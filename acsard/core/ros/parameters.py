@@ -57,10 +57,7 @@ class ParameterDescriptor(Struct, frozen=True):
 
 
 def described(name: str, type_of: int) -> ParameterDescriptor:
-    """Return the descriptor of the parameter `name`.
-
-    `type_of` is the number of its type in ROS, 0 if the parameter does not exist.
-    """
+    """Return the descriptor of a parameter. `type_of` is its ROS type, 0 if it does not exist."""
     if not type_of:
         return ParameterDescriptor(name, type_of)
     return _described(name, type_of)
@@ -92,8 +89,7 @@ def _described(name: str, type_of: int) -> ParameterDescriptor:
 def kind_of(name: str) -> inspect.Type:
     """Return the declared type of the setting with the dotted key `name`.
 
-    For a command source, the key contains the name of the source. Raises `KeyError` for the name of
-    a table.
+    The key of a command source contains its name. Raises `KeyError` for the name of a table.
     """
     cls: type[Struct] = Config
     parts = iter(name.split("."))
@@ -113,10 +109,8 @@ def kind_of(name: str) -> inspect.Type:
 
 T = TypeVar("T")
 Some = Annotated[list[T], Meta(max_length=128)]
-"""List of at most 128 parameters to set. A robot has fewer parameters.
-
-Decoding a longer list would take too much of the time of a control step.
-"""
+"""List of at most 128 parameters to set. A robot has fewer. Decoding a longer list would take too
+much of the time of a control step."""
 Many = Annotated[list[T], Meta(max_length=256)]
 """List of at most 256 names. It may be longer than `Some`, because names are decoded faster."""
 
@@ -219,20 +213,15 @@ class SetAtomicallyReply(Struct, frozen=True):
 
 
 SETTING = ("set_parameters", "set_parameters_atomically")
-"""The services that set parameters. The class `Parameters` only reads, so it does not answer
-them."""
+"""The services that set parameters. `Parameters` only reads, so it does not answer them."""
 
 
 def failure(service: str, why: str, request: bytes = b"") -> bytes:
     """Return the reply to a request that is refused.
 
-    Without a reply, the client would wait for ever. The reply to a request that sets parameters
-    gives the reason. Other replies have no field for a reason, so they are empty, as in rclcpp.
-
-    Args:
-        service: the name of the service.
-        why: the reason for the refusal.
-        request: the payload of the request, which shows how many parameters it sets.
+    Without a reply, the client would wait for ever. A reply to a request that sets parameters gives
+    the reason for each of them. Other replies have no field for a reason, so they are empty, as in
+    rclcpp.
     """
     refused = SetParametersResult(False, why)
     if service in SETTING:
@@ -251,10 +240,7 @@ def failure(service: str, why: str, request: bytes = b"") -> bytes:
 
 
 class Parameters:
-    """Answers the services that only read parameters.
-
-    `tables` is the configuration: tables with their keys, as `effective` returns it.
-    """
+    """Answers the services that only read parameters, from `tables` as `effective` returns them."""
 
     def __init__(self, tables: Mapping[str, object]) -> None:
         self._values = {name: _value(value) for name, value in flat(tables)}
@@ -266,10 +252,7 @@ class Parameters:
         }
 
     def answer(self, service: str, payload: bytes) -> bytes:
-        """Return the reply to the request `payload`, both in CDR.
-
-        Raises `CdrError` if the request is not valid.
-        """
+        """Return the reply to a request, both in CDR. Raises `CdrError` if it is not valid."""
         return self._services[service](payload)
 
     def _list(self, asked: ListRequest) -> ListReply:
@@ -297,10 +280,7 @@ class Parameters:
 
 
 def wished(payload: bytes) -> dict[str, Plain]:
-    """Return the new values in a request to set parameters, by the name of the parameter.
-
-    Raises `CdrError` if the request is not valid.
-    """
+    """Return the new values by parameter in a request. Raises `CdrError` if it is not valid."""
     asked = Cdr(SetRequest).decode(payload)
     wishes: dict[str, Plain] = {}
     for parameter in asked.parameters:
@@ -313,8 +293,8 @@ def wished(payload: bytes) -> dict[str, Plain]:
 def outcome(service: str, payload: bytes, successful: bool, reason: str) -> bytes:
     """Return the reply to a request to set parameters.
 
-    The robot sets all parameters or none, so the reply has the same result for each of them.
-    `payload` is the request in CDR. Raises `CdrError` if it is not valid.
+    The robot sets all or none, so each has the same result. Raises `CdrError` for a request to
+    `set_parameters` that is not valid.
     """
     result = SetParametersResult(successful, reason)
     if service == "set_parameters_atomically":

@@ -1,4 +1,4 @@
-"""Converts events, commands and `state` to ROS messages, whose fields differ from acsard's own.
+"""Converts events, commands and the native message `state` to ROS messages.
 
 CDR has no maps, so the counters become a list. Null becomes NaN (`cdr_types.py`).
 """

@@ -94,8 +94,8 @@ PARAMETER_SERVICES = {
 }
 
 PARAMETERS = "parameters/"
-"""Beginning of `RosName.native` for a parameter service of ROS. The value is then a placeholder and
-not a native key. The native key `config` returns the same settings."""
+"""Beginning of `RosName.native` for a ROS parameter service, which has no native key of its own.
+The native key `config` returns the same settings."""
 
 PUBLISHED = (
     RosName("odom", "odom", "out", "nav_msgs/msg/Odometry"),

@@ -1,12 +1,8 @@
 """Simulates the board: its side of the serial protocol, with the time of each byte on the wire.
 
-Without faults the simulated board does what the daemon expects of a board. It boots with stopped
-motors, obeys only complete valid lines, and stops the motors after 300 ms without a valid line. It
-answers a checked line, which is a line with a checksum, with a checked reply. It does not use the
-daemon's parser, so that an error in that parser makes the tests fail.
-
-A fault is on inside a `with` block, such as `with mcu.mute():` (`faults.py`). The faults that
-`[sim] faults` lists are always on.
+The simulated board does not use the daemon's parser, so that an error in that parser makes the
+tests fail. A fault is on inside a `with` block, such as `with mcu.mute():` (`faults.py`). The
+faults that `[sim] faults` lists are always on.
 """
 
 from __future__ import annotations
@@ -33,10 +29,8 @@ RESET_NS = 2 * NS_PER_S
 """Time for which a board with a bootloader ignores its input after a reset, ns."""
 
 SHORTEST_WINDOW_NS = 4 * MS
-"""Shortest time over which the board computes speeds from encoder counts, ns.
-
-A reply that follows sooner repeats the last speeds.
-"""
+"""Shortest time over which the board computes speeds from encoder counts, ns. A reply that follows
+sooner repeats the last speeds."""
 
 OUTPUT_BYTES = 255
 """Size of the board's output buffer. The board drops a line that does not fit, as the firmware in
@@ -57,18 +51,13 @@ START_AMPS, START_NS = 10.0, 300 * MS
 current lowers the battery voltage by 2 V."""
 
 NEVER_NS = 2**62
-"""Monotonic time that is never reached, ns."""
 
 PROCESSING_MS = (2.1, 1.3, 3.7, 1.0, 4.9, 2.6, 1.8, 3.2)
 """Times from the end of a line to the start of its answer, ms. The board uses them in turn."""
 
 
 class FakeMcu(Faults):
-    """The simulated board.
-
-    The caller passes the bytes of the host to `receive`, waits until the time that `next_ns`
-    returns, and gets the bytes of the board from `advance`.
-    """
+    """The simulated board. Call `advance` at the times that `next_ns` returns, to get its bytes."""
 
     def __init__(self, config: Config, now_ns: int = 0) -> None:
         super().__init__()
@@ -77,8 +66,7 @@ class FakeMcu(Faults):
         self._counts = config.sim.encoder_counts
         self._wiring = _wiring(config.mcu.wheels)
         self._now_ns = self._moved_ns = now_ns
-        """`_now_ns` is the time of the last `advance`, and `_moved_ns` the time up to which the
-        vehicle has moved, both monotonic, ns."""
+        """Monotonic times of the last `advance`, and of the vehicle's present state, ns."""
         self._events: list[tuple[int, int, str, bytes]] = []
         self._order = count()
         self._processing = cycle(PROCESSING_MS)
@@ -105,18 +93,14 @@ class FakeMcu(Faults):
         """Field `bumpers` of a status line while none is pressed: a dot for each bumper."""
         self._inputs: tuple[tuple[int, int, str, str], ...] = ()
         """The faults of the inputs: begin (ns), end (ns), field of the status line, and its value.
-
-        The status line contains only the fields that a fault names. The value `silent` leaves the
-        field out of the line. If several faults of one field are on, the last one decides. Faults
-        that press bumpers are an exception: all of these bumpers count as pressed.
-        """
+        The value `silent` leaves the field out of the line. If several faults of one field are on,
+        the last one decides, except that a bumper counts as pressed if any of them presses it."""
         self._inputs_clock = b""
         self._battery_clock = b""
         self._charge = self._capacity = 1.0
         """State of charge of the battery, 0 to 1, and its capacity, ampere seconds."""
         self._drained_ns = self._rested_ns = now_ns
-        """`_drained_ns` is the time at which the charge was last computed. `_rested_ns` is the last
-        time at which all set points were zero. Both are ns."""
+        """Times of the last computation of the charge, and of the last zero set points, ns."""
         if config.sim.boot_time:
             self._schedule(self._boot_until_ns, "booted", b"")
         self._lasting = ExitStack()
@@ -138,10 +122,7 @@ class FakeMcu(Faults):
     # Time.
 
     def receive(self, now_ns: int, data: bytes) -> None:
-        """Accept bytes that the host wrote at `now_ns`.
-
-        They arrive at the board at the rate of the wire.
-        """
+        """Accept bytes that the host wrote at `now_ns`. They arrive at the rate of the wire."""
         start, taken = max(self._in_free_ns, now_ns), 0
         data = self._damaged(data)
         *lines, rest = data.split(b"\n")
@@ -191,11 +172,7 @@ class FakeMcu(Faults):
         return out
 
     def reset(self, now_ns: int, deaf_ns: int = RESET_NS) -> None:
-        """Reset the board.
-
-        The board stops the motors, and ignores its input for `deaf_ns` ns. During that time it
-        sends noise.
-        """
+        """Reset the board: stop the motors, send noise once, and ignore input for `deaf_ns` ns."""
         self._now_ns = now_ns
         self._events.clear()
         self._held = self._batch = b""
@@ -220,7 +197,6 @@ class FakeMcu(Faults):
         heapq.heappush(self._events, (due_ns, next(self._order), what, data))
 
     def _catch_up(self) -> None:
-        """Simulate the vehicle up to now, and stop the motors when the watchdog trips."""
         vehicle, now_ns, moved_ns = self._vehicle, self._now_ns, self._moved_ns
         deadline = self._fed_ns + self.watchdog_ns
         if deadline <= now_ns and self.watchdog and any(vehicle.set_points):
@@ -287,11 +263,7 @@ class FakeMcu(Faults):
         self._schedule(self._out_free_ns, "sent", data)
 
     def _handed_over(self, now_ns: int, what: str, data: bytes) -> bytes:
-        """Return the bytes that the USB adapter passes to the host now, and keep the other bytes.
-
-        `what` is "sent" if the board has sent `data`, or "batch" if the adapter's timer has
-        expired.
-        """
+        """Return the bytes that the USB adapter passes on now. `what` is "batch" for its timer."""
         until_ns = self._stalled_until(now_ns)
         if until_ns > now_ns:
             self._schedule(until_ns, what, data)
@@ -307,7 +279,6 @@ class FakeMcu(Faults):
         return waited[:full]
 
     def _encoders(self) -> list[int]:
-        """Return the encoder counts of the motors a to d."""
         angles = self.vehicle.angles
         if angles != self._angles:
             floor, tau, per_turn = math.floor, math.tau, self._counts
@@ -316,10 +287,7 @@ class FakeMcu(Faults):
         return self._seen
 
     def _speeds(self, now_ns: int) -> list[float]:
-        """Return the speeds of the motors a to d, rad/s.
-
-        A speed is the angle turned since the last computation, divided by the time since then.
-        """
+        """Return the mean speeds of the motors a to d since the last computation, rad/s."""
         since, before = self._window
         gains = self.gains
         if self.stuck is not None:
@@ -349,12 +317,11 @@ class FakeMcu(Faults):
         return [speed if abs(speed) >= 0.005 else 0.0 for speed in seen]
 
     def _sample(self) -> tuple[int, ...]:
-        """Return the time of the last encoder reading, ms since power-on, and the counts."""
+        """Return the time of the last encoder reading, ms since power-on, and the four counts."""
         read_ns, _ = self._window
         return (read_ns - self._on_ns) // MS, *(round(count) for count in self._counted)
 
     def _tell_inputs(self, now_ns: int) -> None:
-        """Send a status line with the inputs, except those whose value is `silent`."""
         fields: dict[str, str] = {}
         for begin_ns, end_ns, name, value in self._inputs:
             before = fields.setdefault(name, self._bumpers if name == "bumpers" else "ok")
@@ -384,7 +351,6 @@ class FakeMcu(Faults):
         self._tell(now_ns, {"volts": f"{volts:.2f}", "amps": f"{-amps:.2f}", "charge": charge})
 
     def _schedule_changes(self, begin_ns: int, end_ns: int) -> None:
-        """Schedule a status line for each time at which a fault of an input begins or ends."""
         for change_ns in (begin_ns, end_ns):
             if self._now_ns <= change_ns < NEVER_NS:
                 self._schedule(change_ns, "status", b"")
@@ -396,10 +362,7 @@ class FakeMcu(Faults):
         return self._input("estop", "ok")
 
     def estop_pressed(self, after_s: float, length_s: float) -> Fault:
-        """Make the board report the emergency stop as pressed after `after_s` s, for `length_s` s.
-
-        At other times the board reports it as released. If `length_s` is 0, it stays pressed.
-        """
+        """Press the emergency stop after `after_s` s for `length_s` s (0 s: for ever)."""
         return self._input("estop", "pressed", after_s, length_s)
 
     def estop_silent(self, after_s: float, length_s: float) -> Fault:
@@ -415,10 +378,7 @@ class FakeMcu(Faults):
         return self._input("bumpers", self._bumpers)
 
     def bumper_pressed(self, number: float, after_s: float, length_s: float) -> Fault:
-        """Make the board report bumper `number` as pressed after `after_s` s, for `length_s` s.
-
-        The first bumper of the board has the number 1. If `length_s` is 0, it stays pressed.
-        """
+        """Press bumper `number` (from 1) after `after_s` s for `length_s` s (0 s: for ever)."""
         marks = ["X" if i == number else mark for i, mark in enumerate(self._bumpers, 1)]
         return self._input("bumpers", "".join(marks), after_s, length_s)
 
@@ -431,10 +391,7 @@ class FakeMcu(Faults):
         return self._input("bumpers", "silent", after_s, length_s)
 
     def driver_fault(self, after_s: float, length_s: float) -> Fault:
-        """Make the board report a fault of a motor driver after `after_s` s, for `length_s` s.
-
-        At other times the board reports no fault. If `length_s` is 0, the fault stays.
-        """
+        """Make the board report a driver fault `after_s` s later for `length_s` s (0: for ever)."""
         return self._input("driver", "fault", after_s, length_s)
 
     @contextmanager
@@ -487,11 +444,7 @@ class FakeMcu(Faults):
 
 
 def _wiring(wheels: WheelMap) -> list[tuple[int, int]]:
-    """Return for each of the motors a to d the wheel that it turns, and a sign.
-
-    A wheel is an index in the order of `values.WHEELS`. The sign is -1 for a reversed motor, else
-    1.
-    """
+    """Return for each motor a to d its wheel's index in `WHEELS`, and -1 if reversed, else 1."""
     motors = (wheels.front_right, wheels.front_left, wheels.rear_left, wheels.rear_right)
     place = {motor[1]: (index, -1 if motor[0] == "-" else 1) for index, motor in enumerate(motors)}
     return [place[letter] for letter in "abcd"]

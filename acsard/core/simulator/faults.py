@@ -1,8 +1,7 @@
-"""The faults of the simulated board and its wire.
+"""The switches of the faults of the simulated board and its wire.
 
-For each fault, a method returns a context manager, and the fault is on inside its `with` block.
-This module contains the switches of the faults, and `fake_mcu.py` implements their effects. No
-fault is random. A fault that affects only some lines affects every n-th line.
+`fake_mcu.py` implements the effects of the faults. No fault is random. A fault that affects only
+some lines affects every n-th line.
 """
 
 from __future__ import annotations
@@ -56,12 +55,10 @@ class Faults:
         self.understand: Callable[[bytes], protocol.Command | None] = protocol.whole
         self.samples = True
         self.latency_ns = 0
-        """Interval at which the host's USB adapter sends a packet that is not full, ns; 0 means
-        that there is no adapter."""
+        """Interval at which the USB adapter sends even an unfilled packet, ns; 0: no adapter."""
         self.stall_every_ns = self.stall_ns = 0
         self.lose_reply = self.lose_command = self.bit_error = 0
-        """The n of three faults: every n-th reply is lost, every n-th command is lost, and one bit
-        of every n-th line is flipped. 0 means that the fault is off."""
+        """The n of each fault that affects every n-th line. 0 means that the fault is off."""
         self._passed = {"reply": 0, "command": 0, "bit": 0}
         self._clock = b""
 
@@ -81,18 +78,14 @@ class Faults:
             setattr(self, name, value)
 
     def _catch_up(self) -> None:
-        """Simulate the vehicle up to now. `FakeMcu`, which has a vehicle, implements this."""
+        """Simulate the vehicle up to now. `FakeMcu` implements this."""
 
     def _hit(self, what: str, every: int) -> bool:
-        """Count an event of kind `what`, and return whether the fault affects this event.
-
-        The fault affects every `every`-th event, or none if `every` is 0.
-        """
+        """Count an event of kind `what`. Return whether it is an `every`-th one; 0 means never."""
         self._passed[what] += 1
         return every > 0 and self._passed[what] % every == 0
 
     def _damaged(self, data: bytes) -> bytes:
-        """Return `data` as the wire delivers it. The fault `bit_errors` may flip one bit."""
         if not data or not self._hit("bit", self.bit_error):
             return data
         place, bit = divmod(self._passed["bit"] * 59 % (8 * len(data)), 8)
@@ -189,10 +182,7 @@ class Faults:
         return self._with(ending=",\r\n")
 
     def comma_latched(self) -> Fault:
-        """Make the board obey each value that has a comma after it, as old firmware does.
-
-        Such firmware ignores checksums.
-        """
+        """Make the board obey each value before a comma and ignore checksums, like old firmware."""
         return self._with(understand=protocol.latched)
 
     def no_check(self) -> Fault:
@@ -228,17 +218,11 @@ class Faults:
         return self._with(lose_command=every)
 
     def bit_errors(self, every: int = 7) -> Fault:
-        """Flip one bit in every n-th line, where n is `every`. The bit is different each time.
-
-        The lines of both directions are counted together.
-        """
+        """Flip a different bit in every n-th line of both directions, where n is `every`."""
         return self._with(bit_error=every)
 
     def ftdi(self, latency_s: float = 0.016) -> Fault:
-        """Send replies through a USB adapter that waits for a full packet or for its timer.
-
-        Bytes arrive up to `latency_s` s late, and several lines arrive at once.
-        """
+        """Send replies through a USB adapter, which delays them by up to `latency_s` s."""
         return self._with(latency_ns=int(latency_s * NS_PER_S))
 
     def stalls(self, every_s: float, length_s: float) -> Fault:

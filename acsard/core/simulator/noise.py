@@ -19,10 +19,7 @@ def uniform(seed: int, n: int) -> float:
 
 
 def gauss(seed: int, n: int) -> float:
-    """Return the n-th number of this seed, normally distributed.
-
-    The mean is 0 and the standard deviation 1. The method is that of Box and Muller (1958).
-    """
+    """Return the n-th number of this seed from the standard normal distribution (Box-Muller)."""
     radius = math.sqrt(-2.0 * math.log(1.0 - uniform(seed, 2 * n)))
     return radius * math.cos(math.tau * uniform(seed, 2 * n + 1))
 

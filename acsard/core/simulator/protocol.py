@@ -1,9 +1,7 @@
 """The serial protocol as the board implements it: the lines that it obeys, and its answers.
 
-A checked line is a plain line with a suffix: a sequence number and a checksum. There is a function
-for each kind of firmware. The reference firmware (`whole`) obeys only complete valid lines, plain
-or with a correct suffix. Other firmware does not know the suffix: `plain_only` refuses a line with
-a suffix, and `prefix` and `latched` obey its plain part. The module shares no code with the host.
+There is a decoder for each kind of firmware; `whole` is the reference firmware. A checked line is a
+plain line with a suffix: a sequence number and a checksum. The module shares no code with the host.
 """
 
 from __future__ import annotations
@@ -37,10 +35,7 @@ class Command(Struct, frozen=True):
 
 
 def whole(line: bytes) -> Command | None:
-    """Decode a line like the reference firmware, or return None if it is not valid.
-
-    A line with `#` or `*` must have a correct suffix.
-    """
+    """Decode a plain or checked line like the reference firmware; return None if it is invalid."""
     text = line.removesuffix(b"\n").removesuffix(b"\r")
     if b"#" not in text and b"*" not in text:
         return _plain(text)
@@ -101,12 +96,9 @@ def _value(word: bytes) -> float:
 
 @lru_cache(1024)
 def speeds_text(speeds: tuple[float, ...], separator: str, unpadded: bool) -> bytes:
-    """Return the plain part of a reply, without a line end.
+    """Return the plain part of a reply with the speeds of the motors a to d, rad/s.
 
-    Args:
-        speeds: The speeds of the motors a to d, rad/s.
-        separator: The text between two values.
-        unpadded: Whether a speed below ten has only one integer digit.
+    `unpadded` says whether a speed below ten has only one integer digit.
     """
     form = "%s%s%.2f" if unpadded else "%s%s%05.2f"
     words = [
@@ -117,12 +109,9 @@ def speeds_text(speeds: tuple[float, ...], separator: str, unpadded: bool) -> by
 
 
 def suffix(text: bytes, sequence: bytes, sample: Sequence[int]) -> bytes:
-    """Return the suffix of a checked reply.
+    """Return the suffix of a checked reply whose plain part is `text`.
 
-    Args:
-        text: the plain part of the reply.
-        sequence: the two digits of the command's sequence number.
-        sample: the milliseconds and the four encoder counts, or empty for a reply without them.
+    `sample` is the milliseconds and the four encoder counts, or empty for a reply without them.
     """
     body = b"#" + sequence
     if sample:
@@ -134,10 +123,7 @@ def suffix(text: bytes, sequence: bytes, sample: Sequence[int]) -> bytes:
 
 
 def status(fields: Mapping[str, str], check: bool) -> bytes:
-    """Return the status line with these fields, such as `{"estop": "ok"}`.
-
-    `check` says whether the line gets a checksum.
-    """
+    """Return the status line with `fields`, such as `{"estop": "ok"}`. `check` adds a checksum."""
     text = "".join(["!status", *(f" {name}={value}" for name, value in fields.items())]).encode()
     return text + (b"*%04X" % _crc(text) if check else b"") + b"\r\n"
 
@@ -145,9 +131,8 @@ def status(fields: Mapping[str, str], check: bool) -> bytes:
 def identity(counts: int, watchdog_ms: int, sample: bool) -> bytes:
     """Return the line with which the firmware identifies itself.
 
-    `counts` is the number of encoder counts per wheel turn. `watchdog_ms` is the silence after
-    which the board stops the motors, ms. `sample` says whether the firmware can add its time and
-    encoder counts to its replies.
+    `counts` is the number of encoder counts per wheel turn. `sample` says whether the firmware can
+    add its time and encoder counts to its replies.
     """
     text = f"!acsard-mcu 1 counts={counts} watchdog_ms={watchdog_ms} check=1 sample={int(sample)}"
     return text.encode() + b"\r\n"

@@ -1,7 +1,6 @@
-"""Observes the true motion of the simulated robot a hundred times per second, and simulates a gyro.
+"""Observes the true motion of the simulated robot at 100 Hz, and simulates a gyro.
 
-The simulated board does not use these observations. It reports only the motion that its encoders
-measure.
+The simulated board does not use these observations: it reports only the speeds from its encoders.
 """
 
 from __future__ import annotations
@@ -21,17 +20,14 @@ LOOK_NS = NS_PER_S // 100
 
 
 class Sight(Struct, frozen=True):
-    """An observation of the simulated robot."""
+    """An observation of the simulated robot's true motion."""
 
     at_ns: int
     """Monotonic time of the observation, ns."""
     pose: Pose
-    """True pose of the robot."""
     gyro: float
-    """Turn rate that the gyro reports, rad/s.
-
-    It is the mean over the time between two observations, delayed by `[sim] gyro_delay`.
-    """
+    """Turn rate that the gyro reports, rad/s: the mean since the last observation, delayed by
+    `[sim] gyro_delay`."""
 
 
 class WatchedMcu(FakeMcu):
@@ -44,10 +40,7 @@ class WatchedMcu(FakeMcu):
         self._looks = 0
         self._look_ns = now_ns + LOOK_NS
         self._history: deque[tuple[int, float]] = deque([(now_ns, 0.0)])
-        """Pairs of a time (ns) and the angle that the robot has turned until then (rad).
-
-        The pairs go back as far as the delayed samples of the gyro need.
-        """
+        """Times (ns) and angles turned until then (rad), as far back as the delayed gyro needs."""
 
     def next_ns(self) -> int:
         """Return the monotonic time of the next event or observation, ns."""
@@ -76,10 +69,7 @@ class WatchedMcu(FakeMcu):
         self._see(Sight(now_ns, self.vehicle.pose, rate))
 
     def _turned(self, at_ns: int) -> float:
-        """Return the angle that the robot has turned up to `at_ns`, rad.
-
-        For a time before the oldest observation, return the angle of that observation.
-        """
+        """Return the angle turned until `at_ns`, or until the start of the history, rad."""
         before_ns, before = self._history[0]
         if at_ns <= before_ns:
             return before

@@ -7,10 +7,8 @@ from acsard.core.messages.schema import Header, Imu, Pose, PoseStamped, Quaterni
 from acsard.core.simulator.simulated_robot import Sight
 
 FRAME = "sim"
-"""Frame of the true pose. Its origin is the robot's pose at the start of the simulator.
-
-No transform connects it with `odom`, so no program can mistake the true pose for odometry.
-"""
+"""Frame of the true pose. Its origin is the robot's pose at the start of the simulator. No
+transform connects it with `odom`, so no program can mistake the true pose for odometry."""
 
 
 def true_pose(sight: Sight, wall_ns: int) -> PoseStamped:
@@ -23,11 +21,8 @@ def true_pose(sight: Sight, wall_ns: int) -> PoseStamped:
 def turn_rate(sight: Sight, frame: str, deviation: float, wall_ns: int) -> Imu:
     """Return the turn rate that the gyro measured, as an Imu message without other measurements.
 
-    Args:
-        sight: the observation.
-        frame: the frame of the measurement.
-        deviation: the standard deviation of the gyro's noise, rad/s.
-        wall_ns: the stamp, wall-clock ns since 1970.
+    `deviation` is the standard deviation of the gyro's noise, rad/s. `wall_ns` is the stamp, ns
+    since 1970.
     """
     unknown, variance = [-1.0] + [0.0] * 8, deviation * deviation
     known = [variance, 0.0, 0.0, 0.0, variance, 0.0, 0.0, 0.0, variance]

@@ -2,9 +2,7 @@
 
 A motor follows its set point as a first-order system. The base moves according to the true speeds
 of the wheels, the true radii and the true effective track. `[sim]` can make the radii and the track
-differ from the configured ones. With `turn_slip` the base turns less than the wheels roll. With
-`load` the motors are slower than their set points. A person who pushes the robot is stronger than
-the motors. Wheels are in the order of `values.WHEELS`.
+differ from the configured ones. Wheels are in the order of `values.WHEELS`.
 
 The true effective track depends on the turn rate. Let L be the configured effective track, m the
 setting `track_multiplier`, k the setting `track_rate_dependence`, and w the turn rate in rad/s that
@@ -12,7 +10,7 @@ the wheels would give with the track m L. The base turns at the rate
 
     w / (1 + 2 k |w| / (1 + |w|))
 
-The true track is therefore m L at very low turn rates, (1 + k) m L at 1 rad/s, and it approaches
+The true track is therefore m L at very low turn rates and (1 + k) m L at 1 rad/s, and it approaches
 (1 + 2 k) m L.
 """
 
@@ -57,11 +55,7 @@ class Vehicle:
         """Fraction of each set point that the motors do not reach, 0 to 1."""
 
     def advance(self, dt: float, push: float | None = None) -> None:
-        """Move the robot for `dt` s with the present set points.
-
-        If `push` is a number, a person pushes the robot straight at `push` m/s, and the set points
-        have no effect.
-        """
+        """Move the robot for `dt` s by its set points, or pushed by a person at `push` m/s."""
         if dt <= 0.0:
             return
         if push is None and not (any(self.set_points) or any(self.speeds)):

@@ -9,12 +9,10 @@ Zenoh denies every message that no rule allows.
   expression of the message. A query with a wildcard therefore needs a rule with a wildcard.
 - A client over TLS may use exact keys only, unless `access.wildcards` is set. A few wildcards can
   take all of Zenoh's processor time.
-- The daemon itself checks three things of each message again: the exact key, the kind (PUT), and
-  the source of commands.
+- The daemon checks the exact key, the kind (PUT) and the source of each command again.
 
-Zenoh does not tell the daemon with which certificate a sample came. Therefore each certificate that
-may command has keys of its own, which end with the certificate's name. The rules let no other
-certificate put on these keys.
+Zenoh does not tell the daemon the certificate of a sample's sender. Therefore each certificate that
+may command has separate keys, which end with its name. Only that certificate may put on them.
 """
 
 from __future__ import annotations
@@ -40,10 +38,8 @@ from acsard.core.ros.transports import PARAMETERS, Endpoint, claims, endpoints, 
 from acsard.core.values import ROLES, ROOT, Role
 
 LOCAL_LINKS = ("tcp",)
-"""Protocols of links without a certificate.
-
-Such links connect programs of one machine, unless `bus.insecure` allows others.
-"""
+"""Protocols of links without a certificate. Such links connect programs of one machine, unless
+`bus.insecure` allows others."""
 
 TOKENS = ("@ros2_lv/**", "@/*/@ros2_lv/**")
 """Key expressions of the liveliness tokens of ROS."""
@@ -61,15 +57,9 @@ SPOKEN = (
 EVERYTHING = (*SPOKEN, "put", "delete", "query")
 
 DRIVERS: tuple[Role, ...] = tuple(role for role in ROLES if has(role, COMMAND_ROLE))
-"""The roles whose certificates may command."""
 
 
 def _grants(role: Role) -> tuple[str, ...]:
-    """Return the names of a role's rules. A role may also use the keys of the lower roles.
-
-    Only a maintainer may forward the liveliness tokens of other daemons. Routers have this role,
-    because they forward tokens.
-    """
     own = [f"{least} {use}" for least in ROLES if has(role, least) for use in USES]
     return ("speak", "tell", *own, *(("appear",) if role == "maintainer" else ()))
 
@@ -97,13 +87,10 @@ LOCAL = (
     "err",
     "forge",
 )
-"""The names of the rules of a client on the robot's own machine.
-
-Such a client has the permissions of a maintainer. It may also subscribe with any wildcard and
-receive the commands of other clients. It may even put on wrong keys, so that the daemon receives
-such a sample, counts it and refuses it with a reason. It may not publish on the keys on which the
-robot publishes.
-"""
+"""The names of the rules of a client on the robot's own machine: a maintainer's rules and more.
+Such a client may also subscribe with any wildcard and receive the commands of other clients. It may
+put on wrong keys, so that the daemon can count its sample and refuse it with a reason. It may not
+put on the keys on which the robot publishes."""
 
 Flow = Literal["ingress", "egress"]
 
@@ -131,9 +118,7 @@ class _Keys:
         topics, outgoing = offered(config), published(config)
         self._incoming = [topic for topic in topics if topic not in outgoing]
         """Rows of the topic table that the daemon does not publish: inputs, queries and services.
-
-        If the daemon itself publishes the gyro of the simulator, the row of the gyro is left out.
-        """
+        The row of the gyro is left out if the daemon publishes the gyro of the simulator."""
         self._readable = [*outgoing, *(t for t in self._incoming if t.direction != "in")]
         """Rows of the topic table that clients may subscribe to or query."""
         self.all = full_key(robot, "**")
@@ -168,27 +153,23 @@ class _Keys:
     def of(self, role: Role, use: Use) -> list[str]:
         """Return the exact native and ROS keys that `role` may use and that no lower role may use.
 
-        `use` is "subscribe", "query" or "publish". Command keys that end with a certificate's name
-        are not included; see `commands_by`.
+        Command keys that end with a certificate's name are not included; see `commands_by`.
         """
         rows = self._incoming if use == "publish" else self._readable
         keys = [full_key(self._robot, key) for key in keys_for(role, use, rows)]
         return keys + [e.key for e in self._ros if use in _uses(e) and self._least(e) == role]
 
     def commands_by(self, certificate: str) -> list[str]:
-        """Return the command keys that the holder of one certificate may use, of all sources.
+        """Return the command keys of all sources for the certificate with this common name.
 
-        `certificate` is the common name of the certificate. "*" gives the keys of all certificates:
-        a router needs them, because it forwards the commands of every client.
+        "*" gives the keys of all certificates: a router forwards the commands of every client.
         """
         return [full_key(self._robot, key) for key in source_keys(self._sources, certificate)]
 
     def _least(self, endpoint: Endpoint) -> Role | None:
-        """Return the lowest role that may use a ROS endpoint: the same as for its native key.
+        """Return the lowest role that may use a ROS endpoint; None if its source is not configured.
 
-        Return None if the endpoint sends commands to a source that is not configured, which no role
-        may do. A ROS key cannot contain a certificate's name, so every role that may command may
-        use the ROS key of a command. Raise `LookupError` if the table of keys lacks the native key.
+        A ROS key cannot contain a certificate's name, so every role that may command may use it.
         """
         native = endpoint.native
         if native.startswith(PARAMETERS):
@@ -229,11 +210,7 @@ def gateway_access(config: Config) -> dict[str, object]:
 
 
 def _access(config: Config, local: tuple[str, ...], *, gateway: bool) -> dict[str, object]:
-    """Return the value of `access_control`.
-
-    `local` gives the names of the rules for links without a certificate. `gateway` is true for the
-    TLS gateway and false for the daemon.
-    """
+    """Return `access_control`. `local` names the rules for links without a certificate."""
     keys = _Keys(config)
     rules = _rules(keys)
     access = config.access
@@ -300,7 +277,7 @@ def _rules(keys: _Keys) -> dict[str, Rule]:
             _rule(f"{role} publishes", "ingress", ["put"], keys.of(role, "publish")),
         ]
     rules += [
-        # A router forwards the tokens of other daemons:
+        # A router has the role maintainer, and forwards the tokens of other daemons:
         _rule("appear", "ingress", ["liveliness_token"], [keys.alive, *keys.claims]),
         # A client without a certificate commands, and a router forwards commands:
         _rule("command", "ingress", ["put"], keys.commands),

@@ -31,9 +31,8 @@ def address_of(
 ) -> Address:
     """Return the address of a robot from its configuration and from the options of a tool.
 
-    The options are `connect` (the endpoint), `robot_id` and `tls` (the certificate directory). An
-    option that is not None replaces the value of the configuration. Raises `UsageError` for an id
-    that no robot can have.
+    An option that is not None replaces the value of the configuration. Raises `UsageError` for an
+    id that no robot can have.
     """
     robot_id = config.robot.id if robot_id is None else robot_id
     require_id(robot_id)
@@ -49,10 +48,9 @@ def address_of(
 def address_by_environment(endpoint: str | None, robot_id: str | None, tls: str | None) -> Address:
     """Return a robot's address for a program that uses the client library.
 
-    The arguments are the endpoint, the robot's id and the certificate directory. An argument that
-    is not None takes precedence. The other values come from the file that $ACSARD_CONFIG names, or
-    from the defaults. $ACSARD_TLS replaces the certificate directory of the file. Raises
-    `UsageError` for an id that no robot can have, and for a file that cannot be used.
+    An argument that is not None takes precedence. The other values come from the file that
+    $ACSARD_CONFIG names, or from the defaults. $ACSARD_TLS replaces the certificate directory of
+    the file. Raises `UsageError` for an id that no robot can have, and for an unusable file.
     """
     complete = endpoint is not None and robot_id is not None
     if complete and (tls is not None or not _is_tls(endpoint or "")):

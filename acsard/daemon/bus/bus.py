@@ -35,18 +35,14 @@ OPEN_TIMEOUT_S = 10.0
 CLOSE_TIMEOUT_S = 0.3
 
 TWIN_TIMEOUT_S = 0.5
-"""Time for which the daemon checks at its start whether another daemon has this robot's id or ROS
-names, s."""
+"""Time to look for another daemon with this robot's id or ROS names at the start, s."""
 
 
 class ZenohBus:
     """The robot's keys on the bus. The keys exist while this asynchronous context is entered."""
 
     def __init__(self, config: Config, waker: Waker) -> None:
-        """Prepare the buffers. The session opens when the context is entered.
-
-        `waker` wakes the control loop when a command or a stop arrives.
-        """
+        """Prepare the buffers. `waker` wakes the control loop when a command or a stop arrives."""
         self._config, self._id = config, config.robot.id
         self._alive = full_key(self._id, "alive")
         prefix = full_key(self._id, "")
@@ -56,8 +52,7 @@ class ZenohBus:
         self._outlets, self._links = Outlets(), RouterLinks(config.bus, self._inbox)
         self._session: zenoh.Session
         self._kept: list[object] = []
-        """References to the declared entities. Zenoh undeclares an entity when nothing refers to
-        it."""
+        """The declared entities. Zenoh undeclares an entity when nothing refers to it."""
 
     # The control loop calls the methods below.
 
@@ -67,10 +62,7 @@ class ZenohBus:
         return self._outlets.wanted
 
     def take(self, queries: int) -> BusInput:
-        """Return the input since the last call, with at most `queries` queries.
-
-        A slow query may exceed this number by one (`Inbox.take`).
-        """
+        """Return the input since the last call, with at most `queries` queries (`Inbox.take`)."""
         taken = self._inbox.take(queries)
         routers = self._links.changed()
         if routers is not None:
@@ -85,16 +77,12 @@ class ZenohBus:
         self._outlets.publish(key, message)
 
     def flush(self) -> None:
-        """Wake the thread that sends the queued messages, without waiting for it.
-
-        Raises the error of a thread of the bus if this error has ended the thread.
-        """
+        """Wake the sending thread without waiting. Raise the error of a bus thread that failed."""
         self._outlets.flush()
         self._replies.check()
         self._links.check()
 
     def reply(self, reply: Reply) -> None:
-        """Send a reply to the query that `reply.ticket` names."""
         self._replies.send(reply)
 
     def retire(self, ticket: int) -> None:
@@ -131,10 +119,7 @@ class ZenohBus:
         return session
 
     def _conflict(self, tokens: set[str]) -> str:
-        """Return an error message if another daemon has this robot's id or ROS names, else "".
-
-        `tokens` contains those of this robot's liveliness tokens that other sessions have declared.
-        """
+        """Return an error message if another daemon has this robot's id or ROS names, else ""."""
         if self._alive in tokens:
             return (
                 f"another daemon on this bus already has the id {self._id}; give this robot its "
@@ -174,9 +159,8 @@ class ZenohBus:
     def _declare_json(self, session: zenoh.Session, topic: Topic) -> None:
         """Declare the topic's JSON key, for clients without msgpack.
 
-        Its publisher never keeps its last message for late subscribers, because then it would
-        encode every message even without subscribers. A query on the key returns the present value
-        instead.
+        Its publisher is never latched, because a latched publisher must encode every message even
+        without subscribers. A query on the key returns the present value instead.
         """
         below = json_key(topic.key)
         key, encoding = full_key(self._id, below), encoding_name("json", topic.type)
@@ -220,10 +204,7 @@ class ZenohBus:
 
 
 def _others(session: zenoh.Session, alive: str, claims: tuple[str, ...]) -> set[str]:
-    """Return those of the liveliness tokens `alive` and `claims` that other sessions have declared.
-
-    Blocks for up to `TWIN_TIMEOUT_S`.
-    """
+    """Return those of these tokens that other sessions hold. Block up to `TWIN_TIMEOUT_S`."""
     liveliness = session.liveliness()
     subscribers = {
         token: liveliness.declare_subscriber(token, history=True) for token in (alive, *claims)

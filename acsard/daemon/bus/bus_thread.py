@@ -1,7 +1,6 @@
 """A thread of the bus. If an exception ends the thread, the daemon ends too.
 
-Otherwise the robot would drive on, but would no longer publish or answer. An exception in the
-thread is a bug, like one in a control step.
+Otherwise the robot would drive on, but would no longer publish or answer.
 """
 
 from __future__ import annotations

@@ -1,12 +1,9 @@
 """Watches the certificate files of the bus: whether they are replaced, and when they expire.
 
-Zenoh reads the files of a listening endpoint only when it opens the endpoint, and the files of a
-connection only when it connects. A process that listens must therefore know when its files have
-been replaced. `CertificateFiles.renewed` reports this. Three files cannot be replaced at the same
-moment. So new files are reported only when they belong together and no longer change.
-
-The module also reads when three kinds of certificates expire: those of the robot, of its authority
-and of the routers. A thread reads them, because a disk or a router may not answer.
+Zenoh reads the files of a listening endpoint only when it opens the endpoint. So a process that
+listens must know when its files have been replaced (`CertificateFiles.renewed`). Three files cannot
+be replaced at the same moment, so new files are reported only when they belong together and no
+longer change. A thread reads the expiry times, because a disk or a router may not answer.
 """
 
 from __future__ import annotations
@@ -36,8 +33,7 @@ class CertificateFiles:
     def __init__(self, authority: Path, certificate: Path, key: Path) -> None:
         """Record the state of the files.
 
-        The caller must create this object before it reads the files itself. Otherwise a replacement
-        between the two would not be noticed.
+        The process must read the files after this, or a replacement in between goes unnoticed.
         """
         self._files = authority, certificate, key
         self._used = self._seen = self._signature()
@@ -46,8 +42,7 @@ class CertificateFiles:
     def renewed(self) -> bool:
         """Return whether the files were replaced by new ones that can be used together.
 
-        It returns True once for each replacement. It checks the files at most every
-        `FILES_LOOK_NS`, and returns False in between.
+        Returns True once for each replacement. Checks the files at most every `FILES_LOOK_NS`.
         """
         now_ns = clock.mono_ns()
         if now_ns < self._due_ns:
@@ -77,29 +72,25 @@ ENDS_LOOK_S = 60.0
 """Pause between two readings of the expiry times, s."""
 
 ROUTER_LOOKS = 60
-"""The routers' certificates are read only at every n-th reading of the robot's files. This is n.
-
-Each reading of a router's certificate takes one of the router's connections. If a router did not
-answer, all routers are tried again at the next reading of the robot's files.
-"""
+"""The routers' certificates are read once in this many readings of the robot's files, because each
+reading takes one of the router's connections. If a router did not answer, all routers are tried
+again at the next reading of the robot's files."""
 
 
 def ends_of(routers: Iterable[str], directory: str) -> dict[str, int]:
-    """Return the expiry times of the certificates of those routers that answer, ns since 1970.
+    """Return when the certificates of those routers that answer expire, ns since 1970.
 
-    The keys of the result are names for messages, like "the router tls/HOST:PORT". `routers` lists
-    the endpoints. `directory` contains the certificate with which this machine connects to the
-    routers.
+    The keys of the result are names for messages, like "the router tls/HOST:PORT". `directory`
+    contains the certificate with which this machine connects.
     """
     found = {f"the router {one}": peer_ends_ns(one, directory) for one in routers}
     return {whose: ends_ns for whose, ends_ns in found.items() if ends_ns is not None}
 
 
 async def watch_certificates(bus: BusConfig, known: MutableMapping[str, int]) -> None:
-    """Update the expiry times in `known` again and again, until cancelled.
+    """Update the expiry times in `known`, ns since 1970, again and again until cancelled.
 
-    `known` maps the name of each certificate to its expiry time, ns since 1970. The value of a
-    certificate that cannot be read stays unchanged.
+    The value of a certificate that cannot be read stays unchanged.
     """
     routers = [endpoint for endpoint in bus.connect if endpoint.startswith(TLS)]
     answered, look = 0, 0

@@ -26,8 +26,7 @@ WHOAMI_S, WHOAMI_MORE_S = 2.0, 0.3
 """Time to wait for the first answer, and then for further answers, s."""
 
 Ask = Callable[[str, Callable[[zenoh.Sample], object]], None]
-"""Function that queries a key (its first argument), and passes each sample of the answer to a
-callback (its second argument)."""
+"""Function that queries a key, and passes each sample of the answer to the callback."""
 
 
 class Identity(Struct, frozen=True):
@@ -40,15 +39,12 @@ class Identity(Struct, frozen=True):
     sender: str
     """The name that the daemon gives to this client's commands."""
     robot: str = ""
-    """The id of the robot that was queried."""
     endpoint: str = ""
-    """The endpoint to which the client is connected."""
 
     def lacks(self, key: str) -> str:
-        """Return why this client may not use a robot's key, in words.
+        """Return why this client may not use a robot's key, in words; "" if it may use it.
 
-        Return "" if the client may use the key. Also return "" if no key answered and the client
-        has no certificate, because then nothing is known about its role.
+        Also returns "" if no key answered and the client has no certificate: its role is unknown.
         """
         least = least_role(key)
         if not self.role:
@@ -59,11 +55,10 @@ class Identity(Struct, frozen=True):
 
     @property
     def silence(self) -> str:
-        """The likeliest reasons why no key answered, in words.
+        """The likeliest reasons why no key answered; "" with a role or without a certificate.
 
-        The text is "" if the client has a role, or has no certificate. A client cannot distinguish
-        three cases: the robot is absent, the robot hangs, or the robot does not list the client's
-        certificate. Therefore the text names all three.
+        A client cannot distinguish a robot that is absent, a robot that hangs, and a robot that
+        does not list the client's certificate.
         """
         return "" if self.role or not self.certificate else self._nobody()
 
@@ -97,14 +92,8 @@ class Identity(Struct, frozen=True):
 def identity(ask: Ask, tls: str, sender: str, robot: str = "", endpoint: str = "") -> Identity:
     """Query the robot for this client's role, and return the client's identity.
 
-    Blocks for up to `WHOAMI_S`.
-
-    Args:
-        ask: queries a key of the robot.
-        tls: directory of the client's certificate; "" without a certificate.
-        sender: the name that the daemon gives to this client's commands.
-        robot: the robot's id.
-        endpoint: the endpoint to which the client is connected.
+    Blocks for up to `WHOAMI_S`. `tls` is the directory of the client's certificate, or "". `sender`
+    is the name that the daemon gives to this client's commands.
     """
     answers: SimpleQueue[str] = SimpleQueue()
     for role in ROLES:

@@ -39,7 +39,7 @@ TICKETS = 1024
 
 
 class Replies:
-    """Holds the unfinished queries of one robot, and sends the replies to them."""
+    """The unfinished queries of one robot, and the thread that sends the replies to them."""
 
     def __init__(self, prefix: str) -> None:
         self._prefix = prefix
@@ -52,8 +52,7 @@ class Replies:
     def issue(self, query: zenoh.Query, key: str) -> int | None:
         """Return a ticket for this query, or None if there are too many unfinished queries.
 
-        The replies to the query are sent on the key `key`. If `key` is "", each reply is sent on
-        the robot's prefix followed by the key that the reply names.
+        The replies are sent on `key` or, if it is "", on the robot's prefix plus the reply's key.
         """
         if len(self._queries) >= TICKETS:
             return None
@@ -114,42 +113,31 @@ class Replies:
 
 
 ARRIVALS = 16
-"""Size of the buffer of each command key, in samples. A newer sample displaces the oldest one.
-
-A sender at the limit of 1000 Hz puts 10 samples into one step at 100 Hz.
-"""
+"""Size of the buffer of each command key, in samples. A newer sample displaces the oldest one. A
+sender at the limit of 1000 Hz puts 10 samples into one step at 100 Hz."""
 
 SAMPLES = 64
 """Size of the buffer for gyro samples. A gyro at 400 Hz fills it if the control loop takes no
 samples for 160 ms."""
 
 OTHERS = ""
-"""Name of the buffer for the keys of all sources that are not configured.
-
-These keys share one buffer, so that a flood on them cannot displace the command of a configured
-source.
-"""
+"""Name of the buffer that the keys of all unconfigured sources share, so that a flood on them
+cannot displace the command of a configured source."""
 
 ALL = "*"
 """Placeholder for the name of a certificate in a key."""
 
 STOPS = 16
-"""Size of the buffer for stops. It is separate, so that no flood of commands can displace a stop.
-"""
+"""Size of the buffer for stops. It is separate, so that no flood of commands displaces a stop."""
 
 QUERIES = 256
-"""Size of each of the three queues: services, other native queries, and slow queries.
-
-One slow query is answered per step, so the last of 256 waits 2.6 s at 100 Hz. If a queue is full,
-further queries are refused with `BUSY`.
-"""
+"""Size of each of the three queues: services, other native queries, and slow queries. If a queue is
+full, further queries are refused with `BUSY`. One slow query is answered per step, so the last of
+256 waits 2.6 s at 100 Hz."""
 
 ATTACHMENT_BYTES = 256
-"""Largest number of bytes of an attachment that are used.
-
-An attachment of rmw_zenoh has 33 bytes, and one of acsard has up to 140. A longer attachment is cut
-off, so that no sender can be decoded from it.
-"""
+"""Largest number of bytes of an attachment that are used. An attachment of rmw_zenoh has 33 bytes,
+and one of acsard up to 140. A longer one is cut off, so that no sender can be decoded from it."""
 
 STOP, SET = service_key("stop"), service_key("set")
 STOP_ALL = full_key("*", "stop")
@@ -162,17 +150,11 @@ class Inbox:
         self, prefix: str, replies: Replies, sources: tuple[str, ...], waker: Waker
     ) -> None:
         self.own_id: zenoh.TimestampId | None = None
-        """The id that the daemon's session writes into timestamps.
-
-        A timestamp with this id is not from the sender: the session has stamped a sample that came
-        without a timestamp.
-        """
+        """The id that the daemon's session writes into timestamps. A timestamp with this id is not
+        from the sender: the session stamps each sample that comes without a timestamp."""
         self.routers: frozenset[str] = frozenset()
-        """The ids that the connected routers write into timestamps.
-
-        A router stamps a sample that came without a timestamp. Such a timestamp says when the
-        sample passed the router, and does not identify its sender.
-        """
+        """The ids that the connected routers write into timestamps. Such a timestamp says when a
+        sample passed the router, and does not identify its sender."""
         self._prefix, self._replies = prefix, replies
         self._arrivals: dict[str, Mailbox[Arrival]] = {
             key: Mailbox(ARRIVALS, self._commanded)
@@ -187,25 +169,19 @@ class Inbox:
         self._others: deque[Query] = deque()
         """Native queries that are neither services nor slow."""
         self._slow: deque[Query] = deque()
-        """Slow queries: ROS parameter queries, and changes of settings.
-
-        A single slow query takes as much time as all other queries of a step.
-        """
+        """Slow queries: ROS parameters and settings. One takes as long as all others of a step."""
         self._lost = dict.fromkeys(self._arrivals, 0)
-        """For each buffer, the number of samples that newer ones had displaced before the last
-        `take`."""
+        """For each buffer, the number of displaced samples at the last `take`."""
         self._any = False
-        """True if an item waits. It becomes true only after the item is queued, so that `take`
-        misses no item.
-        """
+        """True if an item waits. Set after the item is queued, so that `take` misses no item."""
         self._waker = waker
 
     def take(self, queries: int) -> BusInput:
-        """Return the samples since the last call, and some of the waiting queries.
+        """Return the samples since the last call, and at most `queries` of the waiting queries.
 
-        The stops come first, then the other samples in the order of their arrival. The queries are
-        service calls first, then one slow query, then others, at most `queries` in all. The slow
-        query is taken even if the service calls already reach this number.
+        The stops come before the other samples, which are in the order of their arrival. Of the
+        queries, service calls come first, then one slow query, even if this exceeds `queries`, then
+        the others.
         """
         if not self._any:
             return NOTHING
@@ -231,18 +207,13 @@ class Inbox:
     # Zenoh's threads call the methods below.
 
     def on_sample(self, sample: zenoh.Sample) -> None:
-        """Queue a sample on a native key."""
         key = str(sample.key_expr)
         # A stop for all robots arrives with the wildcard in its key.
         key = "stop" if key == STOP_ALL else key.removeprefix(self._prefix)
         self._arrived(sample, key, str(sample.encoding), "native")
 
     def on_ros_sample(self, endpoint: Endpoint, sample: zenoh.Sample) -> None:
-        """Queue a sample that arrived on a ROS key.
-
-        The sample is treated like one on the native key that corresponds to the ROS key. A ROS
-        sample has no encoding, so `endpoint` supplies the encoding.
-        """
+        """Queue a sample of a ROS key as one of the native key, with the encoding of `endpoint`."""
         key = str(sample.key_expr)
         native = endpoint.native if key == endpoint.key else key
         self._arrived(sample, native, endpoint.encoding, endpoint.transport)
@@ -350,10 +321,7 @@ class Inbox:
 
 
 def _bytes(payload: zenoh.ZBytes | None, most: int) -> bytes:
-    """Return a copy of at most `most` + 1 bytes of a payload.
-
-    The extra byte shows that a payload is too long. If `payload` is None, the result is empty.
-    """
+    """Return at most `most` + 1 bytes of a payload. The extra byte shows that it is too long."""
     return b"" if payload is None else payload.to_bytes()[: most + 1]
 
 

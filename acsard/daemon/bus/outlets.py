@@ -1,12 +1,11 @@
 """Publishes each topic on those of its keys that have a subscriber.
 
-A topic has native keys and perhaps ROS keys. Each of these keys has an outlet, which is the
-publisher on that key. A message is encoded once per encoding, and only if an outlet with that
-encoding has a subscriber.
+A topic has native keys and perhaps ROS keys. Each key has an outlet, which is the publisher on that
+key. A message is encoded once per encoding, and only if an outlet with that encoding has a
+subscriber.
 
-The control loop only puts messages into slots. A slot keeps the newest messages of one topic. A
-thread encodes and sends these messages. So if the bus blocks, messages are lost, but the control
-loop misses no period.
+The control loop only puts messages into slots, and a thread encodes and sends them. So if the bus
+blocks, messages are lost, but the control loop misses no period.
 """
 
 from __future__ import annotations
@@ -33,33 +32,24 @@ OPTIONS: dict[str, Any] = {
 }
 
 HELD = 16
-"""Size of the slot of a topic, in messages. A newer message displaces the oldest one.
-
-At 100 Hz a slot holds 0.16 s of odometry. A busy machine or a client that connects usually blocks
-the thread for a shorter time.
-"""
+"""Size of the slot of a topic, in messages. A newer message displaces the oldest one. At 100 Hz a
+slot holds 0.16 s of odometry. A busy machine or a client that connects usually blocks the thread
+for a shorter time."""
 
 STUCK_NS = NS_PER_S // 4
-"""Longest time of a round of puts, ns. If a round takes longer, the bus counts as blocked.
-
-A round sends all waiting messages. It usually takes 0.1 ms, and a little longer on a busy machine.
-"""
+"""Longest time of a round of puts, ns, before the bus counts as blocked. A round sends all waiting
+messages, and usually takes 0.1 ms."""
 
 HEARTBEAT = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5)
 """Heartbeat of the publishers of latched ROS topics, with the settings of rmw_zenoh."""
 
 
 def direct(callback: Callable[[Any], None]) -> Any:
-    """Return a Zenoh handler that runs a callback in Zenoh's receiving thread.
-
-    By default the callback would run in a thread of its own.
-    """
+    """Return a handler that runs `callback` in Zenoh's receiving thread, not in a new thread."""
     return zenoh.handlers.Callback(callback, indirect=False)
 
 
 class _Outlet:
-    """The publisher on one key."""
-
     def __init__(self, publisher: Any, form: Format, gid: bytes, signed: bytes) -> None:
         self.publisher, self.form = publisher, form
         self.wanted = False
@@ -181,18 +171,13 @@ class Outlets:
         gid: bytes = b"",
         signed: bytes = b"",
     ) -> None:
-        """Declare a publisher of a topic.
+        """Declare a publisher of the topic with the native key `topic` on the key `key`.
 
         Args:
-            session: the daemon's Zenoh session.
-            topic: native key of the topic.
-            key: key to publish on.
-            form: format of the payload.
             encoding: Zenoh's name of the encoding.
             latched: whether the publisher keeps its last sample for late subscribers.
-            gid: identity of a ROS publisher, or b"". With it, the samples carry an attachment of
-                rmw_zenoh.
-            signed: attachment of the samples if there is no `gid`; b"" for no attachment.
+            gid: identity of a ROS publisher. With it, the samples carry an attachment of rmw_zenoh.
+            signed: attachment of the samples if there is no `gid`.
         """
         if latched:
             publisher: Any = zenoh.ext.declare_advanced_publisher(

@@ -29,8 +29,8 @@ PRESENT_S = 2.0
 def named(text: str) -> tuple[str, ...]:
     """Return the robot ids in the text of an option `--id` that names several robots.
 
-    Returns `("*",)` if the text stands for all robots, and () if it names only one robot. Raises
-    `UsageError` for a text with commas that is not a list of robot ids.
+    Returns `("*",)` for all robots, and () if the text names only one robot. Raises `UsageError`
+    for a text with commas that is not a list of robot ids.
     """
     if text == ALL:
         return (ALL,)
@@ -48,10 +48,9 @@ def named(text: str) -> tuple[str, ...]:
 
 
 def present(session: zenoh.Session, ids: Sequence[str], endpoint: str) -> list[str]:
-    """Return those of `ids` whose daemon is running, sorted.
+    """Return those of `ids` whose daemon is running, sorted. "*" stands for all robots.
 
-    "*" in `ids` stands for all robots. Raises `NoAnswerError` if `ids` contains "*" and no robot is
-    visible. The message of the error names `endpoint`, the endpoint of the client.
+    Raises `NoAnswerError`, which names `endpoint`, if `ids` contains "*" and no robot is visible.
     """
     found = set()
     for robot_id in ids:
@@ -64,11 +63,7 @@ def present(session: zenoh.Session, ids: Sequence[str], endpoint: str) -> list[s
 
 
 def presence(session: zenoh.Session, robot_id: str, endpoint: str) -> Presence | None:
-    """Return whether the client is connected, whether this robot is present, and the other robots.
-
-    The other robots are looked up only if this robot is absent. Returns None if the session is
-    closing.
-    """
+    """Return the robots that this client sees, or None if the session is closing."""
     try:
         if not session.info.links():
             return Presence(linked=False, here=False)
@@ -82,10 +77,9 @@ def presence(session: zenoh.Session, robot_id: str, endpoint: str) -> Presence |
 
 
 def stop(session: zenoh.Session, ids: Sequence[str], sender: str) -> None:
-    """Stop these robots; "*" in `ids` stands for all robots.
+    """Stop these robots ("*" stands for all robots) without waiting for answers.
 
-    This function does not wait for answers, so that a slow robot does not delay the stop of the
-    others. `sender` is the caller's sender id, `NAME/SECRET`.
+    `sender` is the caller's sender id, `NAME/SECRET`.
     """
     by = msgspec.msgpack.encode({"sender": sender})
     for robot_id in ids:
@@ -111,8 +105,7 @@ def nobody(endpoint: str) -> str:
 def follow(session: zenoh.Session, ids: Sequence[str], name: str) -> Subscription:
     """Subscribe to the key `name` of all these robots; "*" in `ids` stands for all robots.
 
-    The function `robot_of` finds the robot of a sample from the sample's key. Raises `UsageError`
-    if `name` is not a key.
+    `robot_of` finds the robot of a sample. Raises `UsageError` if `name` is not a key.
     """
     topic = by_key(name)
     latched = topic is not None and topic.latched
@@ -145,10 +138,7 @@ class Presence(Struct, frozen=True):
 
 
 def explain_silence(key: str, robot_id: str, endpoint: str, presence: Presence) -> str:
-    """Return why no sample arrives on a key of a robot, and how to fix it.
-
-    `key` is the key below the robot's id, and `endpoint` the endpoint of the client.
-    """
+    """Return why no sample arrives on `key` (the part below the robot's id), and how to fix it."""
     if not presence.linked:
         return (
             f"the endpoint {endpoint} has no connection any more: the daemon or router there has "
@@ -188,7 +178,6 @@ def _silent(key: str) -> str:
 
 
 def _unpublished(key: str, row: Topic) -> str:
-    """Return why a key that the daemon publishes has no samples now."""
     match row.rate:
         case "on change":
             return (

@@ -23,9 +23,8 @@ STOP_S = 0.05
 class RouterLinks:
     """The watch of the connections to the endpoints of `bus.connect`.
 
-    Zenoh reconnects by itself, but does not report that a connection is lost or restored. Without
-    this watch, the operator would not notice that a router is gone. A separate thread polls Zenoh,
-    because the call may block.
+    Zenoh reconnects by itself, but does not report that a connection is lost or restored. A
+    separate thread polls Zenoh, because the call may block.
     """
 
     def __init__(self, bus: BusConfig, inbox: Inbox) -> None:
@@ -46,10 +45,7 @@ class RouterLinks:
         self._thread.check()
 
     def start(self, session: zenoh.Session) -> None:
-        """Start polling, even if `bus.connect` is empty, as a router may connect to the daemon.
-
-        `session` is the daemon's Zenoh session.
-        """
+        """Start polling, even without `bus.connect`, because a router may connect to the daemon."""
         self._session = session
         self._thread.start()
 
@@ -90,12 +86,11 @@ class RouterLinks:
 
 
 def unreached(mode: str, endpoints: tuple[str, ...], ends: set[str]) -> tuple[str, ...]:
-    """Return the endpoints to which no link leads.
+    """Return the endpoints to which no link leads. Resolves host names, which may block.
 
-    `mode` is `bus.mode`, and `ends` contains the address of the far end of each link. In mode
-    "client" there is only one link, and if it exists, no endpoint counts as unreached. A program
-    that has connected to the daemon (the TLS gateway, a bridge, a ROS node) has an ephemeral port
-    at its end, so it matches no endpoint. This function resolves host names, which may block.
+    `ends` contains the address of the far end of each link. In client mode there is only one link,
+    and if it exists, no endpoint counts as unreached. A program that has connected to the daemon
+    (the TLS gateway, a bridge, a ROS node) has an ephemeral port, so it matches no endpoint.
     """
     if mode == "client":
         return () if ends else endpoints
@@ -103,10 +98,7 @@ def unreached(mode: str, endpoints: tuple[str, ...], ends: set[str]) -> tuple[st
 
 
 def _leads_there(endpoint: str, ends: set[str]) -> bool:
-    """Return whether one of the far ends `ends` belongs to the endpoint.
-
-    The far ends are addresses like "tcp/192.168.0.2:7447". The endpoint may contain a host name.
-    """
+    """Return whether a far end, such as "tcp/192.168.0.2:7447", belongs to the endpoint."""
     bare = endpoint.partition("?")[0].partition("#")[0]
     protocol, _, address = bare.partition("/")
     host, _, port = address.rpartition(":")

@@ -42,11 +42,7 @@ class Subscription:
     """The samples of one or more keys, in the order of their arrival."""
 
     def __init__(self, queue: Any, key: str = "") -> None:
-        """Read from `queue`, such as an `Arrivals`.
-
-        If `key` is not "", the subscription skips samples that were put on another key or on a
-        wildcard.
-        """
+        """Read from `queue`. If `key` is not "", skip samples put on another key or a wildcard."""
         self._queue, self._key = queue, key
 
     def try_recv(self) -> zenoh.Sample | None:
@@ -136,8 +132,7 @@ def encoded(sample: zenoh.Sample) -> tuple[str, bytes]:
 def queue_on(session: zenoh.Session, *keys: str, latched: bool) -> Arrivals:
     """Subscribe to the keys, and return the queue of their samples.
 
-    If `latched` is true, the queue first gets the sample that was last published on each key before
-    the subscription.
+    If `latched` is true, the queue first gets the last sample that was published on each key.
     """
     arrivals = Arrivals()
     handler = zenoh.handlers.Callback(arrivals.put, arrivals.close)

@@ -27,9 +27,8 @@ CA, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"
 def require_usable(directory: str) -> None:
     """Check that the files of a TLS directory can be read and belong together.
 
-    Raises:
-        CertificateError: a file is missing or unusable. The message says what to do.
-        NotPermittedError: this user may not read a file. The message says what to do.
+    Raises `CertificateError` for a missing or unusable file, and `NotPermittedError` for a file
+    that this user may not read. The message says what to do.
     """
     if not Path(directory).is_dir():
         raise CertificateError(
@@ -89,8 +88,7 @@ def common_name(directory: str) -> str:
 def shown_at(endpoint: str, directory: str) -> str:
     """Return the common name with which this client presents itself at an endpoint.
 
-    The name comes from the certificate in `directory`, the client's TLS directory. Returns "" if
-    the client needs no certificate at this endpoint, or has no readable one.
+    Returns "" if the client needs no certificate there, or has no readable one in `directory`.
     """
     return common_name(directory) if directory and endpoint.startswith(TLS) else ""
 
@@ -102,10 +100,7 @@ def names_in(directory: str) -> list[str]:
 
 
 def _plain(name: str) -> str:
-    """Return the short form of an IPv6 address, or any other name unchanged.
-
-    The standard library decodes an IPv6 address in a certificate with all its zeros.
-    """
+    """Shorten an IPv6 address, which `ssl` decodes with all its zeros. Return others unchanged."""
     try:
         return str(ipaddress.ip_address(name))
     except ValueError:
@@ -141,16 +136,14 @@ NO_CHECK_TIME = 0x200000
 """OpenSSL's flag X509_V_FLAG_NO_CHECK_TIME, which Python's `ssl` does not name."""
 
 AUTHORITY = "the authority"
-"""Key of the authority's certificate in the result of `ends`. The key of the directory's own
-certificate is the empty string."""
+"""Key of the authority's certificate in the result of `ends`."""
 
 
 def ends(directory: str) -> dict[str, int]:
     """Return when the certificates in `directory` expire, ns since 1970.
 
-    The key "" gives the expiry time of the directory's own certificate, and the key `AUTHORITY`
-    gives that of its authority. Returns {} if a file cannot be read or the optional library is
-    missing.
+    The key "" stands for the directory's own certificate, and `AUTHORITY` for that of its
+    authority. Returns {} if a file cannot be read or the optional library is missing.
     """
     try:
         from cryptography import x509
@@ -170,9 +163,9 @@ def ends(directory: str) -> dict[str, int]:
 def peer_ends_ns(endpoint: str, directory: str) -> int | None:
     """Return when the certificate of the program at a TLS endpoint expires, ns since 1970.
 
-    `directory` contains the certificate of this machine. Nothing is verified, so that the function
-    also works for an expired certificate. Returns None if the program cannot be reached or the
-    optional library is missing. Blocks for up to twice `PATIENCE_S`.
+    Nothing is verified, so that this also works for an expired certificate. Returns None if the
+    program cannot be reached or the optional library is missing. Blocks for up to twice
+    `PATIENCE_S`.
     """
     try:
         from cryptography import x509
@@ -190,10 +183,7 @@ def peer_ends_ns(endpoint: str, directory: str) -> int | None:
 
 
 def _trusting(directory: str) -> ssl.SSLContext:
-    """Return the TLS context of a client that does not verify the server.
-
-    The client presents the certificate in `directory`.
-    """
+    """Return a TLS client context that has the certificate in `directory` and verifies nothing."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
     _load(context, directory)
@@ -210,12 +200,10 @@ def _ends_ns(certificate: Any) -> int:
 
 
 def host_of(endpoint: str) -> str:
-    """Return the host in the text of an endpoint."""
     return _place(endpoint)[0]
 
 
 def _place(endpoint: str) -> tuple[str, str]:
-    """Return the host and the port in the text of an endpoint."""
     # An endpoint may end with options for Zenoh: `?metadata` and `#configuration`.
     bare = endpoint.partition("?")[0].partition("#")[0]
     host, _, port = bare.partition("/")[2].rpartition(":")
@@ -226,25 +214,20 @@ PATIENCE_S = 2.0
 """Time limit for the server to accept the connection, s. Its TLS answer has the same limit."""
 
 REFUSAL_S = 0.5
-"""Time to wait after the TLS handshake for a rejection of the client's certificate, s.
-
-A server that rejects the certificate says so at once. A server that accepts it sends nothing and
-waits for data.
-"""
+"""Time to wait after the TLS handshake for a rejection of the client's certificate, s. A server
+that accepts the certificate sends nothing and waits for data."""
 
 AWAY = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN)
-"""Error numbers that mean that no machine answers at the address. They say nothing about the port.
-"""
+"""Error numbers that mean that no machine answers at the address."""
 
 EXPIRED, NOT_YET, WRONG_NAME, WRONG_ADDRESS = 10, 9, 62, 64
 """OpenSSL's verify codes (X509_V_ERR_...). Other codes mean a certificate of another authority."""
 
 
 def trouble(endpoint: str, directory: str) -> str:
-    """Return why this machine cannot connect to a TLS endpoint, and how to fix it.
+    """Return why this machine cannot connect to a TLS endpoint and how to fix it; else "".
 
-    `directory` contains the client's certificate. Returns "" if this function finds no fault.
-    Blocks for a few seconds at most.
+    `directory` contains the client's certificate. Blocks for a few seconds at most.
     """
     host, port = _place(endpoint)
     try:
@@ -323,10 +306,7 @@ def _server_rejected(error: ssl.SSLCertVerificationError, host: str, directory: 
 
 
 def _client_rejected(reason: str, host: str, directory: str) -> str:
-    """Return the message for a server that rejects the client's certificate.
-
-    `reason` is OpenSSL's name of the TLS alert that the server sent.
-    """
+    """Return the message for a server that rejects the client's certificate with alert `reason`."""
     certificate = f"{directory}/{CERTIFICATE}"
     if "CERTIFICATE_EXPIRED" in reason:
         return (

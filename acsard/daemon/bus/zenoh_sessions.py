@@ -1,7 +1,6 @@
 """Opens the Zenoh sessions of the daemon, of the TLS gateway and of the client tools.
 
-This module contains the settings of these sessions, and the reason for each setting. The only keys
-of the robot that it names are the keys with a rate limit.
+This module contains the settings of these sessions, and the reason for each setting.
 """
 
 from __future__ import annotations
@@ -23,12 +22,10 @@ from acsard.host.errors import CertificateError, InUseError, UnreachableError, U
 from acsard.host.terminal_modes import coloured
 
 COMMAND_RATE_HZ = 1000.0
-"""Largest number of commands per second that a session accepts on each key.
-
-The rate is high enough for a zero command that comes 1 ms after another command. It is so low that
-a flood does not cost a control period. The TLS gateway applies the same limit to stops. Dropping a
-stop beyond the limit is safe, because another stop came less than a millisecond before.
-"""
+"""Largest number of commands per second that a session accepts on each key. It allows a zero
+command 1 ms after another command, and is so low that a flood does not cost a control period. The
+TLS gateway also applies it to stops. Dropping a stop beyond the limit is safe, because another stop
+came less than a millisecond before."""
 
 MAX_SESSIONS = 256
 """Largest number of connections of the daemon's session, and of the TLS gateway's session."""
@@ -40,11 +37,8 @@ MESSAGE_BYTES = 65536
 def daemon_session(config: Config) -> zenoh.Session:
     """Open the daemon's session: a Zenoh peer or client without multicast discovery.
 
-    Clients over TLS connect to the TLS gateway, not to this session. In client mode this call
-    blocks until the router answers, so call it in a thread.
-
-    Raises:
-        InUseError: the session cannot listen, for example because another program uses the address.
+    In client mode this call blocks until the router answers, so call it in a thread. Raises
+    `InUseError` if the session cannot listen, for example on an address that is in use.
     """
     bus = config.bus
     settings = _base(bus.mode) | {
@@ -65,11 +59,7 @@ def daemon_session(config: Config) -> zenoh.Session:
 
 
 def gateway_session(config: Config) -> zenoh.Session:
-    """Open the TLS gateway's session: a router between TLS clients and the daemon on this machine.
-
-    Raises:
-        InUseError: the session cannot listen.
-    """
+    """Open the TLS gateway's session, a router. Raise `InUseError` if it cannot listen."""
     bus = config.bus
     settings = _base("router") | PATIENT | _tls(bus.tls) | _listening()
     # Limit only PUT messages. Otherwise a flood of DELETE messages, which are not stops, would use
@@ -110,10 +100,7 @@ def certificate_trouble(authority: Path, certificate: Path, key: Path) -> str:
 
 
 def reachable(endpoint: str) -> str:
-    """Return the endpoint with which a program on this machine connects to `endpoint`.
-
-    If `endpoint` listens on all addresses, the result names the loopback address instead.
-    """
+    """Return `endpoint` with the loopback address if it listens on all addresses."""
     return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 
 
@@ -145,10 +132,6 @@ def _listening() -> dict[str, object]:
 def _limits(
     config: Config, access: dict[str, object], *more: dict[str, object]
 ) -> dict[str, object]:
-    """Return the access rules and the rate limits as Zenoh settings.
-
-    The rate limits are those of `_command_limits`, and those in `more`.
-    """
     return {"access_control": access, "downsampling": [_command_limits(config), *more]}
 
 
@@ -226,11 +209,7 @@ def _base(mode: str) -> dict[str, object]:
 
 
 def _tls(directory: str) -> dict[str, object]:
-    """Return the TLS settings with the certificates in a directory.
-
-    Both ends of a link present a certificate of the same authority. A link closes when one of the
-    certificates expires.
-    """
+    """Return the TLS settings. A link closes when the certificate of either end expires."""
     certificate, key = f"{directory}/{CERTIFICATE}", f"{directory}/{KEY}"
     return {
         "transport/link/tls": {
@@ -248,9 +227,8 @@ def _tls(directory: str) -> dict[str, object]:
 def _command_limits(config: Config) -> dict[str, object]:
     """Return the rate limits of commands, speed limits and gyro samples, on native and ROS keys.
 
-    Each configured source has a limit of its own, so that no source uses up another's limit. All
-    other sources share one limit. All certificates of a source share the limit of that source.
-    Zenoh counts each connection separately.
+    Each configured source has a limit that all its certificates share. All other sources share one
+    limit. Zenoh counts each connection separately.
     """
     names = [*(source.name for source in config.commands.sources), "*"]
     below = [*source_keys(names), *source_keys(names, "*"), IMU, SPEED_LIMIT]

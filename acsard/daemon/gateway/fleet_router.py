@@ -4,9 +4,9 @@ As with zenohd, the access rules in the file say what each client may do. Within
 client with a certificate can still make a router hang. This router detects that and restarts within
 2 s (`listener_process.py`).
 
-`router_file` makes the file from the text of `deploy/zenoh/router.json5`, a template for one robot.
-It repeats the lines between the marks ROBOT and END for each robot. It repeats the lines between
-the marks PERSON and END PERSON for each certificate that may command.
+The template `deploy/zenoh/router.json5` is for one robot. `router_file` repeats its lines between
+the marks ROBOT and END for each robot. It repeats the lines between PERSON and END PERSON for each
+certificate that may command.
 """
 
 from __future__ import annotations
@@ -46,14 +46,9 @@ _PERSON = re.compile(rf'(?<=[/" ]){PERSON}(?=")')
 def router_file(template: str, robots: Sequence[str], people: Mapping[Role, Sequence[str]]) -> str:
     """Return the text of the router's configuration file.
 
-    Args:
-        template: the text of `deploy/zenoh/router.json5`.
-        robots: ids of the robots.
-        people: for each role, the common names of the certificates that have this role, besides the
-            certificate with the role's own name.
-
-    Raises:
-        UsageError: a name occurs twice. Each certificate must belong to one robot or to one role.
+    `template` is the text of `deploy/zenoh/router.json5`. `people` gives for each role the common
+    names of the certificates with this role, besides the certificate with the role's name. Raises
+    `UsageError` if a name occurs twice: a certificate belongs to one robot or to one role.
     """
     names = [*robots, *ROLES, *(name for role in ROLES for name in people.get(role, ()))]
     twice = [name for name, count in Counter(names).items() if count > 1]
@@ -83,7 +78,6 @@ _SUBJECT = 'id: "{}", link_protocols: ["tls"], cert_common_names: [{}]'
 
 
 def _with(pattern: re.Pattern[str], name: str, block: str) -> str:
-    """Return the block with `name` in place of each match of the pattern."""
     # The replacement is a function, because a name may look like a reference to a group.
     return pattern.sub(lambda _: name, block)
 
@@ -113,10 +107,7 @@ _SYNTAX_ERROR = re.compile(
 
 
 def reason(error: zenoh.ZError) -> str:
-    """Return the readable part of Zenoh's error about a configuration.
-
-    It begins with the line and the column if Zenoh names them.
-    """
+    """Return the readable part of Zenoh's error, with the line and the column if it names them."""
     text = str(error)
     if match := _VALUE_ERROR.search(text):
         message = re.sub(r"\\(.)", r"\1", match[1])
@@ -166,8 +157,8 @@ class Router(Listener):
     def open(self) -> zenoh.Session:
         """Open the router's session and listen.
 
-        Raises `InUseError` if listening may be possible later, because an address is in use or does
-        not exist yet. Raises `RouterFileError` if the file must be corrected.
+        Raises `InUseError` if an address is in use or absent. Raises `RouterFileError` if the file
+        must be corrected.
         """
         try:
             return zenoh.open(self._config)
@@ -185,8 +176,7 @@ class Router(Listener):
     def _opens_elsewhere(self) -> bool:
         """Return whether Zenoh accepts the configuration if it listens on free loopback ports.
 
-        If it does, only the configured addresses are at fault, and they may become free later.
-        Zenoh's messages do not distinguish this case from a mistake in the file.
+        If it does, only the configured addresses are at fault, which Zenoh does not report.
         """
         config = zenoh.Config.from_file(str(self._file))
         free = [AN_ADDRESS.sub(r"\1/127.0.0.1:0", endpoint) for endpoint in self._endpoints]
@@ -200,15 +190,11 @@ class Router(Listener):
         return True
 
     def _certificate_files(self) -> CertificateFiles | None:
-        """Return the certificate files of the listening endpoints.
-
-        Returns None if the configuration does not name all three files.
-        """
+        """Return the certificate files of the endpoints, or None if not all three are named."""
         tls = json.loads(self._config.get_json("transport/link/tls")) or {}
         named = [Path(tls[name]) for name in CERTIFICATE_FILES if tls.get(name)]
         return CertificateFiles(*named) if len(named) == len(CERTIFICATE_FILES) else None
 
     def observe(self, session: zenoh.Session) -> Observation:
-        """Return the connections of the router."""
         holders = tuple(link.auth_identifier or "" for link in session.info.links())
         return Observation(clock.mono_ns(), holders, linked=True)

@@ -31,17 +31,12 @@ from acsard.host.rate_limits import Bucket, Rate
 from acsard.host.systemd import Systemd
 
 STUCK_NS = NS_PER_S
-"""Time without a new observation after which Zenoh counts as stuck, ns.
-
-An observation takes a millisecond.
-"""
+"""Time without a new observation after which Zenoh counts as stuck, ns. An observation takes a
+millisecond."""
 
 FIRST_NS = 5 * NS_PER_S
-"""Time within which the daemon must connect after the session has been opened, ns.
-
-Otherwise the process restarts. The time is longer than `ALONE_NS`, because the other clients
-connect at the same time.
-"""
+"""Time within which the daemon must connect after the session has been opened, ns. It is longer
+than `ALONE_NS`, because the other clients connect at the same time."""
 
 ALONE_NS = NS_PER_S
 """Time within which a lost daemon must connect again, ns. Otherwise the process restarts."""
@@ -50,24 +45,17 @@ REPORTS = Rate(1 / 60)
 """Largest rate of events that report that all connections are taken: one a minute."""
 
 MAX_UNANSWERED = 4
-"""Number of consecutive unanswered queries that show a dead connection to the daemon.
-
-A query counts as unanswered after a second. A dead connection is still open, but its data does not
-reach the daemon.
-"""
+"""Number of consecutive queries without an answer within 1 s that show a dead connection to the
+daemon. Such a connection is still open, but its data does not reach the daemon."""
 
 NAMES = 5
-"""Largest number of clients that the text of an event names. These are the clients with the most
-connections."""
+"""Largest number of clients that an event names: those with the most connections."""
 
 Incident = Literal["open", "full", "stuck", "alone"]
 
 Events = dict[Incident, EventName]
-"""Name of the log event for each incident.
-
-The incidents are: the session listens (`open`), all connections are taken (`full`), Zenoh hangs
-(`stuck`), and the daemon is not connected (`alone`).
-"""
+"""Name of the log event for each incident: the session listens (`open`), all connections are taken
+(`full`), Zenoh hangs (`stuck`), or the daemon is not connected (`alone`)."""
 
 GATEWAY_EVENTS: Events = {
     "open": "gateway_open",
@@ -83,10 +71,7 @@ class Observation(Struct, frozen=True):
     at_ns: int
     """Monotonic time of the observation, ns."""
     holders: tuple[str, ...] = ()
-    """For each connection from the network, the common name in the client's certificate.
-
-    It is "" if Zenoh does not report the name.
-    """
+    """The common name in the client's certificate for each connection, "" if unknown."""
     linked: bool = False
     """True if the daemon is connected. For a router, which needs no daemon, it is always True."""
     unanswered: int = 0
@@ -97,10 +82,7 @@ class SessionHealth:
     """The health of the session, derived from its successive observations."""
 
     def __init__(self, most: int, opened_ns: int, events: Events = GATEWAY_EVENTS) -> None:
-        """Create the health of a session that was opened at the monotonic time `opened_ns`, ns.
-
-        `most` is the largest number of connections from the network. `events` names the log events.
-        """
+        """Start at the monotonic time `opened_ns`. `most` is the largest number of connections."""
         self._most, self._events = most, events
         self._linked_ns, self._patience_ns = opened_ns, FIRST_NS
         self._last_ns, self._silence = 0, Silence(STUCK_NS)
@@ -124,8 +106,7 @@ class SessionHealth:
     def restart_event(self, observed: Observation, passed_ns: int) -> Event | None:
         """Return an event that says why the process must restart, or None if it need not.
 
-        `observed` is the newest observation, perhaps the same as in the last call. `passed_ns` is
-        the time since the last call, ns.
+        `observed` may be the same as in the last call, which was `passed_ns` ns ago.
         """
         new, self._last_ns = observed.at_ns != self._last_ns, observed.at_ns
         stuck = self._silence.too_long(new, passed_ns)
@@ -153,10 +134,7 @@ class SessionHealth:
 
 
 def connection_counts(holders: Sequence[str]) -> str:
-    """Return a text with the clients that hold the most connections, and how many each one holds.
-
-    `holders` gives the name of the client for each connection.
-    """
+    """Return a text with the clients that hold the most connections, and the count of each."""
     most = Counter(holders).most_common(NAMES)
     return ", ".join(f"{count} by {name or 'an unnamed client'}" for name, count in most)
 
@@ -165,11 +143,9 @@ PERIOD_S = 0.25
 """Time between two observations of the session, and between two checks by the main thread, s."""
 
 MEMORY_BYTES = 192 << 20
-"""Limit of the data memory of the process, bytes.
-
-The process uses 35 MB, or 72 MB with all connections in use. An attack can take 600 MB a second, so
-a check could not react in time. The kernel refuses memory above the limit, which ends the process.
-"""
+"""Limit of the data memory of the process, bytes. The process uses 35 MB, or 72 MB with all
+connections in use. An attack can take 600 MB a second, too fast for a check. The kernel refuses
+memory above the limit, which ends the process."""
 
 NICE = 5
 """Nice value of this process. The daemon and ordinary programs have priority over it."""
@@ -183,7 +159,6 @@ class Listener:
     most: int
     """Largest number of connections from the network."""
     events: Events
-    """Names of the log events."""
     files: CertificateFiles | None
     """The certificate files of the session, or None if it has none to watch."""
 
@@ -224,8 +199,7 @@ class ListenerProcess:
     def run(self) -> Exit:
         """Run until the process must end.
 
-        Returns OK after a signal or the end of the parent, and FAILURE if the process must be
-        started again.
+        Returns OK after a signal or the end of the parent, and FAILURE if a restart is needed.
         """
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             signal.signal(number, self._leave)
@@ -255,11 +229,7 @@ class ListenerProcess:
         return Exit.OK
 
     def _renewed(self) -> bool:
-        """Return whether the session must be opened again, because there is a new certificate.
-
-        Zenoh cannot use a new certificate in an open session. If the new certificate cannot be used
-        at all, this method logs the reason and returns False.
-        """
+        """Return whether to open the session again for a new certificate. Log an unusable one."""
         files = self._listener.files
         if files is None or not files.renewed():
             return False
@@ -295,7 +265,6 @@ class ListenerProcess:
         return health
 
     def _observe(self, session: zenoh.Session, health: SessionHealth) -> None:
-        """Observe the session and report its state, once in each period of `PERIOD_S`."""
         try:
             pause = threading.Event()
             while True:

@@ -37,11 +37,8 @@ PROBE_NS = NS_PER_S
 counts as unanswered."""
 
 QUERY_TIMEOUT_S = 60.0
-"""Time after which Zenoh itself ends a query to the daemon, s.
-
-The time is much longer than `PROBE_NS`. So the query has counted as unanswered long before Zenoh
-ends it, even if the gateway has to wait for a processor.
-"""
+"""Time after which Zenoh itself ends a query to the daemon, s. It is much longer than `PROBE_NS`,
+so that the query has counted as unanswered long before."""
 
 
 class Gateway(Listener):
@@ -52,11 +49,7 @@ class Gateway(Listener):
     events = GATEWAY_EVENTS
 
     def __init__(self, config: Config) -> None:
-        """Check the certificate files.
-
-        Raises `CertificateError` or `NotPermittedError` if the files in the directory `bus.tls`
-        cannot be used.
-        """
+        """Check the certificate files; raise `CertificateError` or `NotPermittedError`."""
         self._config, self.where = config, ", ".join(config.bus.outside)
         require_usable(config.bus.tls)
         self.files = CertificateFiles(*files_in(config.bus.tls))
@@ -75,7 +68,6 @@ class Gateway(Listener):
             return False
 
     def open(self) -> zenoh.Session:
-        """Open the session between the network and the daemon."""
         session = gateway_session(self._config)
         self._opened_ns = clock.mono_ns()
         return session
@@ -103,25 +95,18 @@ class Gateway(Listener):
 class DaemonProbe:
     """A probe that queries the daemon repeatedly, because an open connection may carry no data.
 
-    A test observed such a connection on a machine with forty times as much work as it could do. Two
-    gateways ended within half a minute. The connection of the third gateway then stayed open for
-    minutes, although the daemon's Zenoh did not read from it.
+    A test on an overloaded machine observed this: a connection stayed open for minutes, although
+    the daemon's Zenoh did not read from it.
     """
 
     def __init__(self, key: str) -> None:
         """Prepare queries of `key`, which the daemon answers."""
         self._key, self._asked_ns, self._unanswered = key, 0, 0
         self._ended = threading.Event()
-        """Set when the query has ended.
-
-        An end without a reply counts as an answer too, because the daemon has received the query.
-        """
+        """Set when the query has ended, with or without a reply: the daemon has received it."""
 
     def unanswered(self, session: zenoh.Session, now_ns: int) -> int:
-        """Return the number of consecutive queries that did not end within `PROBE_NS`.
-
-        This method also sends the next query if it is due. `now_ns` is the monotonic time.
-        """
+        """Send the next query if it is due. Return how many in a row have exceeded `PROBE_NS`."""
         if now_ns - self._asked_ns < PROBE_NS:
             return self._unanswered
         if self._asked_ns:

@@ -16,8 +16,7 @@ from acsard.host import clock
 from acsard.host.processes import Holder, master_of, waited_ns
 
 SEND_S = 0.5
-"""Time after which a driver that accepts no byte counts as hung, s. A line takes 50 ms on the
-slowest wire."""
+"""Time limit for a driver that accepts no byte, s. The slowest wire needs 50 ms for a line."""
 
 DRAIN_S = 0.5
 """Longest time for which `close` waits for the driver to send the last stop lines, s."""
@@ -27,10 +26,7 @@ CLOSE_S = 1.0
 
 
 class BlockingPort:
-    """Blocking access to one serial device, with the interface `checkup.board.Wire`.
-
-    The device is not opened before the first call of `open`.
-    """
+    """Blocking access to one serial device, with the interface `checkup.board.Wire`."""
 
     def __init__(self, path: str) -> None:
         self._path = path
@@ -69,11 +65,10 @@ class BlockingPort:
         device.close()
 
     def now_ns(self) -> int:
-        """Return the monotonic clock, ns."""
         return clock.mono_ns()
 
     def late_ns(self) -> int:
-        """Return how long the program at the other end of a pty has waited for a processor, ns.
+        """Return how long the program at the pty's other end waited for a processor, ns.
 
         Only waiting since the last call counts. The result is 0 for a real device.
         """
@@ -83,10 +78,7 @@ class BlockingPort:
         return max(0, self._waited_ns - before_ns)
 
     def send(self, data: bytes) -> None:
-        """Write all of `data`.
-
-        Raises `WireLostError` if the port is lost, or accepts no bytes for `SEND_S`.
-        """
+        """Write all of `data`. Raises `WireLostError` if the port is lost or hangs for `SEND_S`."""
         fd = self._fileno()
         deadline_ns = clock.mono_ns() + int(SEND_S * NS_PER_S)
         while data:
@@ -101,10 +93,9 @@ class BlockingPort:
                 raise WireLostError(f"{self._path} was lost: {error.strerror}") from error
 
     def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
-        """Return the data that is received before the monotonic time `until_ns`.
+        """Return the data received before monotonic `until_ns`, with the time of each read, ns.
 
-        Each piece comes with the monotonic time of its read, ns. Raises `WireLostError` if the port
-        is lost.
+        Raises `WireLostError` if the port is lost.
         """
         fd = self._fileno()
         pieces: list[tuple[int, bytes]] = []

@@ -1,8 +1,4 @@
-"""System calls on the serial device: open it raw and locked, drain it, close it, explain errors.
-
-This module knows what an error means to the operator. `port.py` decides for the daemon when to
-open, reopen and send. `blocking.py` does so for the tools.
-"""
+"""System calls on the serial device: open it raw and locked, drain it, close it, explain errors."""
 
 from __future__ import annotations
 
@@ -26,18 +22,14 @@ _left_open: list[int] = []
 """Descriptors that could not be closed because no thread could be started."""
 
 DRAIN_STEP_S = 0.001
-"""Time between two checks for unsent bytes, s. It is shorter than the wire time of a line at every
-baud rate."""
+"""Time between two checks for unsent bytes, s. At every baud rate a line takes longer."""
 
 
 class _Device(serial.Serial):  # type: ignore[misc]
     """A port whose `read` makes one system call and never waits."""
 
     def read(self, size: int = 1) -> bytes:
-        """Return up to `size` bytes that have been received, b"" if there are none.
-
-        Raises `SerialException` for a lost port.
-        """
+        """Return up to `size` bytes without waiting. Raises `SerialException` for a lost port."""
         if self.fd is None:
             raise serial.PortNotOpenError
         try:
@@ -52,10 +44,7 @@ class _Device(serial.Serial):  # type: ignore[misc]
 
 
 def open_raw(path: str, baud_rate: int) -> serial.Serial:
-    """Open the port at `path`, locked for this process alone, raw and with empty buffers.
-
-    Raises `OSError` if the port cannot be opened.
-    """
+    """Open the port raw, with empty buffers and locked. Raises `OSError` if that fails."""
     # Close the devices that `close` could not. Two threads may empty the list at the same time.
     with suppress(IndexError):
         while True:
@@ -99,10 +88,7 @@ def _set_up(device: serial.Serial) -> None:
 
 
 def unsent(fd: int) -> int:
-    """Return how many bytes the driver has not sent yet.
-
-    The result is 0 if the driver does not report this number, for example for a pty.
-    """
+    """Return how many bytes the driver has not sent, or 0 if it does not report this (a pty)."""
     waiting = array.array("i", [0])
     try:
         fcntl.ioctl(fd, termios.TIOCOUTQ, waiting)
@@ -112,20 +98,13 @@ def unsent(fd: int) -> int:
 
 
 def draining(fd: int, deadline_ns: int) -> Iterator[float]:
-    """Yield pauses, s, for which the caller sleeps until the driver has sent all bytes.
-
-    The iteration also ends at the monotonic time `deadline_ns`.
-    """
+    """Yield pauses to sleep, s, until all bytes are sent or monotonic `deadline_ns` is reached."""
     while unsent(fd) and clock.mono_ns() < deadline_ns:
         yield DRAIN_STEP_S
 
 
 def unlock(fd: int) -> None:
-    """Let other processes open the device again.
-
-    A pty outlives this process and keeps its exclusive mark. Without this call no other process
-    could open the pty.
-    """
+    """Let other processes open the device. A pty keeps its lock after this process ends."""
     try:
         fcntl.ioctl(fd, termios.TIOCNXCL)
     except OSError:
@@ -136,10 +115,9 @@ def close(device: serial.Serial, *, lost: bool = False, wait_s: float = 0.0) -> 
     """Discard unsent bytes, and unlock and close the device in a thread.
 
     The thread is needed because a driver may drain for 30 s. This call waits for the thread for at
-    most `wait_s` seconds. If no thread can be started, the next `open_raw` closes the device.
-
-    After the call, the descriptor of `device` refers to /dev/null. So the owner of `device` can
-    drain and close it without delay.
+    most `wait_s` seconds. If no thread can be started, the next `open_raw` closes the device. After
+    the call, the descriptor of `device` refers to /dev/null, so the owner can drain and close it
+    without delay.
 
     If `lost` is true, the device has failed. Its output buffer is then discarded even if the driver
     reports no unsent bytes.
@@ -170,10 +148,7 @@ def _end(fd: int) -> None:
 
 
 def refusal(path: str, error: OSError) -> MendableError:
-    """Return the error that explains why the port cannot be opened.
-
-    A tool ends with this error. The daemon may wait and retry instead.
-    """
+    """Return the error that explains why the port cannot be opened."""
     match error.errno:
         case errno.ENOENT | errno.ENODEV | errno.ENXIO | errno.ENOTDIR:
             return NoPortError(
@@ -201,9 +176,9 @@ _JOIN = (
 
 
 def require(path: str) -> None:
-    """Raise the error of `refusal` unless `path` is a character device.
+    """Raise the error of `refusal` unless `path` is a character device. The tools call this.
 
-    The tools call this. The daemon does not, because it waits for a device that is absent.
+    The daemon does not call this, because it waits for a device that is absent.
     """
     try:
         if not stat.S_ISCHR(os.stat(path).st_mode):

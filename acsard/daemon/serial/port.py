@@ -1,9 +1,9 @@
 """The daemon's serial port: opens, reads and reopens the device, and sends STOP before it closes.
 
-The daemon uses pyserial-asyncio only to read. For writing, its transport would queue the bytes that
-the kernel does not take, but the daemon must not keep a line to send it later (the third rule in
-`acsard/README.md`). Therefore the daemon writes lines to the descriptor directly. Opening runs in a
-thread with a time limit, because drivers may block.
+The daemon uses pyserial-asyncio only to read. Its transport would queue the bytes that the kernel
+does not take, and send an old line later (the third rule in `acsard/README.md`). So the daemon
+writes to the descriptor directly. Opening runs in a thread with a time limit, because drivers may
+block.
 """
 
 from __future__ import annotations
@@ -27,13 +27,12 @@ from acsard.host.errors import InUseError, MendableError, NotPermittedError
 from acsard.host.threads import NoThreadError, in_thread
 
 OPEN_TIMEOUT_S = 5.0
-"""Time after which a call that opens a device counts as hung, s. Until that call ends, only a
-different device may be opened."""
+"""Time after which a call that opens a device counts as hung, s. Until it ends, the same device is
+not opened again."""
 
 BACK_OFF_S = (0.05, 0.1, 0.2)
-"""Pauses between the attempts to reopen the port, s. The last pause repeats. The first ones are
-short, because a new device can be opened as soon as udev has set its group, which takes a moment.
-"""
+"""Pauses between the attempts to reopen the port, s. The last one repeats. The first ones are
+short, because udev soon sets the group of a new device."""
 
 PERMISSION_PATIENCE_S = 2.0
 """Time that the start waits for udev to grant access before it fails, s."""
@@ -41,8 +40,7 @@ PERMISSION_PATIENCE_S = 2.0
 HUNG = "the driver did not answer"
 
 FAREWELL_S = 0.15
-"""Time limit of the last STOP, s. It is twice the time of a line on the slowest wire, with a
-margin."""
+"""Time limit of the last STOP, s: twice the time of a line on the slowest wire, and a margin."""
 
 
 AT_ONCE = 4096
@@ -91,13 +89,12 @@ class SerialPort:
     def take(self, late: Instant | None = None) -> tuple[Received, ...]:
         """Return the bytes received since the last call.
 
-        `late` is the time of the step if the step comes late, else None. A late step also reads the
-        bytes that wait in the kernel. Otherwise the step could run before the reader, and its own
-        delay would look like silence of the board.
+        `late` is the time of a late step, else None. A late step also reads the bytes that wait in
+        the kernel, because its own delay would otherwise look like silence of the board.
 
-        After a suspend of the computer this method closes the port, so that it is opened again,
-        even if the device did not notice the suspend. A new session then begins, and every sender
-        must return to neutral.
+        After a suspend of the computer, this method closes the port so that it is opened again,
+        even if the device did not notice. A new session then begins: every sender must return to
+        neutral.
         """
         if self._asleep.was():
             self._leave(OSError(errno.EIO, "this computer was suspended"))
@@ -115,8 +112,7 @@ class SerialPort:
     def offer(self, line: bytes, now: Instant) -> Offered:
         """Write a line that was made at `now`, and return "sent".
 
-        If the port is closed, return "down". If it cannot take the line now, drop the line and
-        return "superseded".
+        Return "down" if the port is closed, and "superseded" if the line was dropped.
         """
         if not self.is_open:
             return "down"
@@ -154,7 +150,6 @@ class SerialPort:
             await asyncio.sleep(BACK_OFF_S[-1])
 
     async def keep_open(self) -> None:
-        """Reopen the port whenever it is lost, for ever."""
         while True:
             if self.is_open:
                 await self._lost.wait()
@@ -204,7 +199,6 @@ class SerialPort:
         self._log(Event("port_open", f"{path} at {baud_rate} baud"))
 
     def _complain(self, refused: MendableError) -> None:
-        """Log why the port cannot be opened, unless the last attempt had the same reason."""
         text = f"{refused}; retrying"
         if text != self.trouble:
             self.trouble = text
@@ -217,10 +211,7 @@ class SerialPort:
         self._wake()
 
     def _leave(self, error: BaseException | None) -> None:
-        """Close the port, so that no bytes in the kernel are sent later.
-
-        `error` is the reason why the port is lost. It is None if the daemon closes the port.
-        """
+        """Close the port and discard unsent bytes. `error` is the cause of a loss, else None."""
         if not self.is_open:
             return
         self.is_open = False
@@ -242,10 +233,7 @@ class SerialPort:
     # Closing.
 
     async def __aexit__(self, *_: object) -> None:
-        """Send STOP as the last line and close, even if an exception has ended the block.
-
-        This takes at most `FAREWELL_S`.
-        """
+        """Send STOP as the last line and close the port, within `FAREWELL_S`."""
         deadline_ns = clock.now().mono_ns + int(FAREWELL_S * 1e9)
         while self.is_open and self.offer(self._stop, clock.now()) == "superseded":
             if clock.now().mono_ns > deadline_ns:
@@ -257,8 +245,6 @@ class SerialPort:
 
 
 class _Reader(asyncio.Protocol):
-    """The protocol that passes received bytes and losses from the transport to its `SerialPort`."""
-
     def __init__(self, port: SerialPort) -> None:
         self._port = port
         self._transport: asyncio.BaseTransport | None = None

@@ -1,9 +1,7 @@
 """The simulated board at the end of a pty, in real time, so that the real serial code runs.
 
-A pty itself carries data at any baud rate. If the host sets another baud rate than the board's,
-this module garbles the data in both directions, as a real wire would. `PtyEnd` is the board's end
-of any serial line that is a pty. `Simulated` is the board that runs in the daemon's process, and
-also publishes the robot's true pose on the bus. The control loop uses its pty like a real device.
+A pty carries data at any baud rate. If the host's rate differs from the board's, this module
+garbles the data in both directions, as a real wire would.
 """
 
 from __future__ import annotations
@@ -31,10 +29,7 @@ from acsard.host.timerfd import TimerFd
 
 
 class PtyEnd:
-    """The board's end of a pty.
-
-    Its methods never block. The descriptor `fileno` becomes readable when the host has written.
-    """
+    """The board's end of a pty. Its methods never block."""
 
     def __init__(self) -> None:
         self._master, self.slave = pty.openpty()
@@ -44,7 +39,6 @@ class PtyEnd:
         self.path = os.ttyname(self.slave)
 
     def fileno(self) -> int:
-        """Return the descriptor on which the event loop waits."""
         return self._master
 
     def read(self) -> bytes:
@@ -61,10 +55,7 @@ class PtyEnd:
         return data
 
     def write(self, data: bytes) -> bool:
-        """Write to the host; return False if the buffer is full because no host reads.
-
-        The data is then lost, as on a real wire.
-        """
+        """Write to the host. Return False, and lose the data, if the buffer is full."""
         try:
             os.write(self._master, data)
         except BlockingIOError:
@@ -72,7 +63,6 @@ class PtyEnd:
         return True
 
     def close(self) -> None:
-        """Close both ends, as if the device were unplugged."""
         os.close(self._master)
         os.close(self.slave)
 
@@ -119,10 +109,7 @@ class SimPty:
         termios.tcsetattr(self._end.slave, termios.TCSANOW, attributes)
 
     def _speed(self) -> int:
-        """Return the baud rate that the host has set.
-
-        If acsard does not support that rate, return the board's baud rate instead.
-        """
+        """Return the host's baud rate, or the board's if acsard does not support the host's."""
         return _RATES.get(termios.tcgetattr(self._end.slave)[5], self.mcu.baud_rate)
 
     def _advance(self) -> None:
@@ -157,10 +144,7 @@ class Simulated(SimPty):
         self._bus = bus
 
     def current(self, key: str) -> Message | None:
-        """Return the newest true pose if `key` is `sim/pose`.
-
-        Return None for every other key, and before the first pose.
-        """
+        """Return the newest true pose; None before the first, and if `key` is not `sim/pose`."""
         return true_pose(*self._last) if key == POSE and self._last is not None else None
 
     def _see(self, sight: Sight) -> None:

@@ -20,7 +20,9 @@ def told(states: list[tuple[float, RobotState]]) -> list[RobotState]:
 def test_a_robot_that_moves_is_a_line_a_second_and_one_at_rest_one_in_ten() -> None:
     moving = [(n / 20, replace(STATE, x=n / 40, linear=0.5)) for n in range(200)]
     assert len(told(moving)) == 10
-    resting = [(n / 20, replace(STATE, linear=0.0, angular=0.0)) for n in range(200)]
+    sliding = [(n / 20, replace(STATE, linear=0.0, angular=0.0)) for n in range(200)]
+    assert len(told(sliding)) == 10  # its wheels turn
+    resting = [(now, replace(state, wheels=[0.0] * 4)) for now, state in sliding]
     assert len(told(resting)) == 1
 
 

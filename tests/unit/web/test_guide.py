@@ -13,7 +13,7 @@ from acsard.calibration.guided.methods import METHODS
 from acsard.cli import parser
 from acsard.host.processes import Holder
 from acsard.machine.serial_ports import SerialDevice
-from acsard.web.guide import KEY, Reach, boards, words
+from acsard.web.guide import KEY, NO_DEVICE, Guide, Reach, boards, words
 from acsard.web.socket_messages import Begin, FrameError
 from tests.each import each
 
@@ -60,6 +60,22 @@ def test_the_configured_one_is_the_first_choice(
 
 REACH = Reach("/etc/acsard/acsard.toml", "tls/robot:7447", "robot2", "/etc/acsard/tls")
 PORTS = ("/dev/acsar", "sim")
+
+
+@pytest.mark.parametrize(
+    ("configured", "devices", "note"),
+    [
+        ("sim", [], NO_DEVICE),
+        ("/dev/none", [], NO_DEVICE),  # as a service, which sees no device
+        ("/dev/none", [MEGA], ""),
+        ("/dev/ttyACM0", [MEGA], ""),
+    ],
+)
+async def test_a_server_that_sees_no_port_says_what_to_do(
+    configured: str, devices: list[SerialDevice], note: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("acsard.web.guide.serial_devices", lambda: devices)
+    assert (await Guide(REACH, configured).choices(simulated=False)).note == note
 
 
 def parsed(given: list[str]) -> argparse.Namespace:

@@ -25,10 +25,10 @@ CASES: dict[str, tuple[Cause, Make]] = {
     "an adapter that holds lines for 16 ms": ("time", partial(drives.late, how="batches")),
     "stalls of the host": ("time", partial(drives.late, how="stalls")),
     "a busy host": ("time", partial(drives.late, how="jitter")),
-    "two decimals": ("quantisation", drives.rounded),
-    "40 counts a turn": ("quantisation", partial(drives.rounded, counts=40)),
-    "400 counts a turn": ("quantisation", partial(drives.rounded, counts=400)),
-    "4000 counts a turn": ("quantisation", partial(drives.rounded, counts=4000)),
+    "two decimals": ("quantization", drives.rounded),
+    "40 counts a turn": ("quantization", partial(drives.rounded, counts=40)),
+    "400 counts a turn": ("quantization", partial(drives.rounded, counts=400)),
+    "4000 counts a turn": ("quantization", partial(drives.rounded, counts=4000)),
     "a line of ten lost": ("gaps", partial(drives.lost, share=0.1, longest=1)),
     "up to five lines lost": ("gaps", partial(drives.lost, share=0.1, longest=5)),
     "bursts lost in which the pose stands": (
@@ -126,7 +126,7 @@ def test_the_track_that_a_gyro_implies_is_a_multiplier_as_the_configured_one() -
 def test_with_a_gyro_no_wheel_turns_the_heading() -> None:
     lines = [replace(line, yaw_variance=1e-6 * n) for n, line in enumerate(driven().lines)]
     found = budget(Received(lines, [], gyro=True), CONFIG)
-    for cause in ("time", "quantisation", "gaps", "slip"):
+    for cause in ("time", "quantization", "gaps", "slip"):
         assert share(found, cause).deg_per_turn == 0.0
     turns = found.turned / 360
     grown = math.degrees(math.sqrt(lines[-1].yaw_variance / turns + (GYRO_SCALE * math.tau) ** 2))
@@ -173,17 +173,17 @@ def test_of_one_long_spin_nobody_knows_what_is_noise_and_what_scale() -> None:
     assert with_a_gyro(spin, 10.0).basis == "unknown"
 
 
-def test_counts_leave_time_and_gaps_without_a_share_and_a_count_for_quantisation() -> None:
+def test_counts_leave_time_and_gaps_without_a_share_and_a_count_for_quantization() -> None:
     counted = replace(CONFIG, mcu=McuConfig(link_check="require", encoder_counts=400))
     found = budget(Received(drives.late(1, 10.0, "batches").lines, [], counted=True), counted)
     assert share(found, "time").mm_per_100_m == share(found, "gaps").mm_per_100_m == 0.0
-    assert (share(found, "quantisation").mm_per_100_m or 0.0) > 0.0
+    assert (share(found, "quantization").mm_per_100_m or 0.0) > 0.0
     assert found.counts == 400
 
 
 def test_of_lines_that_did_not_all_come_here_nothing_is_told_of_time() -> None:
     found = budget(Received(driven().lines, [], whole=False), CONFIG)
-    assert {share(found, cause).basis for cause in ("time", "quantisation", "gaps")} == {"unknown"}
+    assert {share(found, cause).basis for cause in ("time", "quantization", "gaps")} == {"unknown"}
 
 
 def test_a_wheel_that_contradicts_its_neighbour_is_measured_slip() -> None:
@@ -199,10 +199,10 @@ def test_a_wheel_that_contradicts_its_neighbour_is_measured_slip() -> None:
 
 def test_the_largest_is_of_the_place_and_else_of_the_heading() -> None:
     found = budget(Received(driven().lines, []), CONFIG)
-    quantisation, slip = found.largest("measured"), found.largest("measured", "settings")
-    assert quantisation is not None
+    quantization, slip = found.largest("measured"), found.largest("measured", "settings")
+    assert quantization is not None
     assert slip is not None
-    assert (quantisation.cause, slip.cause) == ("quantisation", "slip")
+    assert (quantization.cause, slip.cause) == ("quantization", "slip")
     assert found.largest() is None
     millimetres, _ = found.total()
     assert millimetres is not None

@@ -35,7 +35,7 @@ KNOWN: tuple[Cause, float, Basis] = ("parameters", 5.0, "settings")
     ("cause", "says"),
     [
         ("time", "latency_timer"),
-        ("quantisation", "link_check"),
+        ("quantization", "link_check"),
         ("gaps", "3 feedback lines were lost, so 0.25 s"),
         ("slip", "gyro"),
         ("gyro", "stand"),
@@ -51,7 +51,7 @@ def test_one_sentence_says_what_to_do_about_the_largest_that_was_measured(
 
 
 def test_coarse_encoders_are_named() -> None:
-    assert "40 counts" in advice(of(("quantisation", 100.0, "measured"), KNOWN, counts=40))
+    assert "40 counts" in advice(of(("quantization", 100.0, "measured"), KNOWN, counts=40))
 
 
 def test_coarse_encoders_whose_counts_nobody_knows_come_first() -> None:
