@@ -141,6 +141,7 @@ def test_what_a_daemon_runs_with_counts_and_where_the_file_differs_is_reported(
         assert worst(found["link"])["level"] == "ok"
 
 
+@pytest.mark.nightly
 def test_a_daemon_that_was_started_with_listen_and_id_is_asked_by_them(tmp_path: Path) -> None:
     where = free_endpoint()
     with Daemon(tmp_path, words=("--listen", where, "--id", "other")) as daemon:
@@ -191,6 +192,7 @@ def test_what_can_be_no_place_of_a_daemon_is_a_sentence(
     assert words in done.err
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("fault", "words"), [("mute", "nothing was received"), ("lost_replies", "answered only")]
 )
@@ -209,6 +211,7 @@ def test_a_poor_board_behind_a_daemon_is_named(tmp_path: Path, fault: str, words
     assert code == 1 or linked
 
 
+@pytest.mark.nightly
 def test_an_address_with_something_else_behind_it_is_a_failure(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         endpoint = f"tcp/127.0.0.1:{other.getsockname()[1]}"
@@ -241,6 +244,7 @@ def test_certificates_that_are_missing_are_named(tmp_path: Path) -> None:
     assert "ca.pem is missing" in worst(found["certificates"])["text"]
 
 
+@pytest.mark.nightly
 def test_the_certificate_of_the_options_or_the_environment_is_looked_at(tmp_path: Path) -> None:
     text = with_certificates(tmp_path, 400)
     (tmp_path / "other").mkdir()

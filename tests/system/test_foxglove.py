@@ -278,6 +278,7 @@ def asked(messages: list[Any]) -> list[tuple[str, float, float]]:
     return [(m.header.frame_id, m.twist.linear.x, m.twist.angular.z) for m in messages]
 
 
+@pytest.mark.nightly
 @SLOW
 def test_whatever_a_source_commands_by_is_shown_as_an_export_has_it(tmp_path: Path) -> None:
     words = ["--record", str(tmp_path / "record")]

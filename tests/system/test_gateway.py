@@ -93,6 +93,7 @@ def test_a_gateway_that_is_killed_is_opened_anew_and_counted(robot: Open) -> Non
         until(lambda: bus.count("gateway_opened") == 2, 5.0, "it is counted")
 
 
+@pytest.mark.nightly
 def test_a_new_certificate_is_used_and_the_daemon_runs_on(tmp_path: Path) -> None:
     certificates = Certificates(tmp_path / "own")
     robot, own = Open(tmp_path, certificates), certificates.robot
@@ -138,6 +139,7 @@ def test_a_gateway_that_hangs_is_left_behind_by_no_daemon(robot: Open) -> None:
     until(lambda: gone(gateway), 1.0, f"gone, {time.monotonic() - begun:.1f} s after the signal")
 
 
+@pytest.mark.nightly
 def test_a_gateway_that_is_stopped_is_ended_and_opened_anew(robot: Open) -> None:
     first = robot.gateway()
     os.kill(first, signal.SIGSTOP)

@@ -346,6 +346,7 @@ async def test_a_port_that_the_daemon_holds_is_reported_with_the_way_to_end_it(
             assert (told["method"], told["advice"]) == ("", "")
 
 
+@pytest.mark.nightly
 async def test_a_browser_that_goes_while_a_motor_turns_leaves_zeros_and_the_port(
     tmp_path: Path,
 ) -> None:

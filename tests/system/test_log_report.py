@@ -32,6 +32,7 @@ QUIETLY = (
 )  # fmt: skip
 
 
+@pytest.mark.nightly
 def test_it_is_drawn_and_no_strangers_program_runs(tmp_path: Path) -> None:
     assert BROWSER is not None
     path = tmp_path / "evil.html"
@@ -77,6 +78,7 @@ CUT = """[...document.querySelectorAll('.picture text')]
 DRAWN = "document.querySelectorAll('.picture.js-plotly-plot .main-svg').length"
 
 
+@pytest.mark.nightly
 def test_no_label_of_a_picture_is_cut_on_a_phone_also_after_it_is_turned(tmp_path: Path) -> None:
     path = tmp_path / "new.html"
     # The labels of two seconds have tenths, and are the widest.
@@ -97,6 +99,7 @@ def test_no_label_of_a_picture_is_cut_on_a_phone_also_after_it_is_turned(tmp_pat
             assert browser.js(CUT) == [], size
 
 
+@pytest.mark.nightly
 def test_nothing_is_wider_than_the_window_of_a_phone_or_a_desk(tmp_path: Path) -> None:
     path = tmp_path / "new.html"
     course, _ = drive_of_two()

@@ -225,6 +225,7 @@ def test_fleet_at_a_terminal_is_live_and_says_who_has_gone(robots: Robots) -> No
     assert "Traceback" not in terminal.screen + program.stderr
 
 
+@pytest.mark.nightly
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount")
 def test_a_full_disk_and_a_certificate_that_ends_do_not_look_ready(tmp_path: Path) -> None:
     """An operator sees them in the table, on the page, in its metrics and by echo."""
@@ -361,6 +362,7 @@ def test_nothing_but_stop_goes_to_many(robots: Robots) -> None:
         assert "only stop" in ended.err
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_the_two_robots_of_the_fleet_page_are_in_one_view(tmp_path: Path) -> None:
     (block,) = [one for one in blocks("json5") if "tcp/127.0.0.1:7447" in one.text]
@@ -395,6 +397,7 @@ def test_nobody_there_is_reported_with_69(tmp_path: Path) -> None:
             assert "no robot is visible" in ended.err
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.network
 def test_by_tls_a_wildcard_sees_nobody_and_is_told_why_and_names_do(tmp_path: Path) -> None:

@@ -178,6 +178,7 @@ def test_space_stops_from_every_view_and_who_held_the_stick_drives_no_more(page:
     browser.touch("End")
 
 
+@pytest.mark.nightly
 @alone
 def test_what_a_button_could_not_is_reported_once(page: Phone) -> None:
     page.browser.tap("tab-set")
@@ -235,6 +236,7 @@ def test_keys_drive_after_the_slider_was_set_and_leave_it_where_it_is(page: Phon
     assert browser.text("most") == f"{float(chosen):.2f} m/s"
 
 
+@pytest.mark.nightly
 def test_who_has_no_mouse_sets_the_slider_by_the_arrows_and_drives_by_letters(page: Phone) -> None:
     browser, bus = page.browser, page.bus
     for _ in range(40):
@@ -355,6 +357,7 @@ def viewers(page: Phone) -> int:
     return int(re.findall(r"^acsard_page_viewers\{.*\} (\d+)$", told, re.MULTILINE)[0])
 
 
+@pytest.mark.nightly
 @alone
 def test_a_page_that_is_left_is_gone_at_once_and_there_again_when_somebody_goes_back(
     page: Phone,
@@ -678,6 +681,7 @@ def drawing(browser: Browser) -> str:
     return looks[-1]
 
 
+@pytest.mark.nightly
 @alone
 def test_the_map_is_nearer_and_farther_and_follows_the_robot_again(page: Phone) -> None:
     """Each button changes the drawing, and the reverse button restores it."""
@@ -700,6 +704,7 @@ def test_the_map_is_nearer_and_farther_and_follows_the_robot_again(page: Phone) 
     drawn(False, "as before again")
 
 
+@pytest.mark.nightly
 @alone
 def test_the_map_turns_with_the_robot_and_back(page: Phone) -> None:
     browser = page.browser
@@ -866,6 +871,7 @@ PIECE_PX = 90
 """The least width and height of the path and of the stick, px."""
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("size", SCREENS)
 def test_stick_stop_speed_mode_and_path_fit_on_the_screen_beside_each_other(
     page: Phone, size: tuple[int, int]
@@ -898,6 +904,7 @@ def test_stick_stop_speed_mode_and_path_fit_on_the_screen_beside_each_other(
         assert page.browser.js("document.documentElement.scrollWidth") <= size[0], view
 
 
+@pytest.mark.nightly
 def test_what_is_pressed_is_large_enough_for_a_finger(page: Phone) -> None:
     page.bus.get("srv/stop")
     page.shows("mode", "STOPPED")  # together with Release
@@ -917,6 +924,7 @@ def test_words_at_the_stick_say_how_to_drive_while_nobody_holds_it(page: Phone) 
     until(lambda: page.browser.js(seen) == "visible", 5.0, "the words again")
 
 
+@pytest.mark.nightly
 @alone
 async def test_a_page_that_has_no_place_says_why_and_stops(page: Phone) -> None:
     reading: list[asyncio.Task[None]] = []
@@ -979,6 +987,7 @@ def test_every_state_is_fit_for_a_screen_reader_and_the_map_keeps_its_buttons() 
     assert len(seen) == len(set(seen)) > 20
 
 
+@pytest.mark.nightly
 def test_every_view_is_drawn_on_a_phone_both_ways_and_a_desktop(tmp_path: Path) -> None:
     written = pictures.write(tmp_path / "screens", both=False)
     sizes = [struct.unpack(">II", path.read_bytes()[16:24]) for path in written]

@@ -98,6 +98,7 @@ def sound(browser: Browser) -> None:
         assert browser.too_small() == []
 
 
+@pytest.mark.nightly
 def test_a_board_is_checked_without_a_daemon_and_the_lines_are_written(
     browser: Browser, tmp_path: Path
 ) -> None:

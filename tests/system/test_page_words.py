@@ -263,6 +263,7 @@ def test_the_map_shows_the_robot_and_its_direction_beside_the_buttons_and_a_scal
 SHOWN = "!!document.getElementById({!r}).checkVisibility()"
 
 
+@pytest.mark.nightly
 def test_a_pressed_emergency_stop_or_bumper_and_a_low_battery_have_signs_with_the_mend_at_the_stick(
     tmp_path: Path, browser: Browser
 ) -> None:
@@ -312,6 +313,7 @@ def test_a_pressed_emergency_stop_or_bumper_and_a_low_battery_have_signs_with_th
         browser.open("about:blank")
 
 
+@pytest.mark.nightly
 def test_a_viewer_is_told_who_switches_on_and_an_ended_invitation_ends_stop_and_camera(
     tmp_path: Path, browser: Browser
 ) -> None:

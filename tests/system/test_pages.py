@@ -37,7 +37,10 @@ from tests.system.identities import free_tls_endpoint
 from tests.system.test_fleet import Fleet
 from tests.system.typed import typed
 
-MARKS = {"README.md": pytest.mark.slow, "deploy/zenoh/README.md": pytest.mark.network}
+MARKS = {
+    "README.md": [pytest.mark.slow],
+    "deploy/zenoh/README.md": [pytest.mark.network, pytest.mark.nightly],
+}
 """Marks for pages whose commands take long."""
 
 TYPED = [

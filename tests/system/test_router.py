@@ -64,6 +64,7 @@ def test_one_that_is_killed_is_there_again(where: Path) -> None:
         assert "was ended by signal 9" in router.stderr
 
 
+@pytest.mark.nightly
 def test_one_that_is_stopped_is_ended_and_there_again(where: Path) -> None:
     with watched_router(where, free_tls_endpoint()) as router:
         listens(router)
@@ -74,6 +75,7 @@ def test_one_that_is_stopped_is_ended_and_there_again(where: Path) -> None:
         assert "stopped or hung" in router.stderr
 
 
+@pytest.mark.nightly
 def test_it_opens_again_with_a_new_certificate(where: Path) -> None:
     endpoint = free_tls_endpoint()
     with watched_router(where, endpoint) as router:
@@ -88,6 +90,7 @@ def test_it_opens_again_with_a_new_certificate(where: Path) -> None:
         assert after_ns < before_ns
 
 
+@pytest.mark.nightly
 def test_it_stays_open_if_zenoh_refuses_a_new_certificate(where: Path) -> None:
     endpoint, own = free_tls_endpoint(), where / ITS_NAME
     with watched_router(where, endpoint) as router:

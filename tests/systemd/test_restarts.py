@@ -99,7 +99,7 @@ def end(container: Container, way: Way) -> None:
     ("kind", "way", "times"),
     [
         ("stop", "watchdog", 1),
-        ("fault", "kill", 1),
+        pytest.param("fault", "kill", 1, marks=pytest.mark.nightly),
         pytest.param("inactive", "restart", 1, marks=pytest.mark.nightly),
         *(
             pytest.param(kind, way, 8, marks=pytest.mark.soak)

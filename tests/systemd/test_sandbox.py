@@ -96,6 +96,7 @@ def test_systemd_finds_nothing_wrong_with_a_drop_in(container: Container, name: 
     assert (checked.code, checked.out, checked.err) == (0, "", "")
 
 
+@pytest.mark.nightly
 def test_with_lan_conf_the_gateway_reads_root_s_keys_and_listens_beyond_this_computer(
     container: Container, board: Board
 ) -> None:
@@ -110,6 +111,7 @@ def test_with_lan_conf_the_gateway_reads_root_s_keys_and_listens_beyond_this_com
     )
 
 
+@pytest.mark.nightly
 def test_a_reload_gives_the_services_a_new_certificate_while_the_robot_drives(
     container: Container, board: Board
 ) -> None:
@@ -143,6 +145,7 @@ def test_a_gateway_that_is_killed_is_open_again_and_the_daemon_does_not_notice(
     assert container.main_pid() == daemon
 
 
+@pytest.mark.nightly
 def test_a_gateway_that_hangs_holds_up_no_stop_nor_restart_of_the_daemon(
     container: Container, board: Board
 ) -> None:
@@ -187,6 +190,7 @@ def test_without_its_key_lan_conf_fails_the_start_instead_of_going_without(
     assert {heard.line for heard in board.since(0.0)} <= {ZERO, b"-"}
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("unit", [GATEWAY, PAGE])
 def test_without_its_key_the_gateway_or_page_waits_for_a_person_and_doctor_says_which(
     container: Container, board: Board, unit: str

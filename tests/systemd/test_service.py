@@ -111,6 +111,7 @@ print(answer.read().decode())
 """
 
 
+@pytest.mark.nightly
 def test_the_page_runs_beside_it_within_its_limits_and_falls_alone(bare: Container) -> None:
     bare.write(CONFIGURATION, "")  # the simulator
     assert bare.run(ACSARD, "service", "install").code == 0
@@ -275,6 +276,7 @@ def test_only_root_installs(bare: Container) -> None:
     assert not Path(bare.path(CONFIGURATION)).exists()
 
 
+@pytest.mark.nightly
 def test_after_lan_init_the_service_listens_on_the_network(bare: Container) -> None:
     assert bare.run(ACSARD, "service", "install").code == 0
     made = bare.run(ACSARD, "tls", "init", "--write", CONFIGURATION)
