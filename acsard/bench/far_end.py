@@ -1,7 +1,7 @@
 """The far end of the serial wire in a benchmark: a process that simulates the board on a pty.
 
-It has real-time priority if that is permitted. Its first line of output is the path of the pty.
-When its standard input ends, it writes all recorded data and ends.
+The process has real-time priority if that is permitted. It writes the path of the pty to standard
+output first. When its standard input ends, it writes all recorded data to standard output and ends.
 """
 
 from __future__ import annotations
@@ -25,17 +25,20 @@ from acsard.host.timerfd import TimerFd
 
 
 class Part(msgspec.Struct, frozen=True):
-    """The parameters of the far end. It reads them from a file when it starts."""
+    """The parameters that the simulated board's process reads from a file when it starts."""
 
     config: dict[str, object]
     free_running: float = 0.0
-    """Period of unprompted reports, s. 0 means that the board answers each line."""
+    """Period of feedback lines that the simulated board sends unasked, s; 0 for answers only."""
     baud_rate: int = 0
-    """Baud rate of the simulated board, not validated. 0 means the configured one."""
+    """Baud rate of the simulated board; 0 means the configured rate.
+
+    Unlike in a configuration file, any rate is accepted.
+    """
 
 
 class NumberedMcu(FakeMcu):
-    """A simulated board with the usual timing. It reports a different speed in each line."""
+    """A simulated board that reports the speeds of `staircase()` instead of those of a vehicle."""
 
     def __init__(self, config: Config, now_ns: int) -> None:
         super().__init__(config, now_ns)
@@ -52,7 +55,7 @@ class NumberedMcu(FakeMcu):
 
 
 class FarEnd:
-    """The pty and the simulated board at its other end, in one blocking loop."""
+    """Runs the simulated board at one end of a pty. `path` names the other end, for the daemon."""
 
     def __init__(self, mcu: FakeMcu) -> None:
         self.seen = Seen()
@@ -96,7 +99,10 @@ class FarEnd:
 
 
 def main(part: Part) -> None:
-    """Run until standard input ends, then write the recorded data."""
+    """Simulate the board until standard input ends.
+
+    Then write the data that the board sent and received to standard output.
+    """
     try:
         # Other processes must not delay the simulated board: a real one has its own processor.
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(80))

@@ -17,7 +17,10 @@ from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import Instant
 
 STEPS = 1000
-"""Number of different speeds. Lines with equal speeds are distinguished by their times."""
+"""Number of commands, or of feedback lines, after which their speeds repeat.
+
+Lines with equal speeds are distinguished by their times.
+"""
 
 LOWEST, STEP = 5.0, 0.02
 """Lowest wheel speed, and the step between successive speeds, rad/s.
@@ -45,7 +48,7 @@ class Fed(Struct, frozen=True):
     """A feedback line from which the measured daemon published an odometry sample."""
 
     delay_ns: int
-    """Time from the line's last byte to the sample, ns."""
+    """Time from the writing of the line's last byte to the arrival of the sample, ns."""
     waiting: int
     """Number of newer lines that the simulated board had written before the sample arrived."""
 
@@ -131,7 +134,7 @@ def _key(speed: float) -> int:
 
 
 def summary(durations_ns: Sequence[int]) -> Summary | None:
-    """Return the figures of these durations, or None if there are none.
+    """Return the count, percentiles and maximum of these durations, or None if there are none.
 
     Each percentile is one of the durations, not an interpolation.
     """
@@ -154,7 +157,7 @@ class Seen(Struct, frozen=True):
 
 
 class Sent(Struct, frozen=True):
-    """A command: the monotonic time of its publication, ns, and the line that it must become."""
+    """A command: the monotonic time of its publication, ns, and the serial line it must become."""
 
     at_ns: int
     line: bytes
@@ -174,7 +177,7 @@ class Record(Struct, frozen=True):
     began_ns: int
     """Monotonic time just before the daemon was started, ns."""
     window_ns: tuple[int, int]
-    """Evaluated time, ns: from the end of the daemon's start-up until just before its shutdown."""
+    """Begin and end of the evaluated time, ns: after the daemon's start-up, before its shutdown."""
     seen: Seen | None
     """Data on the wire; None on a real port, whose wire cannot be observed."""
     sent: list[Sent]

@@ -40,11 +40,11 @@ from acsard.host.errors import MendableError
 
 
 def bench_config(config: Config, *, simulated: bool) -> Config:
-    """Return the configuration of the measured daemon: it has a separate robot id, bus and source.
+    """Return `config` with a separate robot id, bus and command source for the measured daemon.
 
-    With the simulated board, more settings change. The limits are so high that each command reaches
-    the next line unchanged. Feedback that contradicts the commands is not a fault. Lines have no
-    sequence number, because the benchmark recognizes each line by its text.
+    With the simulated board, more settings change. The limits are so high that the daemon writes
+    each command unchanged into its next line. Feedback that contradicts the commands does not count
+    as a fault. Lines have no sequence number, because the benchmark recognizes a line by its text.
     """
     own = replace(
         config,
@@ -111,8 +111,8 @@ def _own(state: RobotState) -> dict[str, Summary]:
 
 def _nothing_seen(sent: int, state: RobotState) -> MendableError:
     return MendableError(
-        f"none of the {sent} commands arrived at the port's far end, so nothing was measured; "
-        f"the daemon says: {state.reason}",
+        f"the simulated microcontroller received none of the {sent} commands, so the benchmark "
+        f"measured nothing. The daemon reports: {state.reason}",
     )
 
 

@@ -16,24 +16,24 @@ from acsard.host import real_time
 from acsard.terminal.output import table
 
 POINTS = {
-    "command_to_wire": "put() here -> first byte of the line at the port's far end",
-    "feedback_to_odometry": "last byte of a feedback line written -> its odometry here",
-    "read_to_odometry": "feedback sampled by the microcontroller (its stamp) -> its odometry here",
+    "command_to_wire": "benchmark calls put() -> microcontroller gets the line's first byte",
+    "feedback_to_odometry": "last byte of a feedback line sent -> benchmark gets the odometry",
+    "read_to_odometry": "microcontroller samples the wheels (stamp) -> benchmark gets odometry",
 }
-"""Times that the benchmark measures, and the events that begin and end each time.
+"""Durations that the benchmark measures, and the events that begin and end each duration.
 
 "Here" is the process of the benchmark.
 """
 
 OWN = {
-    "period_lateness": "period due (the first one, if several were missed) -> its step",
-    "step_time": "start of a step -> end of its work",
-    "command_age": "command arrived -> each line that follows it",
-    "command_to_wire": "command arrived in its source's turn -> first line after it",
-    "feedback_to_bus": "feedback line read -> its last message handed to the bus",
-    "mcu_round_trip": "line -> end of its answer (on a checked link)",
+    "period_lateness": "control step due (the first, if some were missed) -> step begins",
+    "step_time": "control step begins -> same step ends",
+    "command_age": "command arrives at the daemon -> each line that carries it",
+    "command_to_wire": "command of the active source arrives -> first line that carries it",
+    "feedback_to_bus": "daemon has read a feedback line -> its messages are on the bus queue",
+    "mcu_round_trip": "daemon writes a line -> end of the reply (only on a checked link)",
 }
-"""Times that the daemon measures (`latencies.Name`), and the events that begin and end each."""
+"""Durations that the daemon measures, and the events that begin and end each duration."""
 
 
 class Machine(Struct, frozen=True):
@@ -57,9 +57,9 @@ class Result(Struct, frozen=True, omit_defaults=False):
     realtime: bool
     """True if the daemon's control task had real-time scheduling."""
     outside: dict[str, Summary | None]
-    """Summaries of the times in `POINTS`, by name. An unmeasured time is null or absent."""
+    """Summaries of the durations in `POINTS`, by name. An unmeasured one is null or absent."""
     own: dict[str, Summary]
-    """Summaries of the times in `OWN`, by name. The percentiles are accurate to 12 %."""
+    """Summaries of the durations in `OWN`, by name. The percentiles are accurate to 12 %."""
     commands_sent: int
     commands_seen: int | None
     """Number of commands whose line arrived at the simulated board; null on a real port."""
@@ -68,7 +68,8 @@ class Result(Struct, frozen=True, omit_defaults=False):
     lines_told: int
     """Number of feedback lines whose odometry the benchmark received."""
     lines_waiting_max: int | None
-    """Largest `Fed.waiting` of the feedback lines; null on a real port."""
+    """Largest number of newer lines that the simulated board had written before a line's odometry
+    arrived here; null on a real port."""
     lines_sent: int
     """Number of lines that the daemon had written to the port when `missed_periods` was read."""
     missed_periods: int
@@ -151,11 +152,11 @@ def _counts(result: Result) -> list[tuple[str, str]]:
     said = "" if r.lines_said is None else f" of {r.lines_said}"
     waiting = ""
     if r.lines_waiting_max is not None:
-        waiting = f", with at most {r.lines_waiting_max} newer lines waiting"
+        waiting = f"; at most {r.lines_waiting_max} newer lines were sent before that"
     start = "not measured" if r.start_up_ms is None else f"{r.start_up_ms:.0f} ms"
     rows = [
         ("commands", f"{r.commands_sent} sent{seen}"),
-        ("feedback lines", f"{r.lines_told}{said} became odometry here{waiting}"),
+        ("feedback lines", f"{r.lines_told}{said} reached the benchmark as odometry{waiting}"),
         ("periods missed", f"{r.missed_periods}; {r.lines_sent} lines were sent"),
         ("processor", f"{r.cpu_percent_following:.1f} % of a core with one subscriber"),
         ("", f"{r.cpu_percent_commanded:.1f} % with 25 commands a second as well"),
@@ -163,5 +164,5 @@ def _counts(result: Result) -> list[tuple[str, str]]:
         ("start-up", f"{start} from the start of the process to the first line on the port"),
     ]
     if not r.simulated:
-        rows.append(("left out", "the benchmark cannot see the lines on the wire of a real port"))
+        rows.append(("left out", "lines on the wire: the benchmark cannot see them on a real port"))
     return rows

@@ -4,7 +4,7 @@
 
 The three processes use the same monotonic clock, so their times can be compared. The measured
 program is usually acsard. Any other program that accepts `--config` and `--port` and uses the same
-keys can be measured in its place.
+Zenoh keys can be measured in its place.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ from acsard.host.child import end, end_with_parent, environment, how_it_ended
 from acsard.host.errors import Exit, ExitError, MendableError, NoAnswerError, UnreachableError
 
 END_S = 5.0
-"""Time limit for the end of a process, s. A process usually needs 0.2 s to end."""
+"""Time in which a process must end after it was told to, s. A process usually needs 0.2 s."""
 
 
 def ended(who: str, code: int, said: str = "") -> MendableError:
-    """Return an error which says that the process `who` ended with `code` and message `said`."""
+    """Return an error which says that process `who` ended with exit `code` and message `said`."""
     return MendableError(f"{who} {how_it_ended(code)}" + (f": {said}" if said else ""))
 
 
@@ -82,7 +82,10 @@ T = TypeVar("T")
 ACSARD = (sys.executable, "-m", "acsard", "run")
 
 START_S = 15.0
-"""Time limit of a start, s. A start takes 0.3 s, or 2.3 s if opening the port resets the board."""
+"""Time limit for each step of the daemon's start, s.
+
+A start takes 0.3 s, or 2.3 s if opening the port resets the board.
+"""
 
 SETTLED = 10
 """Number of odometry samples after which the start of the daemon counts as complete."""
@@ -93,19 +96,20 @@ LOOK_S = 0.5
 FAR_END = "the simulated microcontroller's process"
 
 SPACING_S = (0.02, 0.06)
-"""Range of the random times between commands, s. Commands thus arrive at any control phase."""
+"""Range of the random times between commands, s, so that the commands are not in step with the
+daemon's control period."""
 
 
 class Rig:
-    """Context manager that starts the daemon and waits until its link to the board is up.
+    """Context manager that starts the daemon and waits until it publishes odometry.
 
-    `follow` and `command` measure, and `end` returns the record.
+    `follow()` and `command()` measure, and `end()` returns the record.
 
     Args:
         config: the configuration in `file`.
         file: the configuration file of the measured program.
-        words: the command line that starts the measured program.
-        port: the serial port; "" starts a far end that simulates the board.
+        words: the shell command that starts the measured program, as a list of words.
+        port: the serial port; "" starts a process that simulates the board on a pty.
         free_running: period of the reports of a simulated board that reports without being asked,
             s; 0 simulates a board that answers each line.
         wire_baud_rate: baud rate of the simulated board; 0 means the configured one.
@@ -139,7 +143,7 @@ class Rig:
             self._log = where / "log"
             port = self._port or self._start_far_end(stack, where)
             self._start_program(stack, port)
-            session = self._session = self._wait(self._connect, f"answer at {self._endpoint}")
+            session = self._session = self._wait(self._connect, f"daemon at {self._endpoint}")
             stack.callback(session.close)
             key = full_key(self._config.robot.id, "odom")
             self._kept = session.declare_subscriber(key, direct(self._odometry))
@@ -148,7 +152,7 @@ class Rig:
                 encoding=encoding_name("msgpack", "Twist"),
                 express=True,
             )
-            self._wait(lambda: len(self._arrived) >= SETTLED or None, "odometry on the bus")
+            self._wait(lambda: len(self._arrived) >= SETTLED or None, "odometry from the daemon")
             self._settled_ns = clock.mono_ns()
             self._stack = stack.pop_all()
         return self
@@ -224,7 +228,6 @@ class Rig:
             return ""
 
     def _alive(self) -> None:
-        """Raise an error if the measured program or the far end has ended."""
         if self._far_end is not None and self._far_end.poll() is not None:
             raise ended(FAR_END, self._far_end.returncode)
         code = self.process.poll()
@@ -237,7 +240,7 @@ class Rig:
         self._arrived.append((clock.now(), sample.payload.to_bytes()))
 
     def follow(self, seconds: float) -> float:
-        """Receive odometry for `seconds`. Return the program's CPU use as a share of one core."""
+        """Receive odometry for `seconds`. Return the daemon's CPU use as a fraction of one core."""
         began_ns, used_ns = clock.mono_ns(), processor_ns(self.process.pid)
         end_ns = began_ns + int(seconds * NS_PER_S)
         while (left_ns := end_ns - clock.mono_ns()) > 0:
@@ -246,7 +249,7 @@ class Rig:
         return self._share(began_ns, used_ns)
 
     def command(self, seconds: float, wheel_speed: Callable[[int], float], seed: int = 1) -> float:
-        """Send commands at random intervals. Return the program's CPU use as a share of one core.
+        """Send commands at random intervals. Return the daemon's CPU use as a fraction of one core.
 
         `wheel_speed` takes the number of a command (0, 1, ...) and returns the wheels' speed,
         rad/s.
@@ -265,7 +268,7 @@ class Rig:
         return self._share(began_ns, used_ns)
 
     def _neutral(self, phases: random.Random) -> None:
-        """Send zeros until the daemon accepts one: it does not accept a new sender at once."""
+        """Send zero speeds until the daemon accepts them: at first it ignores a new sender."""
         before = self._counted()
 
         def look() -> bool | None:
@@ -273,7 +276,7 @@ class Rig:
             time.sleep(phases.uniform(*SPACING_S))
             return before is None or self._counted() != before or None
 
-        self._wait(look, "neutral command counted")
+        self._wait(look, "neutral command counted by the daemon")
         time.sleep(0.2)
 
     def _counted(self) -> int | None:

@@ -24,7 +24,7 @@ NAMES = (
 """Settings of `[drive]` in the order of `Multipliers.values`."""
 
 DIGITS = 5
-"""Decimals of the written multipliers, and significant digits of the settings of `[odometry]`."""
+"""Decimals of multipliers, and significant digits of `[odometry]` settings, in `acsard.toml`."""
 
 
 class Refusal(Struct, frozen=True):
@@ -61,14 +61,15 @@ class Report(Struct, frozen=True):
     covariance: Sequence[Sequence[float]]
     """Covariance of the multipliers of wheel separation, left radius and right radius."""
     odometry: dict[str, float]
-    """New settings of `[odometry]`: the geometry's uncertainty, and the noise if `Noise.better`."""
+    """New settings of `[odometry]`: the uncertainty of the wheel radii and of the track, and also
+    the noise if the new noise settings are surely better."""
     feedback: dict[str, float]
     """New settings of `[feedback]`; empty unless the old ones make good wheels look faulty."""
     effective_track: float
     """Effective track, m."""
     effective_track_std: float | None
     effective_track_growth: float
-    """Fraction by which the track grows with each rad/s of turn rate."""
+    """Fraction by which the effective track grows for each rad/s of turn rate."""
     effective_track_growth_std: float
     left_wheel_radius: float
     """Radius of the left wheels, m."""
@@ -89,7 +90,8 @@ class Report(Struct, frozen=True):
     heading_noise_before: float | None
     """Standard deviation (deg) of the heading after 10 m, due to the configured noise settings.
 
-    It assumes the turning per metre of the log. None means that the settings do not change.
+    The robot is assumed to turn as much per metre as in the log. The value is None if the noise
+    settings stay as configured.
     """
     heading_noise_after: float | None
     """The same figure as `heading_noise_before`, with the new noise settings."""
@@ -101,7 +103,7 @@ class Report(Struct, frozen=True):
     distance_noise_after: float | None
     """The same figure as `distance_noise_before`, with the new noise settings."""
     time_offsets: dict[str, float]
-    """Delay of each sensor's times relative to those of the wheels, s, by the sensor's name."""
+    """Delay of each sensor's recorded times behind those of the wheels, s, by the sensor's name."""
     gyro_bias: float
     """Gyro bias, rad/s."""
     runs: int
@@ -121,7 +123,8 @@ class Report(Struct, frozen=True):
 def report(log: str, calibration: Calibration, drive: DriveConfig, written: str) -> Report:
     """Return the report of a calibration.
 
-    `drive` is the configured geometry. `written` names the file with the new settings, or is "".
+    `drive` is the configured geometry. `written` is the name of the file to which the new settings
+    were written, or "" if none was written.
     """
     multipliers = calibration.multipliers
     track, left, right = multipliers.values.tolist()
@@ -156,7 +159,7 @@ def report(log: str, calibration: Calibration, drive: DriveConfig, written: str)
 
 
 def _noise(calibration: Calibration) -> tuple[BeforeAfter, BeforeAfter]:
-    """Return the noise of heading (deg) and distance (m) after `METRES`, as standard deviations."""
+    """Return the standard deviations due to noise after `METRES`: heading (deg), distance (m)."""
     noise = calibration.noise
     if noise is None or not noise.better:
         return NOTHING, NOTHING
@@ -171,7 +174,7 @@ def _deviations(calibration: Calibration) -> list[float | None]:
 
 
 def keys(calibration: Calibration) -> dict[str, object]:
-    """Return the settings that `--write` sets, by dotted key."""
+    """Return the settings that `--write` sets, by name, such as "odometry.wheel_slip_std"."""
     wanted: dict[str, object] = {
         f"drive.{name}": round(float(value), DIGITS)
         for name, value in zip(NAMES, calibration.multipliers.values, strict=True)
@@ -207,7 +210,12 @@ def parts(report: Report, calibration: Calibration, where: str) -> Iterator[Rend
     yield from _better(report)
     yield ""
     yield from _remains(report, calibration)
-    yield from ("", f"{where}: written" if report.written else "for acsard.toml (or --write):")
+    yield from (
+        "",
+        f"{where}: written"
+        if report.written
+        else "settings for acsard.toml (--write writes them):",
+    )
     yield from excerpt(keys(calibration))
     if report.notes:
         yield ""
@@ -215,13 +223,13 @@ def parts(report: Report, calibration: Calibration, where: str) -> Iterator[Rend
 
 
 def _better(report: Report) -> list[str]:
-    noise = f"random errors of the {{}} after {METRES:g} m, as odometry publishes them"
+    noise = f"random {{}} error that the odometry messages state after {METRES:g} m of driving"
     sentences = [
         f"{words}: {_two(before * factor)} {unit} now, {_two(after * factor)} {unit} with the new "
         "values"
         for before, after, words, unit, factor in (
             (report.turn_error_before, report.turn_error_after,
-             "error of a turn of 360 deg", "deg", 1),
+             "heading error after a turn of 360 deg", "deg", 1),
             (report.straight_error_before, report.straight_error_after,
              "heading error after 10 m straight ahead", "deg", 1),
             (report.heading_error_before, report.heading_error_after,
@@ -235,11 +243,11 @@ def _better(report: Report) -> list[str]:
         )
         if before is not None and after is not None
     ]  # fmt: skip
-    return [*sentences, "(measured on drives that the fit did not use)"] if sentences else []
+    return [*sentences, "(errors on drives that the fit did not use)"] if sentences else []
 
 
 def _two(value: float) -> str:
-    """Return a number with about two significant digits and without an exponent."""
+    """Format a number with about two significant digits and without an exponent."""
     return f"{value:.0f}" if value >= 10 else f"{value:.1f}" if value >= 1 else f"{value:.2f}"
 
 
@@ -247,17 +255,18 @@ def _remains(report: Report, calibration: Calibration) -> list[str]:
     fastest = calibration.drives.fastest
     multipliers = calibration.multipliers
     share = multipliers.std[SEPARATION] / multipliers.values[SEPARATION]
-    known = "" if TRACK in report.kept else f"here it is known to {share:.1%}, and "
+    known = "" if TRACK in report.kept else f"this log determines it to {share:.1%}, and it "
     sentences = [
-        "the error that remains: on wheels that skid the effective track is not constant; "
+        "remaining error: if wheels skid, the effective track is not constant: "
         f"{known}{'it ' * (not known)}changes by {report.effective_track_growth * fastest:+.1%} "
-        f"(+- {report.effective_track_growth_std * fastest:.1%}) from slow turns to fast ones. It "
-        "differs on other ground, so calibrate where you drive"
+        f"(+- {report.effective_track_growth_std * fastest:.1%}) from slow turns to fast ones. The "
+        "track also differs on other ground, so calibrate where you drive"
     ]
     if not report.scale:
         sentences.append(
-            "the size of the wheels was not measured, only the ratio of left to right: distances "
-            "are only as accurate as drive.wheel_radius. Drive 2 m or more straight ahead and give "
-            "--distance METRES"
+            "the calibration compared only the left with the right wheels and did not measure "
+            "their size, so distances are only as accurate as drive.wheel_radius. To measure the "
+            "size, drive 2 m or more straight ahead, measure the distance, and give --distance "
+            "METRES"
         )
     return sentences

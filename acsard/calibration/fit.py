@@ -2,8 +2,9 @@
 
 The fit is a Gauss-Newton fit. The evidence of a sensor is its contribution to the normal equations,
 summed over each block (a few seconds of driving). The standard deviations come from a jackknife
-over the blocks (Quenouille and Tukey): each block is left out in turn, by one linear step from the
-fit to all blocks. These deviations are right even if the errors within a block are correlated.
+over the blocks (Quenouille and Tukey): each block is left out in turn, and one linear step from the
+fit to all blocks gives the parameters without this block. These deviations are right even if the
+errors within a block are correlated.
 """
 
 from __future__ import annotations
@@ -28,9 +29,12 @@ class P(IntEnum):
     RIGHT = 1
     """Ratio of the right wheels' radius to the configured wheel radius."""
     INVERSE_TRACK = 2
-    """Ratio of the configured wheel separation to the effective track. Turns are linear in it."""
+    """Ratio of the configured wheel separation to the effective track.
+
+    The turns of the robot are proportional to this ratio.
+    """
     TRACK_GROWTH = 3
-    """Fraction by which the effective track grows with each rad/s of turn rate."""
+    """Fraction by which the effective track grows for each rad/s of turn rate."""
     DELAY = 4
     """Delay of the positions' recorded times behind those of the wheels, s."""
     SENSOR_X = 5
@@ -69,12 +73,13 @@ class Base(Struct, frozen=True):
         )  # fmt: skip
 
     def start(self) -> Floats:
-        """Return the parameters of the configured multipliers; all other parameters are 0."""
+        """Return parameters that contain the configured multipliers, and 0 for everything else."""
         return np.array([self.left, self.right, 1 / self.track, *[0.0] * (COUNT - P.TRACK_GROWTH)])
 
     @property
     def gain(self) -> float:
-        """Wheel radius / wheel separation: turn per radian that the right side rolls further."""
+        """Wheel radius / wheel separation: turn per radian that the right wheels roll more than the
+        left ones."""
         return self.radius / self.separation
 
 
@@ -82,7 +87,7 @@ class Evidence(Struct, frozen=True):
     """The weighted normal equations of one sensor, block by block.
 
     J is the Jacobian of the predictions with respect to the parameters, r the residuals and W their
-    weights. `fit` divides J^T W J and J^T W r by the noise variance of the sensor.
+    weights. `fit()` divides J^T W J and J^T W r by the noise variance of the sensor.
     """
 
     normal: Floats
@@ -90,7 +95,7 @@ class Evidence(Struct, frozen=True):
     score: Floats
     """Right-hand sides J^T W r of the normal equations, shape (blocks, COUNT)."""
     squares: Floats
-    """Sum of squared residuals per block."""
+    """Sum of weighted squared residuals per block."""
     counts: Floats
     """Number of independent residuals per block."""
 
@@ -116,7 +121,10 @@ def of_rows(
 
 
 def condition(normal: Floats) -> float:
-    """Return the condition number, independent of units; infinite if a parameter does not occur."""
+    """Return the condition number of `normal`, scaled so that units do not matter.
+
+    It is infinite if a parameter has no influence (0 on the diagonal).
+    """
     size = np.sqrt(np.diag(normal))
     if not np.all(size > 0.0):
         return np.inf
@@ -138,13 +146,16 @@ Source = Callable[[Floats], Evidence]
 
 MOST_STEPS = 30
 SMALL, SETTLED = 1e-5, 0.02
-"""Relative steps of radii and track below which the fit ends, and below which it has converged."""
+"""Limits for the largest change of radii and track, as fractions, in the latest step of the fit.
+
+Below `SMALL`, no further step is made. Below `SETTLED`, the fit has converged.
+"""
 
 USUAL = {P.TRACK_GROWTH: 0.06, P.DELAY: 1.0, P.SENSOR_X: 0.5, P.SENSOR_Y: 0.5}
-"""Prior standard deviations of parameters that some logs do not determine, in their own units."""
+"""Prior standard deviations of parameters that some logs do not determine, in the units of `P`."""
 
 GYRO_SCALE = 0.005
-"""Prior standard deviation of a MEMS gyro's scale, as a fraction. Only positions show its error."""
+"""Prior relative standard deviation of a MEMS gyro's scale. Only positions show a wrong scale."""
 
 HELD = 1e9
 """Weight of a constraint (`Held`) in the normal equations, large enough to enforce it."""
@@ -160,13 +171,13 @@ LEAST_BLOCKS = 5
 
 
 def student_factor(free: Floats | float) -> Floats:
-    """Return the variance of Student's t for `free` degrees of freedom (3 if fewer)."""
+    """Return the variance of Student's t with `free` degrees of freedom, but with at least 3."""
     free = np.maximum(3.0, free)
     return np.asarray(free / (free - 2))
 
 
 class Fit(Struct, frozen=True):
-    """The result of a fit: the parameters, and the normal equations of each block for them."""
+    """The result of a fit: the parameters, and each block's normal equations at that point."""
 
     parameters: Floats
     normal: Floats
@@ -182,7 +193,10 @@ class Fit(Struct, frozen=True):
     """Prior standard deviation of each parameter that has one."""
 
     def without(self, blocks: Mask) -> Floats:
-        """Return the parameters without the masked blocks, by one linear step from this fit."""
+        """Return approximately the parameters of a fit that leaves out the masked blocks.
+
+        One linear step from this fit gives them.
+        """
         rest = self.normal[~blocks].sum(axis=0) + self.known
         found = self.parameters.copy()
         found[list(self.active)] -= _solved(rest, self.score[blocks].sum(axis=0), self.active)
@@ -191,7 +205,8 @@ class Fit(Struct, frozen=True):
     def marginal(self) -> Floats:
         """Return the normal equations of radii and inverse track; other parameters are eliminated.
 
-        If no sensor measures sizes, the unknowns are the radii's difference and the inverse track.
+        If no positions show the size of the wheels, the unknowns are the difference of the radii
+        and the inverse track.
         """
         total = self.normal.sum(axis=0) + self.known
         rest = [index for index in self.active if index > P.INVERSE_TRACK]
@@ -224,7 +239,7 @@ class Fit(Struct, frozen=True):
         return np.asarray(chance + pull @ np.diag(1 / np.where(usual, usual, np.inf)) @ pull.T)
 
     def _changes(self, group: npt.NDArray[np.int64]) -> tuple[Floats, Floats]:
-        """Return how the parameters change without each group, and the variances of the jackknife.
+        """Return the parameters' changes without each group of blocks, and the jackknife variances.
 
         `group` gives the group of each block. The variances are widened to those of Student's t,
         with the degrees of freedom of Satterthwaite (An approximate distribution of estimates of

@@ -22,16 +22,22 @@ from acsard.calibration.log_table import Floats, LogError
 from acsard.calibration.runs import Block, Run, cumulative, gaps, inside, rests
 
 REST_S, EDGE_S = 0.6, 0.3
-"""Shortest rest for a gyro's bias, s, and the margin at both ends in which the robot may shake."""
+"""Shortest rest of the robot that shows the gyro's bias, and the margin at both ends of a rest, s.
+
+Samples in the margins are not used, because the robot may shake there.
+"""
 
 TURNED_BY_HAND = 0.05
-"""Deviation of a rest's gyro bias from the median, rad/s, above which a person turned the robot."""
+"""Limit for the gyro's mean rate in one rest minus the median of all rests, rad/s.
+
+Above it, a person turned the robot during this rest, so the rest is not used.
+"""
 
 LEAST_SAMPLES = 5
-"""Minimum number of gyro samples in a rest."""
+"""Minimum number of gyro samples in a rest of the robot."""
 
 OUTLIER = 6.0
-"""Deviation of a gyro sample at rest, in median deviations, above which it is left out."""
+"""Deviation of a gyro sample at rest, in median deviations, above which the sample is left out."""
 
 WALK = 5e-5
 """Smallest random walk assumed for the gyro bias, rad/s per square root of a second."""
@@ -40,7 +46,7 @@ UNSEEN_WALK = 2e-4
 """Random walk of the gyro bias if no run has two rests, rad/s per square root of a second."""
 
 ROW_S = 1.0
-"""Approximate length of the intervals over which turns are compared, s."""
+"""Approximate length of the intervals in which turns of wheels and sensor are compared, s."""
 
 GRID_S, FURTHEST_S = 0.02, 2.0
 """Step of the search for the heading sensor's delay, and the largest delay that it tries, s."""
@@ -55,7 +61,7 @@ class Heading(Struct, frozen=True):
     t: Floats
     """Times of the sensor's samples, s."""
     angle: Floats
-    """Heading at these times, rad."""
+    """Heading at the times `t`, rad."""
     gaps: Floats
     """Gaps between the samples, one row (begin, end) each, in s."""
 
@@ -71,16 +77,19 @@ class Headings(Struct, frozen=True):
     bias: float
     """Median of the gyro's bias in all rests, rad/s; 0 without a gyro or without a rest."""
     bias_unknown: bool
-    """Whether the robot never rested, so that only a comparison with the wheels shows the bias."""
+    """True if the robot never rested, so that the gyro's bias is not known from rests.
+
+    It must then be found by a comparison with the wheels.
+    """
     bias_std: float = 0.0
-    """Standard deviation of the bias while the robot moves, rad/s; 0 without a known bias."""
+    """Standard deviation of the bias while the robot moves, rad/s; 0 if no bias is known."""
 
 
 TURNING = 0.05
 """Turn rate up to which the robot is considered to drive straight, rad/s."""
 
 FASTEST = 0.95
-"""Fraction of all turning in a log that is slower than `Rates.fastest`, weighted by angle."""
+"""Fraction of the total turned angle that the robot turned more slowly than `Rates.fastest`."""
 
 
 class Rows(Struct, frozen=True):
@@ -89,9 +98,9 @@ class Rows(Struct, frozen=True):
     block: npt.NDArray[np.int64]
     """Index of the block (a few seconds of driving) to which each interval belongs."""
     turned: Floats
-    """Turn according to the heading sensor, rad; 0 without one."""
+    """Turn in each interval according to the heading sensor, rad; 0 if there is no sensor."""
     left: Floats
-    """Angle by which the left wheels rolled, rad."""
+    """Angle by which the left wheels rolled in each interval, rad."""
     right: Floats
     fast: Floats
     """Integral of |w| w over each interval, rad2/s. w is the right minus the left wheels' speed."""
@@ -105,7 +114,7 @@ class Rates(Struct, frozen=True):
     mean: float
     """Mean turn rate, weighted by the turned angle."""
     fastest: float
-    """Rate of the fastest turns: the robot turned 95 % of its angle (`FASTEST`) more slowly."""
+    """Turn rate below which the robot turned 95 % (`FASTEST`) of its total turned angle."""
 
 
 def of_gyro(driven: Sequence[Run]) -> Headings | None:
@@ -116,7 +125,9 @@ def of_gyro(driven: Sequence[Run]) -> Headings | None:
     if not any(len(run.gyro) for run in driven):
         return None
     if all(np.ptp(run.gyro) == 0.0 for run in driven if len(run.gyro)):
-        raise LogError("yaw_rate is the same in every row: the gyro was not recorded, or is dead")
+        raise LogError(
+            "column yaw_rate has the same value in every row: the gyro was not recorded, or is dead"
+        )
     biases = [_biases(run) for run in driven]
     all_biases = np.concatenate([values for _, values, _ in biases])
     usual = float(np.median(all_biases)) if len(all_biases) else 0.0
@@ -147,7 +158,9 @@ def of_yaw(driven: Sequence[Run], gain: float) -> Headings | None:
     found = []
     for run in driven:
         if _in_degrees(run, gain):
-            raise LogError("yaw is in degrees, but must be in radians: multiply it by pi / 180")
+            raise LogError(
+                "column yaw is in degrees, but must be in radians: multiply its values by pi / 180"
+            )
         angle = np.asarray(np.unwrap(run.yaw)) if len(run.yaw) else run.yaw
         found.append(Heading(run.yaw_t, angle, gaps(run.yaw_t)))
     return Headings("yaw", tuple(found), offset(found, driven), 0.0, bias_unknown=False)
@@ -166,7 +179,7 @@ def _in_degrees(run: Run, gain: float) -> bool:
 
 
 Rests = tuple[Floats, Floats, Floats]
-"""Times (s), gyro biases (rad/s) and their variances (rad2/s2) in the rests of a run."""
+"""Times (s), gyro biases (rad/s) and variances of the biases (rad2/s2) in the rests of a run."""
 
 
 def _biases(run: Run) -> Rests:
@@ -183,7 +196,7 @@ def _mean(samples: Floats) -> tuple[float, float]:
     """Return the mean of a rest's gyro samples without outliers, and the variance of this mean.
 
     The variance comes from the means of five parts, so it is right for correlated noise as well.
-    The median of a coarse gyro would always be one of the discrete values that the gyro reports.
+    The median is not used: for a coarse gyro it would always be one of the few reported values.
     """
     off = np.abs(samples - np.median(samples))
     steps = np.diff(np.unique(samples))
@@ -198,7 +211,7 @@ def _mean(samples: Floats) -> tuple[float, float]:
 def _bias_std(rested: Sequence[Rests], seconds: Sequence[float]) -> float:
     """Return the standard deviation of the mean bias over all runs, rad/s.
 
-    Its causes are the noise in the rests, and the random walk of the bias outside of them.
+    Its causes are the noise in the rests, and the random walk of the bias outside of the rests.
     """
     count = sum(len(t) for t, _, _ in rested)
     noise = sum(float(variance.sum()) for _, _, variance in rested) / max(1, count) ** 2
@@ -225,7 +238,8 @@ def _sums(rate: Floats, steps: Floats) -> Floats:
 def offset(found: Sequence[Heading], driven: Sequence[Run]) -> float:
     """Return the delay of the sensor, s, for which its turns correlate best with the wheels'.
 
-    In case one side of the wheels has the wrong sign, the sum of both angles is tried as well.
+    A turn of the wheels is the right minus the left angle. Their sum is tried as well, because the
+    speeds of one side may have the wrong sign.
     """
     reach = round(FURTHEST_S / GRID_S)
     scores, sizes = np.zeros((2, 2 * reach + 1)), np.zeros(2)
@@ -263,9 +277,9 @@ def _correlation(later: Floats, earlier: Floats, reach: int) -> Floats:
 
 
 def rows(headings: Headings | None, driven: Sequence[Run], parts: Sequence[Block]) -> Rows:
-    """Return the motion in intervals of about `ROW_S` s, into which the blocks `parts` are divided.
+    """Divide the blocks `parts` into intervals of about `ROW_S` s. Return the motion in each.
 
-    Intervals without samples of the sensor are left out. If `headings` is None, none is left out.
+    Intervals without samples of the sensor are left out. If `headings` is None, all are returned.
     """
     fast = [_fast(run) for run in driven]
     found: list[tuple[Floats, ...]] = []
@@ -326,7 +340,8 @@ def _fast(run: Run) -> Floats:
 NOISE, SHARE = 0.01, 0.03
 """Usual difference between the sensor's and the wheels' turn in an interval of the log.
 
-Its parts, added as squares, are `NOISE` rad/s and the fraction `SHARE` of the wheels' turn.
+It has two parts, whose squares are added: `NOISE` rad for each second of the interval, and the
+fraction `SHARE` of the wheels' turn.
 """
 
 
@@ -379,8 +394,8 @@ def bias(rows: Rows, by_wheels: Floats) -> float:
 def first(rows: Rows, base: Base) -> Floats:
     """Return the factors of the left and of the right wheels that fit the sensor's turns best.
 
-    A factor is wheel radius / effective track, divided by `base.gain`. It is negative if the sign
-    of this side's wheels, or of the sensor, is wrong.
+    A factor is wheel radius / effective track, divided by `base.gain`. It is negative if the
+    sign of this side's wheel speeds, or the sign of the sensor, is wrong.
     """
     columns = base.gain * np.column_stack((-rows.left, rows.right))
     weight = np.ones(len(rows.turned))

@@ -1,9 +1,9 @@
 """Measures the improvement that a calibration brings, on drives that the fit did not use.
 
 This is a cross-validation. Each run (one drive in the log) is left out in turn: the parameters are
-fitted to the other runs, and the odometry error is measured on this run. If the log has fewer than
-three runs, each fifth of the log is left out instead. The configured values are kept unless the new
-ones are surely better.
+fitted to the other runs, and the odometry error is measured on the run that was left out. If the
+log has fewer than three runs, each fifth of the log is left out instead. The configured values are
+kept unless the new values are surely better.
 """
 
 from __future__ import annotations
@@ -29,7 +29,10 @@ STRAIGHT = 0.1
 """Largest curvature that counts as straight, rad/m, computed from the rolling of the wheels."""
 
 STRAIGHT_M = 1.0
-"""Minimum straight driving for a heading error, m: with less, the error per 10 m would be noise."""
+"""Minimum distance of straight driving, m, from which a heading error is computed.
+
+With less, the error per 10 m would be only noise.
+"""
 
 
 class BeforeAfter(Struct, frozen=True):
@@ -42,20 +45,21 @@ class BeforeAfter(Struct, frozen=True):
 NOTHING = BeforeAfter(None, None)
 
 SURE = 2.0
-"""Number of standard deviations by which a gain must exceed 0 to count as sure (95 %)."""
+"""A gain counts as sure (95 %) if it exceeds this many of its standard deviations."""
 
 HALVED = float(np.log(2.0))
 """The value of `Improvement.gain` if the calibration halves one error.
 
-A larger gain always counts as sure. In a guided drive, one leg may show nearly all of the error.
-The standard deviation is then large although the gain is real.
+A larger gain counts as sure, whatever its standard deviation is. In a guided drive, one leg may
+show nearly all of the error. The standard deviation is then large although the gain is real.
 """
 
 NEAR, FAR = 2.0, 3.0
 """Limits for the distance of the new multipliers from the configured ones, in standard deviations.
 
-Up to `NEAR`, the configured multipliers are kept. Above `FAR`, which chance causes in one log of
-thirty, a smaller gain is enough: at twice `FAR`, half of the usual gain.
+Up to `NEAR`, the configured multipliers are kept. Above `FAR`, the new multipliers are accepted
+with a smaller gain: at twice `FAR`, with half of the usual gain. By chance alone, the distance
+exceeds `FAR` in one log of thirty.
 """
 
 LEAST_SQUARE = 1e-9
@@ -70,9 +74,9 @@ class Improvement(Struct, frozen=True):
     straight: BeforeAfter
     """Heading error after 10 m straight ahead, deg: the turn that the wheels do not show."""
     heading: BeforeAfter
-    """RMS error of the heading over whole drives, deg, after each drive was rotated to fit best."""
+    """RMS heading error over whole drives, deg. Each drive is first rotated to fit best."""
     place: BeforeAfter
-    """RMS error of the position over whole drives, m, after each path was aligned to fit best."""
+    """RMS position error over whole drives, m. Each path is first moved and rotated to fit best."""
     gain: float = np.inf
     """Natural logarithm of (error before / error after); inf if it was not computed.
 
@@ -94,7 +98,7 @@ UNMEASURED = Improvement(NOTHING, NOTHING, NOTHING, NOTHING)
 
 
 class Fold(Struct, frozen=True):
-    """One step of the cross-validation: a drive that is left out, and the fit without it."""
+    """One step of the cross-validation: a drive, and the fit that leaves out this drive."""
 
     drive: Block
     blocks: Mask
@@ -125,8 +129,9 @@ def positions_of(drive: Block, driven: Sequence[Run]) -> list[Segment]:
 def folds(fit: Fit, parts: Sequence[Block], left_out: Sequence[Block], rate: Rates) -> list[Fold]:
     """Return a fold for each drive in `left_out`, with the parameters that fit all other drives.
 
-    A fold leaves out the blocks of the fit, `parts`, that overlap its drive. If no block or every
-    block overlaps, the drive gets no fold. The track is adapted to the turn rates `rate`.
+    `parts` are the blocks of the fit. A fold leaves out the blocks that overlap its drive. If no
+    block or every block overlaps, the drive gets no fold. The fitted parameters are returned with
+    a constant track, the one at `rate.mean`.
     """
     run, begin, end = (
         np.array(column) for column in zip(*((p.run, p.begin, p.end) for p in parts), strict=True)
@@ -142,7 +147,7 @@ def folds(fit: Fit, parts: Sequence[Block], left_out: Sequence[Block], rate: Rat
 def with_constant_track(parameters: Floats, rate: Rates) -> Floats:
     """Return the parameters with one track for all turn rates, as in the daemon's odometry.
 
-    It is the fitted track at the mean turn rate of the log.
+    This track is the fitted track at the mean turn rate of the log.
     """
     fixed = parameters.copy()
     fixed[P.INVERSE_TRACK] *= 1.0 - fixed[P.TRACK_GROWTH] * rate.mean
@@ -159,7 +164,8 @@ def improvement(
     Args:
         held: the folds: each drive, with the parameters that were fitted without it.
         configured: the parameters with the configured multipliers.
-        rows: the motion in intervals of about a second. The measured turns are 0 without a sensor.
+        rows: the motion in intervals of about a second. The measured turns are 0 without
+            a heading sensor.
         places: for each fold, the measured positions of its drive.
         steps: the wheel steps of each run; empty if the log has no positions.
     """
@@ -192,7 +198,11 @@ def improvement(
 
 
 def rms(sums: Floats) -> BeforeAfter:
-    """Return RMS errors from `sums`: squared errors before, after, and the number of samples."""
+    """Return the RMS errors before and after the calibration.
+
+    `sums` contains the sum of the squared errors before, the same sum after, and the number of
+    samples.
+    """
     before, after, count = sums.tolist()
     if not count:
         return NOTHING
@@ -200,7 +210,7 @@ def rms(sums: Floats) -> BeforeAfter:
 
 
 def per_amount(sums: Floats, unit: float) -> BeforeAfter:
-    """Return `unit` times the errors before and after, per driven angle or distance.
+    """Return the errors before and after, divided by the driven angle or distance, times `unit`.
 
     `sums` contains the sum of errors before, the same sum after, and the driven angle or distance.
     For example, a `unit` of 360 gives the error in deg for a full turn.
@@ -214,7 +224,8 @@ def per_amount(sums: Floats, unit: float) -> BeforeAfter:
 def _gain(kinds: Sequence[Floats]) -> tuple[float, float]:
     """Return `Improvement.gain` and `Improvement.chance`.
 
-    `kinds` has an array for each kind of error. Each row is a drive, with the `sums` of `rms`.
+    `kinds` has an array for each kind of error. Each row is a drive, with the
+    three numbers that `rms()` takes.
     """
     drives = np.any([squares[:, 2] > 0.0 for squares in kinds], axis=0)
     if not np.any(drives):
@@ -283,7 +294,7 @@ def _of_positions(
 
 
 def no_better(found: Improvement) -> str:
-    """Return the message of a calibration whose new multipliers are not surely better."""
+    """Return the message if the new multipliers are not surely better than the configured ones."""
     errors = ", ".join(
         f"{name} {error.before * factor:.2g} {unit} now and {error.after * factor:.2g} {unit} "
         "with the new values"
@@ -293,7 +304,8 @@ def no_better(found: Improvement) -> str:
         if error.before is not None and error.after is not None
     )  # fmt: skip
     return (
-        "keep the configured multipliers: over whole drives that the fit did not use, the "
-        "multipliers of this log are not clearly better "
-        f"({errors or 'no drive could be left out'})"
+        "the multipliers of this log are not clearly better than the configured ones on whole "
+        "drives that the fit did not use "
+        f"({errors or 'no drive of the log could be left out of the fit'}): "
+        "keep the configured multipliers"
     )

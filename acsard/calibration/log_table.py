@@ -32,7 +32,7 @@ RATE = {f"{unit}/s": size for unit, size in ANGLE.items()} | TURNS
 
 SPEED = {f"{unit}/s": size for unit, size in LENGTH.items()}
 APPLIED = "applied_linear", "applied_angular"
-"""Columns of the twist that the daemon commands to the wheels, in m/s and rad/s."""
+"""Columns with the twist that the daemon commands to the wheels, in m/s and rad/s."""
 
 UNITS = {"t": TIME, "x": LENGTH, "y": LENGTH, "yaw": ANGLE, APPLIED[0]: SPEED}
 """Factors from known units to SI, by column. All other columns have the units of `RATE`."""
@@ -54,7 +54,7 @@ def parted(cell: str) -> tuple[str, str]:
 
 
 def factor(name: str, unit: str) -> float | None:
-    """Return the factor from `unit` to SI, or None for an unknown unit. "" means SI."""
+    """Return the factor from `unit` to SI, or None for an unknown unit. An empty unit means SI."""
     known = UNITS.get(name, RATE)
     return known.get(unit.replace("degrees", "deg").replace("/sec", "/s"), None if unit else 1.0)
 
@@ -67,16 +67,17 @@ BOUNDS = dict.fromkeys(WHEELS, 1e3) | {"t": 1e20, "yaw_rate": 1e4, "yaw": 1e7}
 PLACE_BOUND = 1e9
 """Largest possible absolute value, in SI units, in a column that `BOUNDS` does not list.
 
-All limits allow values in degrees or nanoseconds, so that later checks can name the wrong unit.
+This limit and those in `BOUNDS` also allow values in degrees or nanoseconds, so that later checks
+can name the wrong unit.
 """
 
 RATES = frozenset((*WHEELS, "yaw_rate"))
-"""Columns in which spikes are removed."""
+"""Columns of wheel speeds and turn rates. Spikes are removed only from these columns."""
 
 SPIKE, FEW_VALUES, SLOW = 10.0, 0.02, 0.02
 """Definition of a spike, which is a rate that was recorded wrongly.
 
-A spike is more than `SPIKE` times as large as both neighbouring samples, and as the usual rate. The
+A spike is more than `SPIKE` times as large as each neighbouring sample and as the usual rate. The
 usual rate is the quantile 1 - `FEW_VALUES` of all rates above `SLOW` rad/s.
 """
 
@@ -147,7 +148,7 @@ FEW, SHARE = 3, 0.01
 
 EXAMPLE = '"t,left,right,yaw_rate" or "t,fr,fl,rl,rr,x,y"'
 
-AS_CSV = f"export it as CSV, whose first line names the columns, like {EXAMPLE}"
+AS_CSV = f"export the drive as a CSV file whose first line names the columns, like {EXAMPLE}"
 
 
 class LogError(AcsardError):
@@ -177,7 +178,8 @@ class Table(Struct, frozen=True):
     def joined(cls, sensors: Sequence[Mapping[str, Floats]]) -> Table:
         """Return the table of one run: a row for each sample of each sensor, sorted by time.
 
-        Each element of `sensors` maps names to columns: "t", and columns of no other sensor.
+        Each element of `sensors` maps the column names of one sensor to values. All have "t". Any
+        other column belongs to only one sensor.
         """
         ends = np.cumsum([0, *(len(sensor["t"]) for sensor in sensors)])
         columns = {name: np.full(ends[-1], math.nan) for sensor in sensors for name in sensor}
@@ -207,7 +209,7 @@ def _text(data: bytes) -> str:
         if data.startswith(mark):
             return data.decode(coding, errors="replace")
     if b"\0" in data[:4096]:
-        raise LogError(f"it is not text (perhaps a ROS bag): {AS_CSV}")
+        raise LogError(f"the file is not text (perhaps a ROS bag): {AS_CSV}")
     return data.decode("utf-8-sig", errors="replace")
 
 
@@ -234,7 +236,7 @@ def _header(lines: Sequence[str]) -> tuple[int, list[tuple[str, str]], str]:
                 f"line {at + 1} contains numbers instead of the names of the columns: "
                 f"write a first line like {EXAMPLE}"
             )
-    raise LogError(f"it is empty: its first line must name the columns, like {EXAMPLE}")
+    raise LogError(f"the file is empty: its first line must name the columns, like {EXAMPLE}")
 
 
 def _separator(text: str) -> str:
@@ -262,7 +264,10 @@ def _is_number(cell: str) -> bool:
 
 
 def _columns(header: list[str], number: int) -> list[str]:
-    """Return the names of the columns, "" if unused. Raise `LogError` if a column is missing."""
+    """Return the names of the columns, "" if unused.
+
+    Raise `LogError` if a column that the calibration needs is missing.
+    """
     where = f"line {number} (the header)"
     twice = {name for name in header if name in COLUMNS and header.count(name) > 1}
     if twice:
@@ -292,14 +297,14 @@ def _columns(header: list[str], number: int) -> list[str]:
 def _near(names: Sequence[str], header: Sequence[str]) -> str:
     others = [name for name in header if name and name not in COLUMNS]
     if "t" in names and (times := [name for name in others if "time" in name or "stamp" in name]):
-        return f" (if {times[0][:40]} is the time, rename that column to t and write it in s)"
+        return f" (if column {times[0][:40]} is the time, rename it to t and convert it to seconds)"
     if counts := [name for name in others if COUNTS.search(name)]:
         return (
-            f" ({counts[0][:40]} has counts, not speeds: convert the counts of each row to rad/s "
-            "with 2 pi x counts / (counts per turn x seconds))"
+            f" (column {counts[0][:40]} has counts, not speeds: convert the counts of each row to "
+            "rad/s with 2 pi x counts / (counts per turn x seconds))"
         )
     near = [other for name in names for other in nearest(name, others)]
-    return f" (if {near[0]} is that column, rename it)" if near else ""
+    return f" (if column {near[0]} is the missing one, rename it)" if near else ""
 
 
 def _ignored(header: list[tuple[str, str]], names: list[str]) -> list[str]:
@@ -313,8 +318,8 @@ def _ignored(header: list[tuple[str, str]], names: list[str]) -> list[str]:
 
 def _unknown_units(header: list[tuple[str, str]], names: list[str]) -> list[str]:
     return [
-        f"column {name} has the unknown unit ({unit[:20]}): it was read as "
-        f"{SI.get(name, 'rad/s')}; correct the header if that is wrong"
+        f"column {name} has the unknown unit ({unit[:20]}): the values were read as "
+        f"{SI.get(name, 'rad/s')}; correct the header if this unit is wrong"
         for (_, unit), name in zip(header, names, strict=True)
         if name and name != "run" and factor(name, unit) is None
     ]
@@ -395,7 +400,7 @@ class _Reader:
                     return []  # a header in the middle of the file: logs were concatenated
                 shown = printable(cell if len(cell) <= 30 else cell[:27] + "...")
                 date = self._names[i] == "t" and ":" in cell
-                why = "a date, but t must be in s" if date else "not a number"
+                why = "a date, but t must be in seconds" if date else "not a number"
                 self._refuse(f'line {number}, column {self._names[i]}: "{shown}" is {why}')
                 return []
         return row
@@ -427,11 +432,11 @@ class _Reader:
 HEADER = f"t,{','.join(FOUR)},yaw_rate,x,y,yaw"
 
 KEYS = ("wheel_states", "imu", "sim/pose")
-"""Keys whose messages a log can contain."""
+"""Zenoh keys whose messages a log can contain."""
 
 
 def row(message: Message, arrived_ns: int) -> str:
-    """Return the row of a message from one of `KEYS`. Raises `ValueError` for any other message.
+    """Return the CSV row for a message from one of `KEYS`. Raises `ValueError` for other messages.
 
     `arrived_ns` is the wall-clock time of arrival, ns since 1970. It replaces a missing stamp.
     """

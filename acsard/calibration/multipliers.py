@@ -1,4 +1,4 @@
-"""Computes the multipliers of wheel separation and radii, and corrects them by a tape measure.
+"""Computes the multipliers of wheel separation and radii, and corrects them with a measured length.
 
 A log of turn rates alone shows only the ratios of the multipliers. A distance that was measured by
 tape shows how large the wheels are.
@@ -18,7 +18,7 @@ from acsard.calibration.log_table import Floats, RefusedError
 from acsard.core.config.settings import OdometryConfig
 
 SEPARATION, LEFT_RADIUS, RIGHT_RADIUS = range(3)
-"""Indices into `values` and `covariance` of `Multipliers`."""
+"""Indices into `Multipliers.values` and `Multipliers.covariance`."""
 
 
 SAME = 1e-4
@@ -31,7 +31,7 @@ class Deviations(Struct, frozen=True):
     track: float
     """Relative standard deviation of the ratio of effective track to mean radius."""
     ratio: float
-    """Relative standard deviation of the ratio of both radii."""
+    """Relative standard deviation of the ratio of the right to the left wheel radius."""
     scale: float
     """Relative standard deviation of the mean radius, to which all distances are proportional."""
 
@@ -62,7 +62,7 @@ class Multipliers(Struct, frozen=True):
 
     @property
     def ratio_std(self) -> float:
-        """Standard deviation of the ratio of both radii, as a fraction."""
+        """Relative standard deviation of the ratio of the right to the left wheel radius."""
         return self.own().ratio
 
     def apart(self, base: Base) -> float:
@@ -108,9 +108,10 @@ TAPE_M = 0.01
 """Standard deviation of a distance by tape, m, including the choice of the point on the robot."""
 
 CONTRADICTS, CONTRADICTS_STD = 0.02, 5.0
-"""Limits for a distance by tape minus that by positions: a fraction, and standard deviations.
+"""Limits for the difference between a distance by tape and the same distance by positions.
 
-If the difference exceeds both limits, one of the distances is wrong.
+If the difference exceeds the fraction `CONTRADICTS` of the distance and also `CONTRADICTS_STD`
+standard deviations, one of the distances is wrong.
 """
 
 UNKNOWN = 1.0
@@ -141,12 +142,12 @@ class Extent(Struct, frozen=True):
 
     @property
     def straight(self) -> float:
-        """Distance divided by length, 1 for a straight line; 0 for a distance up to `LEAST_M`."""
+        """`distance` / `length`, which is 1 for a straight path; 0 if `distance` <= `LEAST_M`."""
         return self.distance / self.length if self.distance > LEAST_M else 0.0
 
 
 Follow = Callable[[Floats, int], Extent]
-"""Function that returns a run's extent for `Multipliers.values` and the index of the run."""
+"""Function of `Multipliers.values` and the index of a run. It returns the extent of the run."""
 
 
 def scaled(
@@ -166,7 +167,7 @@ def scaled(
     """
     if tape.run and tape.run not in names:
         raise RefusedError(
-            f'--distance: there is no run "{tape.run}" in the log; it has {", ".join(names[:10])}'
+            f'--distance: the log has no run "{tape.run}"; its runs are {", ".join(names[:10])}'
         )
     numbers = [names.index(tape.run)] if tape.run else range(len(names))
     extents = {number: follow(found.values, number) for number in numbers}
@@ -174,9 +175,9 @@ def scaled(
     extent = extents[best]
     if extent.straight < STRAIGHT:
         raise RefusedError(
-            f"--distance: run {names[best]} ends {extent.distance:.2f} m from its start, after "
-            f"{extent.length:.2f} m: drive straight ahead for 2 m or more in a separate run, and "
-            "measure from start to end"
+            f"--distance: run {names[best]} ends {extent.distance:.2f} m from its start, but its "
+            f"path is {extent.length:.2f} m long, so it is not straight enough: drive "
+            "straight ahead for 2 m or more in a separate run, and measure from start to end"
         )
     # Derivatives of the logarithm of the distance with respect to the logarithms of the
     # multipliers.
@@ -194,9 +195,10 @@ def scaled(
     longer_by = math.log(tape.metres / extent.distance)
     if known and abs(longer_by) > max(CONTRADICTS, CONTRADICTS_STD * math.sqrt(variance)):
         raise RefusedError(
-            f"--distance: by the positions, run {names[best]} ends {extent.distance:.2f} m from "
-            f"its start, but you measured {tape.metres:g} m: was this distance measured straight "
-            "from the start to the end of this run, and are x and y in m?"
+            f"--distance: according to the positions, run {names[best]} ends "
+            f"{extent.distance:.2f} m from its start, but you measured {tape.metres:g} m: was this "
+            "distance measured straight from the start to the end of this run, and are x and "
+            "y in m?"
         )
     gain = covariance @ jacobian / variance
     values = found.values * np.exp(gain * longer_by)

@@ -52,7 +52,7 @@ class Source(IntEnum):
     SLIP = 3
     """Variance of the fraction of the distance that is lost in a window (half a minute)."""
     RATIO = 4
-    """Relative variance of the ratio of both wheel radii from window to window (half a minute)."""
+    """Relative variance of right / left wheel radius from window to window (half a minute)."""
     TRACK = 5
     """Relative variance of the effective track from window to window (half a minute)."""
     HEADING = 6
@@ -79,13 +79,20 @@ MOST_WINDOWS = 80
 """Largest number of windows that are used. From a longer log, only every n-th window is used."""
 
 FINE_S = 0.5
-"""Length of a window's steps, s. Only `SLIP`, `RATIO` and `TRACK` correlate errors of steps."""
+"""Duration of the steps into which a window is divided, s.
+
+The sources `SLIP`, `RATIO` and `TRACK` cause the same relative error in all steps of a window.
+Errors from other sources are independent from step to step.
+"""
 
 MOST_FOLDS = 10
-"""Largest number of groups of drives. Each group is left out once, which costs two searches."""
+"""Largest number of groups of drives. Each group is left out once, which takes two searches."""
 
 STEPS, FEWER_STEPS = 150, 60
-"""Number of steps of a search, and of a search that starts from the noise of the whole log."""
+"""Number of iterations in a search for the noise.
+
+`FEWER_STEPS` suffices for a search that starts from the noise of the whole log.
+"""
 
 OUTLIER = 9.0
 """Mean square of a window's normalized residuals above which the window weighs less."""
@@ -94,17 +101,18 @@ ROUNDING = 1e-12
 """Variance added to each residual, so that even a perfect sensor's covariance can be inverted."""
 
 FLOOR = 0.25
-"""Minimum of the noise `DISTANCE`, `YAW` and `SKID`, as a fraction of its standard deviation.
+"""Minimum of the noise `DISTANCE`, `YAW` and `SKID`, in standard deviations of its estimate.
 
 In a short log, the fit often finds a noise of 0, which would make the pose exact.
 """
 
 CHANGES = 0.1
-"""Minimum of the noise `DISTANCE`, as a fraction of `SLIP` converted by `Windows.lasting`.
+"""Minimum of the noise `DISTANCE`, as a fraction of the noise `SLIP`.
 
-In the same way, `RATIO` gives the minimum of `YAW`, and `TRACK` that of `SKID`. A window does not
-show how long an error lasts beyond the window's end. Without this minimum, the pose covariance of
-one robot in eight had no width in some direction.
+`Windows.lasting` first converts `SLIP` to the unit of `DISTANCE`. In the same way, `RATIO` gives
+the minimum of `YAW`, and `TRACK` gives the minimum of `SKID`. A window does not show how long an
+error lasts beyond the window's end. Without this minimum, the pose covariance of one robot in eight
+had no width in some direction.
 """
 
 TWICE = math.log(2.0) - 3 / 8
@@ -114,7 +122,7 @@ A standard deviation stated at twice its true value loses this much log likeliho
 """
 
 MOST = 1.0
-"""Largest value of a proposed setting. The configuration accepts this value for every setting."""
+"""Limit of each setting that a calibration proposes. The configuration accepts this value."""
 
 METRES = 10.0
 """Distance for which the report states the uncertainty that noise causes, m."""
@@ -153,7 +161,7 @@ class Windows(Struct, frozen=True):
     def search(self, start: Floats, free: Mask, steps: int = STEPS) -> Floats:
         """Return the noise with the greatest likelihood, found in `steps` steps from `start`.
 
-        Sources outside the mask `free` keep their number.
+        Sources outside the mask `free` keep the noise that they have in `start`.
         """
         noise, flat = start.copy(), np.moveaxis(self.effects, 1, 0).reshape(COUNT, -1)
         for _ in range(steps):
@@ -170,9 +178,9 @@ class Windows(Struct, frozen=True):
     def at_least(self, noise: Floats) -> Floats:
         """Return the noise to state for other drives, with the minima of `FLOOR` and `CHANGES`.
 
-        If few residuals show `DISTANCE`, `YAW` or `SKID`, this noise is widened like the variance
-        of Student's t. Windows overlap by half, so each residual counts as half a degree of
-        freedom.
+        If few residuals show the noise `DISTANCE`, `YAW` or `SKID`, that noise is increased like
+        the variance of Student's t. Windows overlap by half, so each residual counts as half a
+        degree of freedom.
         """
         shares = np.linalg.inv(self.covariance(noise))[:, None] @ self.effects
         free = noise * np.einsum("wkii->k", shares) / 2
@@ -208,7 +216,7 @@ class Noise(Struct, frozen=True):
     chance: float
     """Standard deviation of `gain`, from the differences between drives."""
     places: bool
-    """Whether the log has positions. Without them, it does not show the noise of the distance."""
+    """Whether the log has positions. Only positions show the noise of the distance."""
     turning: float
     """Turn of the robot per metre driven in this log, rad/m."""
     track: float
@@ -220,11 +228,17 @@ class Noise(Struct, frozen=True):
         return self.gain > min(SURE * self.chance, TWICE)
 
     def heading(self) -> tuple[float, float]:
-        """Return the std of the heading after `METRES`, rad, for configured and for found noise."""
+        """Return the standard deviations of the heading after `METRES`, rad.
+
+        The first is due to the configured noise, the second to the found noise.
+        """
         return self._after(Source.YAW, Source.RATIO, Source.SKID)
 
     def distance(self) -> tuple[float, float]:
-        """Return the std of the distance after `METRES`, m, for configured and for found noise."""
+        """Return the standard deviations of the distance after `METRES`, m.
+
+        The first is due to the configured noise, the second to the found noise.
+        """
         return self._after(Source.DISTANCE, Source.SLIP, None)
 
     def _after(self, rate: Source, lasting: Source, skid: Source | None) -> tuple[float, float]:
@@ -273,7 +287,7 @@ def settings(
 
 
 class Reference(Struct, frozen=True):
-    """The sensors of a log, and the parameters of the fit that belong to them."""
+    """The sensors of a log, and the parameters that were fitted to the whole log."""
 
     runs: Sequence[Run]
     headings: Headings | None
@@ -291,7 +305,8 @@ def noise(
 ) -> Noise | None:
     """Return the noise that a log shows, or None if fewer than two drives show it.
 
-    `known` contains the standard deviations of the geometry in the parameters of `held`.
+    `held` contains the drives, each with parameters that were fitted without it. `known` contains
+    the standard deviations of track and wheel radii in these parameters.
     """
     motions: list[_Motion] = []
     windows = _windows(held, seen, known, motions)
@@ -372,7 +387,8 @@ class _Window(Struct, frozen=True):
     def projected(self, known: Deviations) -> tuple[Floats, Floats, Floats]:
         """Return the residuals, their covariance by source of noise, and their known covariance.
 
-        The unknown start pose is projected out of all three. `known` describes the geometry.
+        The unknown start pose is projected out of all three. The known covariance is due to the
+        uncertainty `known` of track and wheel radii, and to the gyro's bias.
         """
         distance, turn, track = self.motion.distance, self.motion.turn, self.motion.track
         sides = np.maximum(np.abs(distance), track / 2 * np.abs(turn))

@@ -23,30 +23,33 @@ LEAST_ANGLE = 2 * np.pi
 """Minimum turn of the robot in a whole log, rad. Turns to both sides add up."""
 
 LEAST_ROLL = 3.0
-"""Minimum angle, rad, that the wheels of a log roll ahead or back, and against each other."""
+"""Minimum angle that the wheels must roll in a log, rad.
+
+It applies to the mean of the left and the right angle, and also to half of their difference.
+"""
 
 ALIKE = 0.98
-"""Largest squared correlation between the mean and the difference of both sides' motion.
+"""Largest squared correlation between the mean and the difference of left and right motion.
 
 If it is larger, the robot drives the same curve all the time, and the log is refused.
 """
 
 WORST = 0.2, 0.03
-"""Largest useful relative standard deviations: of the track, and of the ratio of the radii."""
+"""Largest accepted relative standard deviations of the track and of the ratio of the radii."""
 
 WORST_CONDITION = 1e4
 """Largest condition number of the normal equations at which radii and track can be separated."""
 
 DRIVE = (
-    "drive 60 s: stand 3 s, 2 m straight ahead and back, three full turns to the left and three to "
-    "the right, some of them slow and some fast, then curves both ways"
+    "record a drive of 60 s: stand for 3 s, drive 2 m straight ahead and back, make three full "
+    "turns to the left and three to the right, some slow and some fast, then drive curves both ways"
 )
 
 UNLIKE = 0.5
 """Largest fraction of a sensor's motion (sum of squares) that may be unexplained by the wheels."""
 
 UNITS = 8.0
-"""Largest factor between a result and the configuration. Beyond it, a unit must be wrong."""
+"""Largest credible ratio of a measured to a configured value. Above it, a unit must be wrong."""
 
 LEAST_TURN = 0.2
 """Smallest credible ratio of the measured turn to the turn that the configured wheels predict.
@@ -70,7 +73,10 @@ LEAST_FACTOR, MOST_FACTOR = 0.1, 10.0
 """Range of multipliers that the configuration accepts."""
 
 NOTABLE_S, FAR_S = 0.005, 0.5
-"""Delays of a sensor, s: reported from `NOTABLE_S` on, with advice on the clocks above `FAR_S`."""
+"""Limits for the delay of a sensor, s.
+
+From `NOTABLE_S` on, a remark states the delay. Above `FAR_S`, it also advises to set the clocks.
+"""
 
 LARGE_BIAS = 0.05
 """Gyro bias, rad/s, above which the bias is reported."""
@@ -89,7 +95,7 @@ LEAST_TRACK, MOST_TRACK = 0.85, 3.0
 
 
 def drives_enough(parts: Sequence[Block]) -> None:
-    """Raise `RefusedError` if the log has too few blocks in which the wheels turn."""
+    """Raise `RefusedError` if the blocks (a few seconds of driving each) of the log are too few."""
     if len(parts) < LEAST_BLOCKS:
         seconds = sum(part.end - part.begin for part in parts)
         raise RefusedError(f"the wheels turn for only {seconds:.0f} s, which is too short: {DRIVE}")
@@ -98,27 +104,29 @@ def drives_enough(parts: Sequence[Block]) -> None:
 def rolls_enough(rows: Rows, *, spins: bool = False) -> None:
     """Raise `RefusedError` if the log lacks a movement of the wheels that the fit needs.
 
-    The sides must roll together and against each other. With `spins`, turns on the spot are enough.
+    The left and right wheels must roll in the same direction at times, and in opposite directions
+    at others. With `spins`, opposite directions (turns on the spot) are enough.
     """
     together, against = (rows.right + rows.left) / 2, (rows.right - rows.left) / 2
-    for rolled, what in ((together, "ahead or back"), (against, "against each other")):
+    for rolled, what in ((together, "ahead or back"), (against, "in opposite directions")):
         if (turns := float(np.abs(rolled).sum()) / (2 * np.pi)) < LEAST_ROLL / (2 * np.pi):
             if spins and what == "ahead or back":
                 continue
             raise RefusedError(
-                f"the wheels roll {turns:.1f} turns {what} in all, which is too little to measure "
-                f"their size, the ratio of left to right and the effective track: {DRIVE}"
+                f"in the whole log, the wheels of the two sides roll only {turns:.1f} revolutions "
+                f"{what}, which is too little to measure the wheel radii and the effective track: "
+                f"{DRIVE}"
             )
         cross = float(together @ against) ** 2
         if cross > ALIKE * float(together @ together) * float(against @ against):
             raise RefusedError(
                 "the robot always drives the same curve, so the log cannot separate errors of the "
-                f"wheels from errors of the track: {DRIVE}"
+                f"wheel radii from errors of the track width: {DRIVE}"
             )
 
 
 def turns_enough(turned: Floats) -> None:
-    """Raise `RefusedError` if the robot hardly turns. `turned` contains its turns, rad."""
+    """Raise `RefusedError` if the robot hardly turns. `turned` contains its turns in rad."""
     if (angle := float(np.abs(turned).sum())) < LEAST_ANGLE:
         raise RefusedError(
             f"the robot turned by {np.degrees(angle):.0f} deg in all, which is too little to "
@@ -126,7 +134,7 @@ def turns_enough(turned: Floats) -> None:
         )
 
 
-TRACK, RATIO = "the effective track", "the ratio of left to right"
+TRACK, RATIO = "the effective track", "the ratio of the left to the right wheel radius"
 """Names of the two quantities that some logs do not determine accurately enough."""
 
 
@@ -135,7 +143,8 @@ def unsure(
 ) -> dict[str, float]:
     """Return the relative standard deviations, by quantity, that exceed their limit in `worst`.
 
-    `track_std` is that of the mean track. The track itself varies more, from turn to turn.
+    `track_std` is the relative standard deviation of the mean track. The track of a single turn
+    varies more.
     """
     deviations = {TRACK: track_std, RATIO: found.ratio_std}
     return {
@@ -169,13 +178,16 @@ def positions_follow(begun: StartingPoint) -> None:
     """Raise `RefusedError` if the positions do not follow the path of the wheels."""
     if begun.unexplained > UNLIKE:
         raise RefusedError(
-            "the positions do not follow the wheels: are they x ahead and y to the left in m (not "
-            "latitude and longitude), from the same drive, on the same clock within 1 s?"
+            "the positions do not match the motion of the wheels: check that x is ahead and y to "
+            "the left in m (not latitude and longitude), that wheels and positions come from the "
+            "same drive, and that their clocks differ by less than 1 s"
         )
 
 
 def turns_the_right_way(source: str, sides: Floats | None, begun: StartingPoint | None) -> None:
-    """Raise `RefusedError`, naming the wrong sign, if wheels and sensors turn to different sides.
+    """Raise `RefusedError` if wheels and sensors show turns in different directions.
+
+    The error names the wrong sign.
 
     `sides` is the result of `heading.first`, or None without the heading sensor `source`. `begun`
     is the result of `positions.search`, or None without positions.
@@ -243,9 +255,9 @@ def turns_like_the_wheels(source: str, rows: Rows, base: Base) -> None:
 
 
 def turn_rates(source: str, rows: Rows) -> None:
-    """Raise `RefusedError` if the heading sensor turns so fast that its unit must be degrees.
+    """Raise `RefusedError` if the heading sensor shows turns so fast that it must be in degrees.
 
-    The wheels' turns are no reference, because the wheel speeds may be in degrees as well.
+    The sensor is not compared with the wheels, because the wheel speeds may be in degrees as well.
     """
     rate = float(np.percentile(np.abs(rows.turned) / rows.seconds, 90))
     if rate > FASTEST_TURN:
@@ -276,7 +288,7 @@ def turn_units(source: str, turn: float, bare: float, base: Base) -> None:
     raise RefusedError(
         f"the robot turns {turn:.3g} times as far as its wheels report: {may}, or "
         f"drive.wheel_radius = {base.radius:g} and drive.wheel_separation = {base.separation:g} "
-        "belong to another robot (--config)"
+        "belong to another robot (give the right file with --config)"
     )
 
 
@@ -285,7 +297,7 @@ def distance_units(size: float, base: Base) -> None:
     if 1 / UNITS < size < UNITS:
         return
     may = (
-        "the wheel speeds are in m/s (divide by the wheel radius), or the positions in mm or cm"
+        "the wheel speeds are in m/s (divide by the wheel radius), or the positions are in mm or cm"
         if size > 1
         else "the positions are latitude and longitude, or in km (they must be x ahead and y to "
         "the left, in m)"
@@ -294,7 +306,8 @@ def distance_units(size: float, base: Base) -> None:
     )
     raise RefusedError(
         f"the robot drives {size:.3g} times as far as its wheels report: {may}, or "
-        f"drive.wheel_radius = {base.radius:g} belongs to another robot (--config)"
+        f"drive.wheel_radius = {base.radius:g} belongs to another robot (give the right file "
+        "with --config)"
     )
 
 
@@ -304,9 +317,10 @@ def in_range(values: Floats) -> None:
         return
     shown = ", ".join(f"{value:.3g}" for value in values)
     raise RefusedError(
-        f"the multipliers are {shown} (wheel separation, left, right), but must be from "
-        f"{LEAST_FACTOR:g} to {MOST_FACTOR:g}: write the measured drive.wheel_radius and "
-        "drive.wheel_separation into the configuration first"
+        f"the multipliers are {shown} (wheel separation, left radius, right radius), but must be "
+        f"from {LEAST_FACTOR:g} to {MOST_FACTOR:g}: first measure wheel radius and wheel "
+        "separation by tape, and write drive.wheel_radius and drive.wheel_separation into the "
+        "configuration"
     )
 
 
@@ -345,13 +359,13 @@ def remarks(
     if min(left, right) < ONE_SIDED * max(left, right):
         yield (
             "nearly all turns are to one side, so the calibration does not show a difference "
-            "between the sides: drive turns to both sides"
+            "between left and right turns: drive turns to both sides"
         )
     size = float(values[1:].mean())
     if sized and not 1 / ODD_SIZE < size < ODD_SIZE:
         yield (
             f"the wheels are {size:.3g} times as large as drive.wheel_radius = {base.radius:g}: "
-            "measure it, and check that wheel speeds are in rad/s and x, y in m"
+            "measure the radius, and check that wheel speeds are in rad/s and x, y in m"
         )
     ratio = float(values[2] / values[1])
     if not 1 / ODD_RATIO < ratio < ODD_RATIO:
@@ -364,6 +378,6 @@ def remarks(
     if not LEAST_TRACK < track < MOST_TRACK:
         yield (
             f"an effective track of {track:.3g} times drive.wheel_separation = "
-            f"{base.separation:g} is unusual (1 to 2.5 is usual): measure it, and check all "
-            "units"
+            f"{base.separation:g} is unusual (1 to 2.5 is usual): measure the wheel "
+            "separation, and check all units"
         )

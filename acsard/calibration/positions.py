@@ -5,8 +5,8 @@ best. The remaining differences are the evidence for the fit, so no start pose, 
 needed. Places are complex numbers x + iy in m.
 
 `search` finds parameters from which the fit to positions can start, because the fit needs a track
-that is nearly right. The search tries tracks from a tenth to thirty times the configured one, with
-turns to either side and with one side of the wheels reversed. For each of them, the size of the
+that is nearly right. The search tries tracks from a tenth to thirty times the configured one. It
+also tries reversed turns, and wheels of one side that roll backwards. Each time, the size of the
 path gives the wheel radius.
 
 Positions often determine a turn on the spot only up to whole turns: the robot faces the same way
@@ -28,15 +28,16 @@ from acsard.calibration.log_table import Floats
 from acsard.calibration.runs import Block, Complexes, Run, cumulative
 
 LEAST_POINTS = 5
-"""Minimum number of positions in a segment. The alignment has three unknowns (shift, rotation)."""
+"""Minimum number of positions in a segment. The alignment has three unknowns (x, y, angle)."""
 
 FINE_S = 0.02
 """Time step for integrating the path, s. Finer steps cost time and add no accuracy."""
 
 JUMP, JUMP_M = 6.0, 0.05
-"""Limits of a step between two positions. Beyond them, the source erred or has relocalized.
+"""Limits for the distance between two successive positions.
 
-A step may exceed the rolled distance by `JUMP` standard deviations plus `JUMP_M` m.
+This distance may exceed the rolled distance by `JUMP` standard deviations plus `JUMP_M` m. If it is
+larger, it is a jump: the source of positions erred or has relocalized.
 """
 
 SPEED_S = 0.05
@@ -78,13 +79,13 @@ class Path(Struct, frozen=True):
     t: Floats
     """Times of the points of the path, s."""
     place: Complexes
-    """Place x + iy of the robot at these times, m."""
+    """Place x + iy of the robot at the times `t`, m."""
     heading: Floats
-    """Heading at these times, rad."""
+    """Heading of the robot at the times `t`, rad."""
     derivatives: dict[P, Complexes]
-    """Derivatives of `place` with respect to the radii, the inverse track and its growth."""
+    """Derivatives of `place` by the radii, the inverse track and the track growth."""
     heading_derivatives: dict[P, Floats]
-    """Derivatives of `heading` with respect to the radii, the inverse track and its growth."""
+    """Derivatives of `heading` by the radii, the inverse track and the track growth."""
 
     def at(self, t: Floats, parameters: Floats) -> tuple[Complexes, Complexes]:
         """Return the places of the position sensor, m, and their derivatives by the parameters.
@@ -111,7 +112,10 @@ class Path(Struct, frozen=True):
 
 
 def segments(driven: Sequence[Run], parts: Sequence[Block]) -> list[Segment]:
-    """Return the segments of each block between jumps that have at least `LEAST_POINTS`."""
+    """Return the positions of each block, split at jumps.
+
+    Segments with fewer than `LEAST_POINTS` positions are left out.
+    """
     edges = [jumps(run) for run in driven]
     found = []
     for number, part in enumerate(parts):
@@ -139,7 +143,7 @@ def jumps(run: Run) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
 
 
 def wheel_steps(run: Run, fine_s: float = FINE_S) -> WheelSteps:
-    """Return the motion of the wheels in steps of about `fine_s` s, or of one sample if longer."""
+    """Return the wheels' motion in steps of about `fine_s` s, but of at least one sample each."""
     usual = float(np.median(np.diff(run.t)))
     every = max(1, int(fine_s / usual))
     kept = np.unique(np.append(np.arange(0, len(run.t), every), len(run.t) - 1))
@@ -172,14 +176,17 @@ def path(steps: WheelSteps, base: Base, parameters: Floats) -> Path:
 
 
 def place(steps: WheelSteps, base: Base, parameters: Floats) -> Complexes:
-    """Return only the places of `path`, in less time. The parameter TRACK_GROWTH must be 0."""
+    """Return the same places as `path()`, in less time. The parameter TRACK_GROWTH must be 0."""
     left, right = parameters[P.LEFT] * steps.left, parameters[P.RIGHT] * steps.right
     _, ahead = _directions(base.gain * parameters[P.INVERSE_TRACK] * (right - left))
     return _sums(ahead * base.radius * (left + right) / 2)
 
 
 def _directions(turns: Floats) -> tuple[Floats, Complexes]:
-    """Return the headings between steps, rad, and the complex chord of each arc of length 1."""
+    """Return the headings at the ends of the steps, rad, and the chords of the steps.
+
+    A chord is a complex number, computed for an arc of length 1.
+    """
     heading = cumulative(turns)
     return heading, np.exp(1j * (heading[:-1] + turns / 2)) * np.sinc(turns / (2 * np.pi))
 
@@ -270,7 +277,8 @@ MOST_POINTS = 80
 MOST_REFINED, FAR_WORSE = 4, 20.0
 """Limits for the starting points that are refined.
 
-At most `MOST_REFINED` points are refined, and none that is `FAR_WORSE` times worse than the best.
+At most `MOST_REFINED` points are refined. Points that are over `FAR_WORSE` times worse than the
+best one are never refined.
 """
 
 USUAL_TURN = 0.31, 1.25
@@ -283,10 +291,13 @@ NEAR_HEADING = 0.8, 1.25
 """Usual range of the turn that positions show, divided by the turn that a heading sensor shows."""
 
 WRONG_WAY = 4.0
-"""Penalty factor if one side is reversed, or if the robot turns opposite to its wheels."""
+"""Penalty factor if the wheels of one side, or the turns of the robot, seem to be reversed."""
 
 NOTHING = 1e-3
-"""Noise of the positions, added to `unexplained` so that much smaller differences hardly matter."""
+"""Fraction that is added to `StartingPoint.unexplained` for comparisons.
+
+Smaller differences, which are only noise of the positions, then hardly matter.
+"""
 
 STRAYED = 1.3
 """Factor by which a refinement may change the robot's turn. Beyond it, the result is discarded."""
@@ -306,7 +317,10 @@ class StartingPoint(Struct, frozen=True):
 def search(
     segments: Sequence[Segment], driven: Sequence[Run], base: Base, sides: Floats | None = None
 ) -> StartingPoint:
-    """Return the best starting point for the fit. `sides` is from `heading.first`, or None."""
+    """Return the best starting point for the fit.
+
+    `sides` is the result of `heading.first()`, or None without a heading sensor.
+    """
     kept = _furthest(segments, MOST_SEGMENTS)
     needed = sorted({segment.run for segment in kept})
     steps = {run: wheel_steps(driven[run], COARSE_S) for run in needed}
@@ -408,7 +422,7 @@ def _tried(
 def _refined(
     point: StartingPoint, few: Sequence[Segment], steps: dict[int, WheelSteps], base: Base
 ) -> StartingPoint:
-    """Return the point refined by a fit to a few segments, if this fit explains more."""
+    """Return the point that a fit to a few segments refines, or `point` if that is not better."""
     segments = [replace(segment, block=number) for number, segment in enumerate(few)]
 
     def source(parameters: Floats) -> Evidence:

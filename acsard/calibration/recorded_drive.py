@@ -27,26 +27,28 @@ from acsard.recording.file import Recording
 from acsard.recording.mcap_records import DAMAGE, MAGIC
 
 MOST_BYTES = 1 << 30
-"""Maximum size of a CSV file or of a recording of acsard, bytes. Both are read into memory."""
+"""Maximum size of a CSV file or a black-box recording, bytes. The file is read into memory."""
 
 MOST_RECORD_BYTES = 1 << 28
-"""Maximum size of a record in a bag, bytes. It is ample: chunks of rosbag2 are below 1 MiB."""
+"""Maximum size of a record in a bag, bytes. This is ample: a chunk of rosbag2 is below 1 MiB."""
 
 BAG_DAMAGE = (*DAMAGE, RuntimeError, KeyError)
 """Exceptions of the MCAP reader and of LZ4 for a damaged bag. `KeyError` means a missing schema."""
 
 OTHER_BAGS = {
     ".db3": (b"SQLite format 3\0", "in SQLite: convert it to MCAP with `ros2 bag convert`"),
-    ".bag": (b"#ROSBAG V", "of ROS 1: convert it to ROS 2 in MCAP with `rosbags-convert`"),
-    ".zstd": (b"\x28\xb5\x2f\xfd", "compressed as a whole file: unpack it with `zstd -d`"),
+    ".bag": (b"#ROSBAG V", "of ROS 1: convert it to a ROS 2 bag in MCAP with `rosbags-convert`"),
+    ".zstd": (b"\x28\xb5\x2f\xfd", "that is compressed as a whole file: unpack it with `zstd -d`"),
 }
-"""Bags that this module cannot read, by file suffix: their first bytes, and words for the error."""
+"""Maps the file suffix of each kind of bag that this module cannot read to the first bytes of such
+a file, and to words for the error message."""
 
 
 def calibrated(log: Path, config: Config, tape: Tape | None, choice: Choice) -> Calibration:
     """Return the calibration from a recorded drive: a file, or the directory of a bag.
 
-    `choice` applies only to a bag. `tape` is a distance that was measured by tape.
+    `choice` names the topics and the axis to use if the drive is a bag. `tape` is a distance that
+    was measured by tape.
 
     Raises:
         LogError: the content of the log is unreadable, incomplete or wrong.
@@ -92,14 +94,14 @@ def _files_of(directory: Path) -> list[Path]:
             if any(path.suffix == suffix for path in directory.iterdir()):
                 raise LogError(_other_bag(what))
         raise LogError(
-            f"it is a directory without an MCAP file: name the directory of a ROS 2 bag, "
+            f"this directory contains no MCAP file: give the directory of a ROS 2 bag with --log, "
             f"or {AS_CSV}"
         )
     return sorted(files, key=lambda path: [int(n) for n in re.findall(r"\d+", path.stem)])
 
 
 def _other_bag(what: str) -> str:
-    return f"it is a ROS bag {what} ({PAGE} has the commands)"
+    return f"this log is a ROS bag {what} ({PAGE} has the commands)"
 
 
 def _is_ours(log: Path) -> bool:
@@ -143,7 +145,10 @@ def _messages(file: Path, notes: list[str]) -> Iterator[RosMessage]:
 
 
 def _measured(log: Path) -> bytes:
-    """Return a black-box recording as a CSV table. Raises `LogError`, also if it has no gyro."""
+    """Return a black-box recording as a CSV table.
+
+    Raises `LogError` if the recording is unreadable or contains no gyro.
+    """
     try:
         recording = Recording(log)
     except RecordingError as error:

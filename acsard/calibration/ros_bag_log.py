@@ -6,8 +6,8 @@ fit, or if a topic should not be used, the user names the topics with `--topic`.
 
 An `Odometry` is usually computed from the wheels, and such a pose cannot calibrate them. An
 `Odometry` is therefore used only if the user names its topic, or if the bag has neither turn rates
-nor other positions. An `Odometry` that the user did not name is refused if it turns exactly as the
-wheels do.
+nor other positions. An `Odometry` that the user did not name is refused if its turns are
+exactly those that follow from the wheels.
 """
 
 from __future__ import annotations
@@ -45,18 +45,20 @@ AXES = ("z", "-z", "x", "-x", "y", "-y")
 """Axes of an IMU that may point up. `-x` means that x points down."""
 
 LEAST_MESSAGES = 20
-"""Minimum number of messages with a value in a topic that is used."""
+"""A topic is used only if at least this many of its messages have a value."""
 
 CLOCKS_APART_S = 1.0
-"""Largest difference between the median delays of two topics from stamp to recording, s. If it is
-larger, their stamps come from different clocks."""
+"""Largest difference between the delays of two topics, s. A topic's delay is the median time from
+the stamp of a message to its recording. If two delays differ by more, the stamps come from
+different clocks."""
 
 STEP_S = 1.0
-"""Length of the intervals in which turns measured by a sensor and the wheels are compared, s."""
+"""Length of the intervals in which a sensor's turns are compared with those of the wheels, s."""
 
 UPRIGHT, LYING = 0.5, 0.8
-"""Limits for the correlation of the turns about an IMU axis with the turns of the wheels. If the
-chosen axis is below `UPRIGHT` and another axis is above `LYING`, the log is refused."""
+"""Limits for the absolute correlation between the robot's turns that an IMU axis measures and those
+that the wheels show. If the correlation is below `UPRIGHT` for the chosen axis and above `LYING`
+for another axis, the IMU lies on its side, and the log is refused."""
 
 OWN = 3e-3
 """Smallest credible RMS difference between the turns of an `Odometry` and of the wheels, divided by
@@ -71,7 +73,7 @@ class RosMessage(NamedTuple):
     type: str
     """ROS name, such as `nav_msgs/msg/Odometry`."""
     encoding: str
-    """ROS 2 uses `cdr`."""
+    """Encoding of `data`; ROS 2 uses `cdr`."""
     wall_ns: int
     """Time of the recording, ns since 1970."""
     data: bytes
@@ -81,7 +83,7 @@ class Choice(Struct, frozen=True):
     """The topics and the axis that the user chose."""
 
     topics: tuple[str, ...] = ()
-    """() means that the tool chooses the topics by their message types."""
+    """Names of the topics to use; () means that the tool chooses them by their message types."""
     axis: str = ""
     """The IMU axis that points up, one of `AXES`; "" means z."""
 
@@ -104,7 +106,7 @@ class _Topic:
 
     def take(self, message: RosMessage, joints: Sequence[str]) -> None:
         if message.encoding != "cdr":
-            self._refuse(f"it is encoded as {message.encoding or 'nothing'}, not as cdr")
+            self._refuse(f"the message is encoded as {message.encoding or 'nothing'}, not as cdr")
             return
         try:
             decoded: Any = decode_cdr(self.kind, message.data)
@@ -178,7 +180,7 @@ _SHORT = {
     "fl": ("fl", "lf"), "fr": ("fr", "rf"), "rl": ("rl", "lr", "bl", "lb"),
     "rr": ("rr", "br", "rb"), "left": ("l",), "right": ("r",),
 }  # fmt: skip
-"""Maps the log column of a wheel or a side to its abbreviations in joint names."""
+"""Maps each log column (of a wheel or of a side) to the abbreviations for it in joint names."""
 
 _COLUMN = {word: column for column, words in _SHORT.items() for word in words}
 
@@ -186,7 +188,7 @@ _NO_WHEEL = ("caster", "castor", "steer")
 
 
 def wheel_of(joint: str) -> str:
-    """Return the column of a log, such as "fl" or "left", for a joint's name; "" if unclear."""
+    """Return the log column, such as "fl" or "left", that a joint's name means; "" if unclear."""
     name = re.sub(r"([a-z])([A-Z])", r"\1_\2", joint).lower()
     if any(word in name for word in _NO_WHEEL):
         return ""
@@ -200,7 +202,7 @@ def wheel_of(joint: str) -> str:
 
 @cache
 def wheel_joints(names: tuple[str, ...], joints: tuple[str, ...]) -> dict[str, list[int]]:
-    """Return the indices of the wheel joints in `names`, by their columns in a log.
+    """Map each log column to the indices in `names` of the wheel joints that fill the column.
 
     The columns are "fr", "fl", "rl" and "rr", or "left" and "right". The result is empty unless
     both sides have a wheel joint. `joints` contains the configured names, in the order of `FOUR`.
@@ -262,7 +264,9 @@ class _Log:
         if places is not None:
             parts.append(self._places(places, times[places.name], sides))
         if self._choice.axis and gyro is None:
-            raise LogError("--yaw-axis is the axis of an IMU, but no IMU is used: leave it out")
+            raise LogError(
+                "--yaw-axis is the axis of an IMU, but the tool uses no IMU: leave this option out"
+            )
         roles = [f"the wheels from {wheels}"]
         roles += [f"the turn rates from {gyro} about its {self._axis} axis"] if gyro else []
         roles += [f"the positions from {places}"] if places else []
@@ -278,7 +282,9 @@ class _Log:
         known = {topic.name: topic for topic in self._topics}
         for name in names:
             if name not in known:
-                raise LogError(f"it has no topic {printable(name)} to use. {self._listed()}")
+                raise LogError(
+                    f"the bag has no topic {printable(name)} that can be used. {self._listed()}"
+                )
         of = {
             kind: [topic for topic in self._topics if topic.kind is kind]
             for kind in TYPES.values()
@@ -304,8 +310,8 @@ class _Log:
                 )
         if gyro is None and places is None:
             raise LogError(
-                f"it has nothing with which to compare the wheels: record {REFERENCES} as well. "
-                f"{self._listed()}"
+                f"the bag has nothing with which to compare the wheels: record {REFERENCES} as "
+                f"well. {self._listed()}"
             )
         return wheels, gyro, places
 
@@ -326,9 +332,13 @@ class _Log:
         if len(candidates) > 1:
             names = ", ".join(map(str, candidates))
             raise LogError(
-                f"several topics can be {what}: {names}; choose one, for example with "
-                f"--topic {printable(candidates[0].name)}"
-                + (" (then also name each other sensor to use)" if what != "the wheels" else "")
+                f"several topics can be the source of {what}: {names}; choose one, for example "
+                f"with --topic {printable(candidates[0].name)}"
+                + (
+                    " (then also give --topic for each other sensor to use)"
+                    if what != "the wheels"
+                    else ""
+                )
             )
         if not candidates and (few := [topic for topic in fit if topic.unreadable]):
             raise LogError(_too_few(few[0]))
@@ -346,16 +356,16 @@ class _Log:
             if topic.unreadable or topic.wheels:
                 return _too_few(topic)
         return (
-            "it has no wheel angles: record a topic of type sensor_msgs/msg/JointState with the "
-            f"wheels' joints. {self._listed()}"
+            "the bag has no wheel angles: record a topic of type sensor_msgs/msg/JointState with "
+            f"the wheels' joints. {self._listed()}"
         )
 
     def _listed(self) -> str:
         shown = [str(topic) for topic in self._topics]
         shown += [f"{printable(name)} ({printable(kind)})" for name, kind in self._others.items()]
         if not shown:
-            return "It has no message at all"
-        return f"Its topics: {', '.join(shown[:20])}{', ...' if len(shown) > 20 else ''}"
+            return "The bag has no messages at all"
+        return f"The bag contains {', '.join(shown[:20])}{', ...' if len(shown) > 20 else ''}"
 
     # Times
 
@@ -412,8 +422,9 @@ class _Log:
         if abs(follow[used]) < UPRIGHT and abs(follow[best]) > LYING:
             up = "-" * bool(follow[best] < 0.0) + "xyz"[best]
             raise LogError(
-                f"the {axis[-1]} axis of {topic} does not follow the turns of the wheels, but its "
-                f"{'xyz'[best]} axis does: the IMU lies on its side. Give --yaw-axis={up}"
+                f"the {axis[-1]} axis of {topic} does not match the robot's turns that the wheels "
+                f"show, but its {'xyz'[best]} axis does: the IMU lies on its side. Give "
+                f"--yaw-axis={up}"
             )
         return {"t": t, "yaw_rate": sign * rates[:, used]}
 
@@ -448,9 +459,10 @@ def speeds_of(t: Floats, angles: Floats) -> tuple[Floats, Floats]:
     """Compute wheel speeds from recorded angles. Return their times, s, and the speeds, rad/s.
 
     Each speed is the mean over one sample period. The integral of the speeds is therefore exactly
-    the angle that the wheel turned, even if the sample times are uneven. No speed is computed
-    across a gap in the samples, or across a jump of an angle (a driver that restarts begins at 0).
-    `angles` has one column for each wheel, rad, and `t` contains their times, s.
+    the angle that the wheel rolled, even if the sample times are uneven. No speed is computed
+    across a gap in the samples, or across a jump of an angle. (After a restart of the motor driver,
+    the angles begin at 0.) `angles` has one column for each wheel, rad, and `t` contains their
+    times, s.
     """
     whole = np.isfinite(angles).all(axis=1)
     times, first = np.unique(t[whole], return_index=True)
@@ -475,7 +487,10 @@ def speeds_of(t: Floats, angles: Floats) -> tuple[Floats, Floats]:
 
 
 def _unwrapped(angles: Floats) -> Floats:
-    """Remove jumps by a whole turn, rad, but none from angles that span more than one turn."""
+    """Return the angles, rad, without jumps by 2 pi.
+
+    Angles that span more than 2 pi are not wrapped, so they are returned unchanged.
+    """
     jumps = np.abs(np.diff(angles)).max(initial=0.0) > np.pi
     within = float(np.ptp(angles)) <= 2 * np.pi + 1e-3 if len(angles) else False
     return np.unwrap(angles) if jumps and within else angles
@@ -503,7 +518,7 @@ def _edges(t: Floats, sides: tuple[Floats, Floats, Floats]) -> Floats:
 
 
 def _follows(t: Floats, rates: Floats, sides: tuple[Floats, Floats, Floats]) -> float:
-    """Return the correlation of turns measured by a sensor and by the wheels; NaN if unknown."""
+    """Return the correlation between a sensor's turns and those of the wheels; NaN if unknown."""
     order = np.argsort(t, kind="stable")
     edges = _edges(t, sides)
     if len(edges) < 4:

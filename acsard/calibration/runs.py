@@ -30,7 +30,7 @@ RESTART_S = 1.0
 """Smallest backward step of the times in a log, s, that may be a restart of the recording."""
 
 FEW_RESTARTS = 100
-"""Largest number of restarts. If the times step back more often, the rows are only unsorted."""
+"""Largest number of restarts. If the times step back more often, the rows are assumed unsorted."""
 
 SLOWEST_S = 0.7
 """Longest period of wheel samples, s. If it is longer, the times are probably not in seconds."""
@@ -46,9 +46,9 @@ ROUNDED_S, REPEATED = 0.2, 4.0
 `ROUNDED_S`, s, and if on average more than `REPEATED` rows share a time."""
 
 ROLLING, AGAIN = 0.2, 0.4
-"""A logger repeats old positions or yaws if more than the fraction `AGAIN` of the rows equal the
-row before. Only rows count in which the absolute speeds of both sides add up to more than `ROLLING`
-rad/s. For example, rows at 20 Hz repeat each position of a 10 Hz source once."""
+"""The wheels roll if the absolute speeds of the left and the right side add up to more than
+`ROLLING` rad/s. If more than the fraction `AGAIN` of the positions (or yaws) of rolling wheels
+equal those of the row before, the logger has repeated old values. Such rows are removed."""
 
 WHEELS = "left right"
 COMMANDS = " ".join(APPLIED)
@@ -59,7 +59,7 @@ Streams = dict[str, tuple[Floats, ...]]
 """The times and the values of each sensor, by the sensor's name in `STREAMS`."""
 
 MOST_RUNS = 1000
-"""Largest number of values in the column `run`. If there are more, it does not name runs."""
+"""Largest number of different values in the column `run`. A column with more does not name runs."""
 
 TOGETHER = 50
 """Number of rows whose speeds are summed before the two wheels of a side are compared."""
@@ -75,20 +75,22 @@ STILL = 0.02
 """Largest speed at which a wheel is considered to stand still, rad/s."""
 
 BLOCKS = 16
-"""Number of blocks into which a log is divided, unless they would be too short or too long."""
+"""Number of blocks into which a log is divided, unless the blocks would be too short or too
+long."""
 
 LONGEST_S = 12.0
-"""Greatest length of a block, s, unless the caller of `blocks` asks for longer blocks."""
+"""Greatest length of a block, s, unless the caller of `blocks()` asks for longer blocks."""
 
 SMOOTH_S = 0.3
 """Time over which a wheel speed is averaged before it is squared, s. Otherwise the speeds of a
 coarse encoder would be 0 in some samples and far too large in others."""
 
 LEAST_TURN = 0.2
-"""Blocks in which the wheels of each side turn by less than this angle, rad, are left out."""
+"""Blocks in which the wheels of each side roll by less than this angle, rad, are left out."""
 
 MOST_JITTER_S = 5.0
-"""Largest variation of the delay from stamp to arrival, s, up to which the stamps are used."""
+"""Largest variation of the delay from stamp to arrival, s. If the delay varies by more, the stamps
+are not used."""
 
 
 class Run(Struct, frozen=True, dict=True):
@@ -98,7 +100,7 @@ class Run(Struct, frozen=True, dict=True):
     start: float
     """Time of the first wheel sample of this drive, s, as the log gives it."""
     t: Floats
-    """Times of the wheel speeds."""
+    """Times of the wheel speeds, s since `start`."""
     left: Floats
     """Mean speed of the left wheels, rad/s."""
     right: Floats
@@ -192,7 +194,8 @@ def runs(table: Table) -> Log:
     columns["left"], columns["right"] = _sides(columns, notes)
     if len(table.names) > MOST_RUNS:
         raise LogError(
-            f"column run has {len(table.names)} different names: it must name drives, not rows"
+            f"column run has {len(table.names)} different names, which is too many: each name must "
+            "stand for a drive, not for a row"
         )
     timed = np.isfinite(t)
     notes.add(f"{{}} of {len(t)} rows have no time and are left out", int((~timed).sum()))
@@ -200,11 +203,15 @@ def runs(table: Table) -> Log:
     for number, name in enumerate(table.names):
         rows = np.flatnonzero(timed & (table.runs == number))
         parts = _restarts(t, rows, columns)
-        notes.add("each jump back of the time begins a new run: {} of them", len(parts) - 1)
+        notes.add(
+            "a new run begins wherever the time in the log jumps back; number of jumps: {}",
+            len(parts) - 1,
+        )
         _in_seconds(name, t, parts, columns)
         whole, parts = len(parts), [piece for part in parts for piece in _pauses(t, part, columns)]
         notes.add(
-            f"each pause of over {PAUSE_S:g} s in the wheel speeds begins a new run: {{}} of them",
+            f"a new run begins after each gap of over {PAUSE_S:g} s in the wheel speeds; number "
+            "of gaps: {}",
             len(parts) - whole,
         )
         for at, part in enumerate(parts):
@@ -245,7 +252,7 @@ def _sides(columns: dict[str, Floats], notes: Notes) -> tuple[Floats, Floats]:
 def _apart(columns: dict[str, Floats], front: str, rear: str) -> float:
     """Return the difference between two wheels of a side, as a fraction of the rolled distance.
 
-    Both roll over the same floor, so a difference above `APART` raises `LogError`.
+    Both wheels roll over the same floor, so a difference above `APART` raises `LogError`.
     """
     seen = np.isfinite(columns[front]) & np.isfinite(columns[rear])
     starts = np.arange(0, int(seen.sum()), TOGETHER)
@@ -303,9 +310,9 @@ def _in_seconds(name: str, t: Floats, parts: list[Rows], columns: dict[str, Floa
             )
         if period > SLOWEST_S:
             raise LogError(
-                f"run {name or 1}: {period:g} s between two rows of wheel speeds: t must be in "
-                "seconds (divide ms by 1000, ns by 1e9), and the wheel speeds must be recorded at "
-                "5 Hz or more"
+                f"run {name or 1}: {period:g} s pass between two rows of wheel speeds: t must be "
+                "in seconds (divide ms by 1000, ns by 1e9), and the wheel speeds must be recorded "
+                "at 5 Hz or more"
             )
 
 
@@ -368,7 +375,7 @@ def _remove_repeats(drives: Iterable[tuple[str, Streams]], notes: Notes) -> None
 
 
 def _repeats(streams: Streams, what: str) -> tuple[Mask, Mask]:
-    """Return two masks of rows: the value repeats the one before, and the wheels turn."""
+    """Return a mask of the values that repeat the one before, and a mask of rolling wheels."""
     t, *values = streams[what]
     if not len(t):
         return np.zeros(0, dtype=bool), np.zeros(0, dtype=bool)
@@ -393,7 +400,7 @@ def _stream(
 
 
 def _ordered(stream: list[Floats], what: str, notes: Notes) -> Iterator[Floats]:
-    """Yield the columns sorted by time, the first column. Of equal times, keep the first row."""
+    """Yield the columns, sorted by time (the first column). Of equal times, keep the first row."""
     t = stream[0]
     notes.add(f"{{}} rows of {what} are out of order and were sorted", int((np.diff(t) < 0).sum()))
     order = np.argsort(t, kind="stable")

@@ -1,4 +1,4 @@
-"""Computes the calibration from a log. If the log gives none, an error says why and what to do."""
+"""Computes the calibration from a log. If that is impossible, an error says why and what to do."""
 
 from __future__ import annotations
 
@@ -52,9 +52,10 @@ ENOUGH_BLOCKS = 8
 """Minimum number of blocks for a block length, if a shorter length has already given a fit. With
 six blocks, the standard deviation of the ratio of the radii was up to three times too small."""
 
+# For comparison: motion capture on a good floor differs by less than 1e-3.
 PERFECT = 1e-4
-"""Smallest credible difference between a sensor and the wheels, as a fraction of the motion. For
-comparison: motion capture on a good floor differs by less than 1e-3."""
+"""Smallest credible difference between a sensor and the wheels, as a fraction of the motion. A
+sensor with a smaller difference was probably computed from the wheels."""
 
 
 class Drives(Struct, frozen=True):
@@ -62,9 +63,10 @@ class Drives(Struct, frozen=True):
     seconds: float
     metres: float
     turns: float
-    """Sum of all left and right turns, measured by the calibrated wheels, in turns of 360 deg."""
+    """Sum of all left and right turns of the robot according to the calibrated wheels, in units of
+    360 deg."""
     fastest: float
-    """Turn rate, rad/s. The robot turned 95 % of its total angle more slowly than this."""
+    """Turn rate, rad/s, below which the robot made 95 % of its turns, weighted by angle."""
 
     @classmethod
     def of(
@@ -151,11 +153,12 @@ class Prepared(Struct, frozen=True):
     base: Base
     parts: list[Block]
     rows: Rows
-    """Motion in intervals of about 1 s. The gyro's bias remains if the robot never rested."""
+    """Motion in intervals of about 1 s. The gyro's bias has been subtracted from it, unless the
+    bias is unknown because the robot never rested."""
     segments: list[Segment]
     """The measured positions; empty if the log has none."""
     steps: list[WheelSteps]
-    """The wheel steps of each run; empty if the log has no positions."""
+    """The motion of the wheels in each run; empty if the log has no positions."""
     sources: list[Source]
     """One function for each sensor, which returns the sensor's evidence for given parameters."""
     start: Floats
@@ -289,7 +292,10 @@ def _known(best: Candidate, odometry: OdometryConfig) -> Deviations:
 def _noise(
     best: Candidate, known: Deviations, odometry: OdometryConfig, *, present: bool
 ) -> Noise | None:
-    """Return the noise that the log shows, or None. If `present`, use the configured geometry."""
+    """Return the noise of the odometry in this log, or None if the log does not show it.
+
+    If `present`, compute the odometry with the configured geometry.
+    """
     made, fitted = best.made, best.fitted
     held = folds(fitted, made.parts, drives(made.runs), best.rate)
     if present:
@@ -345,7 +351,7 @@ def _candidates(made: Prepared) -> list[Candidate]:
 
 
 def _held(base: Base) -> dict[str, list[Held]]:
-    """Return the constraints by the quantity that stays as configured; "" is for a free fit."""
+    """Map each quantity that can stay as configured to its constraints; "" means a free fit."""
     ratio, track, growth = np.zeros((3, COUNT))
     ratio[[P.LEFT, P.RIGHT]] = base.right, -base.left
     track[P.INVERSE_TRACK] = growth[P.TRACK_GROWTH] = 1.0
@@ -393,7 +399,7 @@ def _calibration(
         names = [run.name for run in log.runs]
         result, name = scaled(result, tape, names, follow, known=measured)
         scale.append("distance")
-        notes.append(f"the distance of {tape.metres:g} m is used for run {name}")
+        notes.append(f"the distance of {tape.metres:g} m, measured by tape, is that of run {name}")
     plausibility.in_range(result.values)
     known = _known(best, odometry)
     if tape is not None:
@@ -421,20 +427,20 @@ def _calibration(
 
 
 def _stays(name: str, deviation: float) -> str:
-    known = f" (it is known to {deviation:.1%} by this log)" if deviation < 1.0 else ""
+    known = f" (this log determines it to {deviation:.1%})" if deviation < 1.0 else ""
     return f"{name} stays as configured, because this log does not improve it{known}"
 
 
 def _of_noise(shown: Noise | None) -> Iterator[str]:
     if shown is None or not shown.better:
         yield (
-            "the variances per metre and per radian stay as configured, because the errors of "
-            "another drive may differ from those of this log"
+            "the odometry's variances per metre and per radian stay as configured, because the "
+            "errors of another drive may differ from those of this log"
         )
     elif not shown.places:
         yield (
-            "the random errors of the distance stay as configured, because only positions show "
-            "them, and a gyro does not"
+            "the settings for random errors of the distance stay as configured, because only "
+            "positions show these errors, and a gyro does not"
         )
 
 

@@ -7,9 +7,10 @@ The daemon expects the speed y of a healthy wheel to follow the command u with t
 
 If a wheel contradicts this for `feedback.fault_time`, the daemon reports a fault.
 
-This module tries several response times, and takes the one that fits best. It also runs the
-daemon's own fault detection, `core/motion/wheel_witness.py`, on the log with the configured
-response time, and measures for how long the healthy wheels of the log look faulty.
+This module tries several response times, and takes the one that fits best. It assumes that the
+wheels of the log are healthy. With the configured response time, it runs the daemon's own fault
+detection, `core/motion/wheel_witness.py`, on the log. It measures for how long a wheel nevertheless
+looks faulty.
 """
 
 from __future__ import annotations
@@ -54,12 +55,13 @@ class WheelResponse(Struct, frozen=True):
     seconds: float
     """Response time that fits best, s."""
     proposed: float | None
-    """Response time to configure if `false_fault` is true, s. It causes no fault in this log. None
-    if no tried time from `seconds` on satisfies `SPARE`."""
+    """Response time to configure if `false_fault` is true, s. It is the smallest of the times
+    `TRIED`, beginning with `seconds`, that satisfies `SPARE`. None if there is no such time."""
     present: float
     """Configured response time, s."""
     false_fault: bool
-    """Whether healthy wheels look faulty with the configured response time."""
+    """Whether the daemon would report a fault in this log with the configured response time,
+    although the wheels are assumed to be healthy."""
     fastest: float
     """Highest speed that the wheels reach, rad/s, or infinity if the log shows no such limit."""
 
@@ -74,13 +76,13 @@ class WheelResponse(Struct, frozen=True):
         follow = f"the wheels follow their commands with a response time of {self.seconds:.2g} s"
         if self.false_fault:
             then = (
-                f", but with feedback.response_time = {self.present:g} the daemon would take them "
-                "for faulty: "
+                f", but with feedback.response_time = {self.present:g} the daemon would take the "
+                "wheels for faulty: "
             )
             if self.proposed is not None:
-                then += f"the new value is {self.proposed:g}"
+                then += f"the new feedback.response_time is {self.proposed:g}"
             elif np.isfinite(self.fastest):
-                then += "first lower limits.wheel_speed as below"
+                then += "first lower limits.wheel_speed as the next note says"
             else:
                 then += (
                     "no longer response time leaves enough reserve; if the wheels are healthy, "
@@ -89,12 +91,12 @@ class WheelResponse(Struct, frozen=True):
         elif max(self.seconds / self.present, self.present / self.seconds) > SAME:
             then = f". feedback.response_time is {self.present:g}, and causes no fault in this log"
         else:
-            then = f", as feedback.response_time = {self.present:g} says"
+            then = f", which agrees with the configured feedback.response_time = {self.present:g} s"
         found = [follow + then]
         if np.isfinite(self.fastest):
             found.append(
-                f"the wheels reach {self.fastest:.3g} rad/s, and commands were higher: write "
-                f"limits.wheel_speed = {self.fastest:.3g}"
+                f"the wheels reach only {self.fastest:.3g} rad/s although commands were higher: "
+                f"write limits.wheel_speed = {self.fastest:.3g}"
             )
         return found
 

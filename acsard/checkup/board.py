@@ -63,14 +63,14 @@ class Operator(Protocol):
     """Interface through which the check asks and informs the operator, a person at the robot."""
 
     def doing(self, text: str) -> None:
-        """Show what the check does now, until the next call."""
+        """Show `text`, which says what the check does now. It stays until the next call."""
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
         """Return one of the answers, or None if no person watches the robot."""
 
 
 LEAST_S = 0.001
-"""Shortest remaining time for which `drive` still sends a line, s."""
+"""Time, s. `Board.drive` sends no further line if less than this is left of its duration."""
 
 BEAT_NS = int(motion.PERIOD_S * NS_PER_S)
 """Interval at which the lateness of this computer is measured while listening, ns."""
@@ -97,15 +97,17 @@ class Board:
         self.longest_reply_s = longest_reply
         """Largest permitted value of mcu.reply_period, s."""
         self.armed = False
-        """Whether all motors have stood still once. Then a runaway motor ends the check."""
+        """Whether all motors have stood still once. From then on, a runaway motor ends the
+        check."""
         # Results of the steps
         self.baud_rate: int = mcu.baud_rate
         self.comma = mcu.trailing_comma
-        """Whether lines end with a comma."""
+        """Whether the lines to the board end with a comma."""
         self.latched = False
-        """Whether zeros stop motor d only with the line ending that `comma` selects."""
+        """Whether zeros stop motor d only if the line ends as `comma` says."""
         self.sealed = self.sampled = False
-        """`sealed`: lines have a checksum. `sampled`: they request the board's clock and counts."""
+        """`sealed`: each line has a checksum. `sampled`: each line to the board also requests the
+        board's clock and encoder counts."""
         self.identity: dict[str, str] = {}
         self.own_clock = False
         """Whether the board sends reports by its own clock, and not in reply to lines."""
@@ -118,7 +120,7 @@ class Board:
         # Received lines
         self.replies: list[Reply] = []
         self.others: list[bytes] = []
-        """Lines that are not good replies."""
+        """Received lines that are not valid replies."""
         self.inputs: dict[int, bool] = {}
         """Whether each input was pressed in the last status line that reported it. Input 0 is the
         emergency stop, and inputs from 1 on are the bumpers."""
@@ -191,7 +193,7 @@ class Board:
 
     @property
     def known(self) -> dict[str, object]:
-        """The values of the attributes in `KNOWN`. A repeated step starts from them."""
+        """Values of the attributes in `KNOWN`, from which a repetition of a step starts."""
         return {name: getattr(self, name) for name in KNOWN}
 
     @known.setter
@@ -224,7 +226,7 @@ class Board:
         return seal(line, self._sequence, ASK_SAMPLE if self.sampled else b"")
 
     def send(self, motors: Motors, comma: bool | None = None) -> None:
-        """Send one line that commands these speeds, rad/s. The parameters are those of `line`."""
+        """Send one line that commands these speeds, rad/s. The parameters are those of `line()`."""
         turned, self._commanded = any(self._commanded), motors
         self.wire.send(self.line(motors, comma))
         self.sent_lines += 1
@@ -251,17 +253,17 @@ class Board:
         return True
 
     def ask(self, wait_s: float = 0.0, comma: bool | None = None) -> None:
-        """Send one line of zeros, then listen for `wait_s` s, but at least for one period."""
+        """Send one line of zeros, then listen for `wait_s` s, but at least for `period_s`."""
         self.send(ZERO, comma)
         self.listen(max(wait_s, self.period_s))
 
     def answers(
         self, lines: int, wait_s: float, comma: bool | None = None
     ) -> list[tuple[float, Reply]]:
-        """Send zeros `lines` times, and return the first reply to each line with its delay, s.
+        """Send zeros `lines` times. Return the delay, s, and the first reply for each line.
 
-        Wait `wait_s` s for each reply, but at least 1.5 periods. A line without a reply has no
-        entry in the result.
+        Wait `wait_s` s for each reply, but at least 1.5 times `period_s`. A line without a reply
+        has no entry in the result.
         """
         # Replies to earlier lines must not be taken for replies to these lines.
         self.listen(max(motion.GLANCE_S / 4, wait_s))
@@ -368,7 +370,7 @@ class Board:
 
     @property
     def silent_s(self) -> float:
-        """Time since the last reply, s; 0 before the first reply, and always 0 if `fled`."""
+        """Time since the last reply, s; 0 before the first reply, and 0 if `fled` is true."""
         return self.now_s - self.replies[-1].at_s if self.replies and not self.fled else 0.0
 
     def _guard(self) -> None:
@@ -416,8 +418,8 @@ class Board:
     def settles(self, comma: bool) -> bool:
         """Send zeros until at least two replies show that every motor stands.
 
-        Returns False if this takes longer than `MOTOR_S`, or longer than `PATIENCE_S` while a motor
-        still slows down.
+        `comma` says whether the lines end with a comma. Returns False if this takes longer than
+        `MOTOR_S`, or longer than `PATIENCE_S` while a motor still slows down.
         """
         began_s = self.now_s
         while True:

@@ -32,7 +32,7 @@ def answered(findings: Iterable[Finding]) -> bool:
 def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Changes:
     """Return the suggested changes of the configuration.
 
-    They include `mcu.port` with the value `port`, unless that is "" or no board answered there.
+    They include `mcu.port` with the value `port`, unless `port` is "" or no board answered there.
     """
     wanted: Changes = {"mcu.port": port} if port and answered(findings) else {}
     for finding in findings:
@@ -62,8 +62,8 @@ def withheld(simulated: bool, config: Config) -> str:
     if not simulated or config.mcu.simulated:
         return ""
     return (
-        f"the tool checked the simulator, but mcu.port here is {config.mcu.port}: the results "
-        "do not apply to that robot"
+        f"the tool checked the simulator, but the configured mcu.port is {config.mcu.port}: the "
+        "results do not apply to the robot on that port"
     )
 
 
@@ -83,8 +83,8 @@ class Report(Struct, frozen=True):
     """The result of a check.
 
     `changes` are the suggested configuration values, and `toml` contains them as lines of TOML.
-    `written` is the file that now contains the changes. `error` is a failure of another part than
-    the board.
+    `written` is the file that now contains the changes. `error` is a failure outside the board,
+    such as a port that cannot be opened or a file that could not be written.
     """
 
     port: str
@@ -95,7 +95,8 @@ class Report(Struct, frozen=True):
     written: str | None = None
     error: str | None = None
     withheld: str | None = None
-    """Why no finding applies to the configuration file, or None."""
+    """Reason why the findings do not apply to the robot of the configuration file; None if they
+    do."""
 
 
 def report(
@@ -124,7 +125,7 @@ def summary(found: Report, where: str) -> str:
     verdicts = [finding.verdict for finding in found.findings]
     counts = ", ".join(f"{verdicts.count(v)} {v}" for v in get_args(Verdict) if v in verdicts)
     if late := lateness.unjudged(found.findings):
-        again = "so the check has not passed: try again when this computer is idle"
+        again = "so the check has not passed: repeat it when this computer is idle"
         counts += f"\n{len(late)} not judged, {again}"
     if found.withheld:
         return f"\n{counts}\nnothing to write into {where}: {found.withheld}"

@@ -50,7 +50,7 @@ def broken_lines(comma: bool, sealed: bool, motors: Sequence[int]) -> list[tuple
 
 
 def finding(board: Board, motors: Sequence[int]) -> Finding:
-    """Send every kind of damaged line while `motors` stand, and report the kinds that moved one."""
+    """Send damaged lines while `motors` stand. Report the kinds of damage that moved a motor."""
     if not motors:
         return outcomes.find("damaged lines: untested")
     lines = broken_lines(board.comma, board.sealed, motors)

@@ -73,9 +73,10 @@ def identity(board: Board) -> Finding:
 
 
 def form(board: Board) -> Finding | None:
-    """Return a finding if the board answers only the ending that is not configured, else None.
+    """Find out whether the board answers only lines with the ending that is not configured.
 
-    The endings are with a comma and without one. Later lines have the ending that works.
+    Lines end with a comma or without one. If only the other ending works, return a finding and use
+    that ending for later lines. Otherwise return None.
     """
     if board.own_clock or _answers(board, board.comma) or not _answers(board, not board.comma):
         return None

@@ -20,8 +20,8 @@ ALIKE = 0.75
 because with a coarse encoder the measurement of a single motor is rough."""
 
 COARSE = 0.015
-"""Smallest mean jump of a motor's angle from reply to reply, rad, that shows a coarse encoder. The
-daemon must know the counts per turn of such an encoder."""
+"""If a motor's angle jumps by at least this much on average from reply to reply, rad, its encoder
+is coarse. The daemon must know the counts per turn of such an encoder."""
 
 LONGEST_S = 0.05
 """Longest time between replies, s, for which jumps of the speed can show a coarse encoder. With a
@@ -78,8 +78,8 @@ def coarse(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
 def finding(board: Board, motors: Sequence[int]) -> Finding:
     """Return the finding about `mcu.encoder_counts`, the configured counts per wheel turn.
 
-    It is compared with the value in the board's identification, if there is one, and with a
-    measurement by `motors`, which turned as commanded.
+    The configured value is compared with the value in the board's identification, if there is one,
+    and with the value measured from the replies. `motors` are the motors that turned as commanded.
     """
     if not board.sampled:
         about = coarse(board.replies, motors)
@@ -104,17 +104,20 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
         shown = ", ".join(f"{LETTERS[motor]} {counts:.0f}" for motor, counts in each.items())
         return outcomes.find("encoder counts: unequal", unused, shown=shown)
     if measured is None:
-        counts, how = named, "stated by the firmware; not measured"
+        counts, how = named, "the firmware states this number; the check could not measure it"
     elif not named:
         near = abs(measured - configured) <= AGREES * configured
         if board.lost and not near:
             return outcomes.find("encoder counts: damaged", share=board.lost)
         counts = configured if near else round(measured)
-        how = f"measured against the speeds: {measured:.0f}, which agrees within {AGREES:.0%}"
+        how = (
+            f"counts and speeds in the replies give {measured:.0f} per turn; the check tolerates a "
+            f"difference of {AGREES:.0%}"
+        )
     elif abs(measured - named) > AGREES * named:
         return outcomes.find("encoder counts: misnamed", named=named, measured=measured)
     else:
-        counts, how = named, f"stated by the firmware; measured {measured:.0f}"
+        counts, how = named, f"the firmware states this number; the check measured {measured:.0f}"
     if counts > MOST_COUNTS:
         return outcomes.find("encoder counts: many", unused, counts=counts, most=MOST_COUNTS)
     right, off = configured in (0, counts), abs(configured / counts - 1)

@@ -1,4 +1,4 @@
-"""Results of `acsard mcu check`: one `Finding` per subject, and the errors that end it early."""
+"""Results of `acsard mcu check`: one `Finding` per subject, and errors that end the check early."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ REST = "the rest"
 class Finding(Struct, frozen=True):
     """The result for one subject. Its texts come from `outcomes.py`.
 
-    `figure` is the measurement, and `text` its meaning. `mend` is the remedy unless the subject
-    passed. `keys` contains the suggested configuration values by dotted key, including values that
-    are configured already.
+    `figure` is the measurement, and `text` its meaning. `mend` is the remedy, or "" if there
+    is none. `keys` contains the suggested configuration values by dotted key. Some of them may be
+    configured already.
     """
 
     name: str
@@ -54,7 +54,7 @@ def wheel_of(mcu: McuConfig, motor: int) -> tuple[str, int]:
         entry = getattr(mcu.wheels, wheel)
         if entry[1] == LETTERS[motor]:
             return wheel, -1 if entry[0] == "-" else 1
-    raise ValueError(f"no wheel has motor {LETTERS[motor]}")
+    raise ValueError(f"the configuration has no wheel with motor {LETTERS[motor]}")
 
 
 def words(wheel: str) -> str:

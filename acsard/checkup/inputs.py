@@ -51,7 +51,7 @@ def finding(board: Board, operator: Operator, safety: SafetyConfig) -> Finding:
         fields = [*["estop=ok"] * estop, *["bumpers=" + "." * len(places)] * bool(places)]
         return outcomes.find("inputs: missing", listed=listed, fields=" ".join(fields))
     question = (
-        f"The inputs of the board: {listed}. You will press and release each of them once. Type "
+        f"The board has these inputs: {listed}. You will press and release each of them once. Type "
         '"ready" when you stand at the robot, or "skip":'
     )
     if operator.ask(question, ("ready", "skip")) != "ready":

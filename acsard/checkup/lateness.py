@@ -47,7 +47,7 @@ class Lateness:
 def spoilt(found: Unsure, late_s: float) -> bool:
     """Return whether the finding may be wrong because this computer was late by up to `late_s` s.
 
-    A delay of half the finding's margin is enough, because the computer may have been late both at
+    A delay of half of `found.margin_s` is enough, because the computer may have been late both at
     the start and at the end of the measurement.
     """
     least_s = PAUSE_S if found.verdict == "PASS" else SPOILS_S

@@ -29,8 +29,8 @@ FEW = 2
 """Smallest number of lost lines that counts as a fault. Fewer may be a coincidence."""
 
 LINES, LEAST_S, MOST_S = 300, 3.0, 10.0
-"""The count of lost lines takes `LEAST_S` s. If a line is lost, it goes on until it has `LINES`
-lines, enough to show a loss of 2 %, or until `MOST_S` s have passed."""
+"""The count of lost lines takes `LEAST_S` s. If a line is lost, the count goes on until it has
+`LINES` lines, enough to show a loss of 2 %, or until `MOST_S` s have passed."""
 
 SILENT = 2.0
 """A gap between two replies is a silence only if it is this many times as long as the mean gap."""
@@ -114,8 +114,8 @@ def _gaps(replies: Sequence[Reply]) -> list[float]:
 def _left_out(replies: Sequence[Reply]) -> int:
     """Return the number of missing replies of a board that sends them at regular intervals.
 
-    It follows from the time between the first and the last reply. Single gaps would not show it,
-    because a reply that is received late makes one gap longer and the next one shorter.
+    The number follows from the time between the first and the last reply. Single gaps would not
+    show it, because a reply that is received late makes one gap longer and the next one shorter.
     """
     gaps = _gaps(replies)
     usual = median(gaps) if gaps else 0.0
@@ -131,8 +131,8 @@ def _silence_s(board: Board, replies: Sequence[Reply]) -> float:
 
 
 PULSE_S = 0.08
-"""Time from a pulse, a single line that turns the motors, to the zeros after it, s. The encoders
-show the movement, but the board's watchdog does not act yet."""
+"""Time from a pulse (a single line that turns the motors) to the zeros that follow, s. It is long
+enough for the encoders to show the movement, and too short for the board's watchdog to act."""
 
 TOLD, PULSES_S = 8, 20.0
 """The search for the direction of a loss ends after `TOLD` unanswered pulses, or `PULSES_S` s."""
@@ -142,14 +142,19 @@ SPREAD, STRIDE = 12, 5
 With equal pauses, losses at regular intervals could miss every pulse."""
 
 OBEYED = 0.5
-"""The motors obeyed a pulse if they turned by at least this fraction of the usual angle."""
+"""The motors obeyed a pulse if they turned by at least this fraction of the median angle of all
+pulses."""
 
 SEEN, GRAINS = 0.02, 4
 """Pulses can be judged if they usually turn a motor by `SEEN` rad and `GRAINS` encoder steps."""
 
 
 class Ways(Struct, frozen=True):
-    """Numbers of pulses: all, lost on the way to the board, and obeyed with a lost reply."""
+    """Numbers of pulses (see `pulsed`).
+
+    `sent` counts the pulses that could be judged. `there` counts the pulses that were lost on the
+    way to the board. `back` counts the pulses that the motors obeyed, but whose reply was lost.
+    """
 
     sent: int
     there: int
@@ -160,7 +165,7 @@ def direction(board: Board, operator: Operator, motors: Sequence[int]) -> Findin
     """Find out whether lines are lost on the way to the board, or replies on the way back.
 
     `motors` turn as commanded, so their encoders show which lines arrived. Returns None if the
-    board replies to lines and few of them are lost.
+    board replies to lines and few lines are lost.
     """
     if not (board.own_clock or board.lost > MOST):
         return None

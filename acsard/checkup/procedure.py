@@ -46,13 +46,13 @@ STEPS = (
 """Names of all steps. After an early end of the check, one finding lists those that did not run."""
 
 SILENT: tuple[tuple[str, Callable[[Board], Finding | None]], ...] = (
-    ("listening for 3 s at the configured baud rate, then at the others", dialect.baud),
+    ("listening for 3 s at the configured baud rate, then at other baud rates", dialect.baud),
     ("asking the board for its name", dialect.identity),
     ("measuring how often the board answers", dialect.rate),
     ("measuring how fast the board answers", dialect.trip),
-    ("trying the comma at the end of the line", dialect.form),
-    ("checking the form of the replies", dialect.replies),
-    ("asking the board for the link check", dialect.check),
+    ("testing whether lines to the board need a comma at their end", dialect.form),
+    ("checking the format of the replies", dialect.replies),
+    ("asking whether the board supports the link check", dialect.check),
     ("counting lost lines for 3 s or more", line_loss.finding),
 )
 """The steps that send only zeros and questions, in order, each with a message for the operator."""
@@ -79,7 +79,10 @@ def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
     unjudged: set[str] = set()
 
     def once(finding: Finding | None) -> None:
-        """Report the first finding of each name, and the first judged one if that is another."""
+        """Report a finding unless one of that name has been reported already.
+
+        A judged finding is also reported after one that was not judged.
+        """
         if finding is None:
             return
         judged = lateness.judged(finding)
@@ -140,11 +143,9 @@ class _Steps:
         right = [channel.motor for channel in channels if channel.kind in ("right", "off")]
         self._measure("", lambda: line_loss.direction(board, operator, right))
         self._take("", lambda: encoder_counts.finding(board, right))
-        together = (
-            "the motors turn together, then this computer sends nothing; this step may repeat"
-        )
+        together = "all motors turn, then this computer sends nothing; this step may repeat"
         self._measure(together, lambda: watchdog.finding(board, right))
-        broken = "sending broken lines; no motor may turn"
+        broken = "sending damaged lines; a motor that turns now is a fault"
         self._measure(broken, lambda: damage.finding(board, right))
         self._take("", lambda: inputs.finding(board, operator, safety))
 
@@ -178,7 +179,9 @@ class _Steps:
         for _ in range(1 + min(LATE_AGAIN, self._late_left)):
             if late_s:
                 self._late_left -= 1
-                self._operator.doing("this computer was late; this part of the check runs again")
+                self._operator.doing(
+                    "this computer was too slow; this part of the check runs again"
+                )
                 board.known = known
                 if board.armed:
                     board.rest()
@@ -206,7 +209,7 @@ class _Steps:
         return found
 
     def _take(self, doing: str, step: Step) -> None:
-        """Run a step and report its finding. Repeat it if the board restarts."""
+        """Run a step and report its finding. Repeat the step if the board restarts."""
         board, again = self._board, 0
         known = board.known
         while True:

@@ -73,7 +73,7 @@ class Restarts:
 
     def __init__(self) -> None:
         self.watched = True
-        """Whether `look` reports restarts."""
+        """Whether `look()` reports restarts."""
         self._asked_s = self._turned_s = float("-inf")
         self._turned: Motors = ZERO
         """The last commanded speeds that were not all zero, rad/s."""
@@ -138,7 +138,7 @@ class Restarts:
         most_ms = 1000 * (reply.at_s - before[1] + AHEAD_S)
         # After half a minute without a reply, the clock may have started again at 0 by itself.
         if most_ms < CLOCK / 2 and (reading.mcu_ms - before[0]) % CLOCK > most_ms:
-            return "the clock and the counts of the board restarted"
+            return "the board's clock and encoder counts started again from 0"
         return ""
 
 

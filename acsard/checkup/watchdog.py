@@ -50,11 +50,12 @@ class Run(Struct, frozen=True):
     ran_s: float
     """Largest distance that a motor ran on until it stood, as a time at full speed, s."""
     slow_s: float
-    """Time from the beginning of the stop until all motors were slower than `STOPPED`, s."""
+    """Time until all motors were slower than `STOPPED`, s. It begins with the last line that turned
+    the motors, or with the zeros in an ordinary stop."""
     first: float
-    """Speed in the first reply after the silence, as a fraction of full speed. It is the mean over
-    the silence if the firmware computes it from line to line, or the momentary speed if the
-    firmware measures by its own clock."""
+    """Speed in the first reply after the silence, as a fraction of full speed. Firmware that
+    computes speeds from line to line reports the mean over the silence. Firmware that measures by
+    its own clock reports the momentary speed."""
     second: float
     """Speed in the second reply after the silence, as a fraction of full speed. A quick motor has
     obeyed the first line of zeros by then."""
@@ -63,7 +64,7 @@ class Run(Struct, frozen=True):
 
 
 def finding(board: Board, motors: Sequence[int]) -> Finding:
-    """Measure the time after which the watchdog stops `motors`, and leave them standing."""
+    """Measure the time after which the watchdog stops `motors`. Then bring them to rest."""
     if not motors:
         return outcomes.find("watchdog: untested")
     stop = run(board, motors, 0.0)

@@ -84,7 +84,8 @@ class Channel(Struct, frozen=True):
 
     @property
     def error(self) -> float:
-        """Relative error of the speed of the motor's own encoder, in the worse direction."""
+        """Relative error of the speed of the motor's own encoder, forward or backward, whichever is
+        larger."""
         own = self.motor
         return max(abs(self.forth[own] / SPEED - 1), abs(self.back[own] / SPEED + 1))
 
@@ -104,7 +105,7 @@ def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
         shown=", ".join(f"encoder {LETTERS[m]} {channel.forth[m]:+.2f}" for m in moved),
         here=LETTERS[motor],
         there=LETTERS[there],
-        reversed=", and one of them is reversed" if channel.forth[there] < 0 else "",
+        reversed=", and one motor or encoder is reversed" if channel.forth[there] < 0 else "",
         wheel=words(wheel_of(mcu, motor)[0]),
         error=channel.error,
         which="slower" if forth - back < 2 * SPEED else "faster",
@@ -181,8 +182,8 @@ def one(motor: int, speed: float) -> Motors:
 def turn(board: Board, motor: int, speed: float) -> tuple[Motors, float]:
     """Bring a motor to `speed`, rad/s, and measure the speeds of all encoders.
 
-    Returns these speeds, rad/s, and the relative error of the motor's speed that whole encoder
-    counts may cause.
+    Returns these speeds, rad/s, and the possible relative error of the motor's measured speed. The
+    error can arise because an encoder counts only whole steps.
     """
     means = run_up(board, one(motor, speed))
     unsure = _unsure(board, motor, 2 * _look_s(board))
@@ -269,8 +270,8 @@ def _both_ways(board: Board, motor: int) -> Channel:
 def probe(board: Board, motor: int) -> Motors | None:
     """Turn a motor slowly and briefly, to see whether its own encoder follows.
 
-    Returns None if the encoder follows; the motor may then still turn. Otherwise returns the speeds
-    that the encoders showed, rad/s, and the motor stands.
+    If the encoder follows, returns None, possibly while the motor still turns. Otherwise stops the
+    motor and returns the speeds that the encoders showed, rad/s.
 
     The firmware may drive a motor without a working encoder to full speed, but the probe is too
     short for that. If the encoder does not follow, the probe is repeated, because a coarse encoder
@@ -337,8 +338,9 @@ def seen(board: Board, operator: Operator, channel: Channel) -> Channel:
     The wheels stand during the question. If no person watches, the channel is unchanged.
     """
     question = (
-        f"which wheel did motor {LETTERS[channel.motor]} turn? front right, front left, "
-        "rear left, rear right, none; or show it again"
+        f"which wheel did motor {LETTERS[channel.motor]} turn: front right (fr), "
+        "front left (fl), rear left (rl), rear right (rr) or none? (again: turn the motor once "
+        "more)"
     )
     while (which := operator.ask(question, (*ANSWERS, "again"))) == "again":
         _both_ways(board, channel.motor)

@@ -28,34 +28,35 @@ from acsard.host.version import version
 VERBS = {
     "run": "run the daemon (the default)",
     "sim": "simulate a microcontroller on a pty, for a separate `acsard run --port …`",
-    "check": "check the configuration and print the effective one",
-    "topics": "list the keys on the bus: direction, type, rate, meaning",
-    "echo": "print the messages on a key as JSON lines",
-    "get": "query a key once and print the answer as JSON",
-    "hz": "measure the message rate of a key",
+    "check": "check the configuration and print it with all defaults",
+    "topics": "list the robot's Zenoh keys: direction, type, rate, meaning",
+    "echo": "print the messages on a Zenoh key as JSON lines",
+    "get": "query a Zenoh key once and print the answer as JSON",
+    "hz": "measure the message rate of a Zenoh key",
     "top": "show the robot's status on one screen, live",
     "fleet": "show one live line per robot",
     "foxglove": "show the robot live in Foxglove or Lichtblick",
     "drive": "drive the robot with the keyboard",
     "web": "serve the robot's page: see, stop and drive the robot in a browser",
-    "call": "call a service, such as stop or clear",
+    "call": "call a service of the robot, such as stop or clear",
     "whoami": "show your role on this robot, your certificate and your sender id",
     "set": "change a setting of the running robot, or list the changeable settings",
     "bench": "measure how fast the daemon is on this machine",
-    "doctor": "find the problems on this machine and their fixes",
+    "doctor": "find problems on this machine and say how to fix them",
     "ports": "list the serial ports, the processes that use them, and the likely MCU",
     "mcu": "test the microcontroller on your own robot with its wheels lifted",
-    "accuracy": "show the causes of odometry error now, and their fixes",
+    "accuracy": "measure the present causes of odometry error and say how to reduce the largest",
     "calibrate": "measure wheel radii and effective track width, by a guided or a recorded drive",
     "recording": "list, show, replay, export and draw recordings",
-    "tls": "make the certificates with which other machines connect",
+    "tls": "make the certificates that other machines need to connect to the robot",
     "gateway": "run the TLS gateway, which admits clients from other machines",
     "router": "run a fleet's Zenoh router and restart it when a client blocks it",
     "service": "install acsard as a system service, remove it, or show its status",
-    "completion": "print the script for completion with Tab in a shell",
+    "completion": "print the script that lets a shell complete acsard commands with Tab",
     "man": "print the text of every --help as a man page",
 }
-"""The subcommands, each a module of this package, with help texts, in the order of `--help`."""
+"""Maps each subcommand to its help text, in the order of `--help`. The name of a subcommand is also
+the name of its module in this package."""
 
 _EPILOG = """\
 exit codes: 0 done, 1 failure, 2 wrong usage, 65 part of the recording is damaged, 66 no such
@@ -144,9 +145,9 @@ def _decimal(word: str) -> str:
 def entry() -> NoReturn:
     """Run `main` and end the process at once: the entry point of the `acsard` script.
 
-    The process ends with `os._exit`, because Zenoh's threads may still call into Python while the
-    interpreter shuts down, which would abort the process. Everything that matters is flushed by
-    then.
+    The process ends with `os._exit`, because Zenoh's threads may still call into Python. During
+    a normal shutdown of the interpreter, such a call would abort the process. Standard output and
+    standard error are flushed first.
     """
     _fill_closed_streams()
     try:

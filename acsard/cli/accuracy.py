@@ -35,8 +35,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--follow",
         action="store_true",
-        help="run until Ctrl-C and print a result every S seconds. Each result covers the time "
-        "since the start, but at most the last ten minutes",
+        help="run until Ctrl-C and print a result each time the S seconds of --seconds have "
+        "passed. Each result covers the time since the start, but at most the last ten minutes",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object a line")
     add_bus(parser)
@@ -52,13 +52,13 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _config(robot: Client, path: str | None) -> Config:
-    """Return the daemon's configuration, or the local file's for a client that may not query it."""
+    """Return the daemon's configuration, or the local one if the daemon does not give its own."""
     try:
         return msgspec.convert(robot.get("config"), Config)
     except (NoAnswerError, NotPermittedError, msgspec.ValidationError):
         where, config = load(path)
         print(
-            f"acsard: the robot does not answer with its configuration, so the tool uses {where}",
+            f"acsard: the robot did not send its configuration. Instead, this command uses {where}",
             file=sys.stderr,
         )
         return config

@@ -45,8 +45,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--port",
         metavar="DEVICE",
-        help="measure with the microcontroller on this serial port, at zero speed (default: "
-        "sim, a simulated one, even if the configuration names a port)",
+        help="serial port of the microcontroller to measure with; acsard sends it only zero "
+        "speeds (default: sim, the built-in simulator, even if the configuration names a port)",
     )
     parser.add_argument(
         "--rate", type=float, metavar="HZ", help="control rate (default: as configured)"

@@ -69,9 +69,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME",
-        help="with --log and a ROS 2 bag: the topic to use if several fit; repeat the option "
-        "to name more. If you name topics with Imu, PoseStamped or Odometry messages, the wheels "
-        "are compared only with those topics",
+        help="with --log and a ROS 2 bag: the ROS topic to read if several topics of the bag "
+        "are suitable; repeat the option to name several. If you name topics with Imu, "
+        "PoseStamped or Odometry messages, acsard compares the wheels only with those topics",
     )
     parser.add_argument(
         "--yaw-axis",
@@ -84,9 +84,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--distance",
         type=_distance,
         metavar="[RUN=]METRES",
-        help="with --log: the straight-line distance from the start to the end of a run, by "
-        "tape measure. It determines how large the wheels are. Without RUN it applies to "
-        "the straightest run",
+        help="with --log: the straight-line distance from the start to the end of the run RUN, "
+        "by tape measure. acsard computes the size of the wheels from this distance. Without RUN, "
+        "METRES is the distance of the straightest run",
     )
     add_outcome(parser, "the result")
 
@@ -138,7 +138,9 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
     if trouble is not None:
         raise trouble
     if written and not args.log:
-        print("restart the daemon: it reads these values only when it starts", file=sys.stderr)
+        print(
+            "restart the daemon: it uses the new calibration only after a restart", file=sys.stderr
+        )
     return int(Exit.OK)
 
 
@@ -146,7 +148,7 @@ def _require_fitting(args: argparse.Namespace) -> None:
     """Raise `UsageError` if options of a recorded drive (`--log`) and of a guided one are mixed."""
     if not args.log and args.distance:
         raise UsageError(
-            "--distance goes with --log: a guided drive asks for the distances that it needs"
+            "--distance needs --log: without --log, acsard asks for the distances that it needs"
         )
     if not args.log and _choice(args) != Choice():
         raise UsageError("--topic and --yaw-axis need --log: they select data in a ROS 2 bag")
@@ -178,32 +180,33 @@ def _add_drive_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--method",
         choices=tuple(NEEDS),
-        help="reference for the drive (default: a gyro if the robot has one ([odometry] gyro), "
-        "else a tape)",
+        help="reference with which the wheels are compared (default: the gyro if odometry.gyro is "
+        "true, else a tape measure)",
     )
     parser.add_argument(
         "--positions",
         metavar="KEY",
-        help="for --method positions: the key on which the robot's positions are published "
-        "(PoseStamped or Odometry in JSON, msgpack or CDR). Give a key that `acsard topics` lists, "
-        "for example sim/pose, or a full key",
+        help="for --method positions: the Zenoh key on which the robot's positions are published "
+        "(PoseStamped or Odometry in JSON, msgpack or CDR). Give a key as `acsard topics` lists "
+        "it, for example sim/pose, or a full key",
     )
     parser.add_argument(
         "--positions-at",
         metavar="ENDPOINT",
-        help="address at which the key of --positions is published if the daemon does not have it, "
-        "for example the address of a router",
+        help="bus address that has the key of --positions, for example the address of a router; "
+        "needed only if the daemon's own bus does not have that key",
     )
     parser.add_argument(
         "--imu",
         metavar="KEY",
-        help="for --method gyro: the key of the gyro (default: imu), as `acsard topics` lists it, "
-        "or a full key",
+        help="for --method gyro: the Zenoh key of the gyro (default: imu), as `acsard topics` "
+        "lists it, or a full key",
     )
     parser.add_argument(
         "--yes",
         action="store_true",
-        help="start every leg without Enter (only with the built-in simulator)",
+        help="start every leg of the drive without waiting for Enter (only with the built-in "
+        "simulator)",
     )
 
 
@@ -245,31 +248,33 @@ def _guided(
         try:
             return guide(name, made, prompt, robot.ride, simulated=info.simulated), config
         except KeyboardInterrupt:
-            raise GuideError("the operator ended the drive. No file is written") from None
+            raise GuideError("the operator ended the drive. No file was written") from None
 
 
 def _usable(args: argparse.Namespace, odometry: str) -> None:
     if args.method == "positions" and not args.positions:
-        raise UsageError("--method positions needs the key of the positions: --positions KEY")
+        raise UsageError(
+            "--method positions needs the Zenoh key of the positions: add --positions KEY"
+        )
     if args.positions and args.method not in (None, "positions"):
         raise UsageError(f"--positions does not go with --method {args.method}: leave one out")
     if args.positions in ("odom", odometry):
         raise UsageError(
-            "odom is computed from the wheels themselves: the positions must come from "
-            "another source"
+            "the daemon computes odom from the wheels themselves: give --positions the Zenoh key "
+            "of another source"
         )
     if args.imu and (args.positions or args.method not in (None, "gyro")):
         other = "--positions" if args.positions else f"--method {args.method}"
         raise UsageError(f"--imu is for --method gyro, not for {other}: leave one out")
     if args.positions_at and not args.positions:
         raise UsageError(
-            "--positions-at says where the key of --positions is: give --positions KEY as well"
+            "--positions-at needs --positions KEY, too: it names the bus address of that key"
         )
     if not (args.yes or args.json_lines or sys.stdin.isatty()):
         raise UsageError(
             "calibrate drives the robot, and a person at the terminal starts and stops "
-            "it: run it in a terminal. Without a terminal, use --yes (only with the "
-            "built-in simulator), or --log with a recorded drive"
+            "each leg: run `acsard calibrate` in a terminal. Without a terminal, use --yes (only "
+            "with the built-in simulator), or --log with a recorded drive"
         )
 
 
@@ -280,8 +285,8 @@ def _differing(config: Config, mine: Config, where: str) -> str:
         return ""
     return (
         f"the daemon runs with drive.wheel_radius = {same[0]:g} and drive.wheel_separation "
-        f"= {same[1]:g}, but {where} has other values: name the daemon's file with "
-        "--config"
+        f"= {same[1]:g}, but {where} has other values: name the daemon's configuration "
+        "file with --config"
     )
 
 
@@ -291,7 +296,7 @@ def _way(args: argparse.Namespace, config: Config) -> str:
     gyro = args.method == "gyro" or args.imu
     if gyro and args.imu in (None, IMU) and not config.odometry.gyro:
         raise UsageError(
-            "this robot's daemon receives no gyro: set odometry.gyro = true and restart "
+            "this robot's daemon does not read a gyro: set odometry.gyro = true and restart "
             "the daemon, or use --method tape, wall or umbmark"
         )
     way: str = args.method or ("gyro" if gyro or config.odometry.gyro else "tape")

@@ -37,7 +37,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         nargs="*",
         type=float,
         metavar="NUMBER",
-        help=f"the values of the payload: {'; '.join(forms)}",
+        help=f"the numbers that the service needs: {'; '.join(forms)}",
     )
     parser.add_argument("--json", action="store_true", help="print the answer as JSON")
     add_bus(parser, MANY + " (stop only)")
@@ -65,13 +65,16 @@ def _fields(service: Verb) -> tuple[str, ...]:
 
 
 def for_one(service: str, values: Sequence[float], ids: tuple[str, ...]) -> str:
-    """Return a message that `service` is for one robot, with the command for each of `ids`."""
+    """Return an error message: `service` can be called on only one robot at a time.
+
+    The message contains the command to type for each of `ids`.
+    """
     typed = " ".join(["acsard call", service, *(f"{value:g}" for value in values), "--id"])
     each = [one for one in ids if one != "*"] or ["robot1"]
     more = "" if "*" not in ids else "; `acsard fleet` lists the ids"
     return (
-        f"only stop goes to many robots at once: before {service} a person must look at "
-        "each robot. Call them one after the other: "
+        f"only stop can be called on several robots at once: before {service}, a person must look "
+        "at each robot. Call one robot after the other: "
         f"{', '.join(f'`{typed} {one}`' for one in each)}{more}"
     )
 

@@ -36,7 +36,7 @@ def add_outcome(parser: argparse.ArgumentParser, result: str) -> None:
     form.add_argument(
         "--json-lines",
         action="store_true",
-        help="for a program that puts the questions to the operator itself: write messages and "
+        help="for a program that asks the operator the questions: write messages and "
         "questions to standard output as JSON, one object per line, and read the answers from "
         "standard input in the same form (deploy/web/README.md)",
     )
@@ -51,8 +51,8 @@ def add_outcome(parser: argparse.ArgumentParser, result: str) -> None:
 def require_asking(args: argparse.Namespace) -> None:
     if args.yes and args.json_lines:
         raise UsageError(
-            "--yes and --json-lines exclude each other: --yes asks no questions, --json-lines asks "
-            "them through a program. Leave one out"
+            "--yes cannot be used with --json-lines: with --yes acsard asks no questions, with "
+            "--json-lines a program asks them. Leave one of the two options out"
         )
 
 
@@ -67,7 +67,7 @@ def count(text: str) -> int:
 def seconds(text: str) -> float:
     """Parse a duration from 1 to 600 s, as an argparse type.
 
-    All measured values stay in memory: 60 MB after 600 s at 100 Hz.
+    The limit is 600 s because all measured values stay in memory: 60 MB after 600 s at 100 Hz.
     """
     value = float(text)
     if not 1.0 <= value <= 600.0:

@@ -20,7 +20,7 @@ from acsard.host.extras import missing
 
 SHELLS = {
     "bash": "~/.local/share/bash-completion/completions/acsard",
-    "zsh": "a directory of your $fpath, as _acsard",
+    "zsh": "the file _acsard in a directory of your $fpath",
     "fish": "~/.config/fish/completions/acsard.fish",
 }
 """Where each shell looks for its completion script."""
@@ -50,7 +50,7 @@ _acsard_recordings() {{
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     places = "; ".join(f"{shell}: {place}" for shell, place in SHELLS.items())
-    parser.epilog = f"Where the shells look for it: {places}."
+    parser.epilog = f"Write the script to the file that your shell reads: {places}."
     parser.add_argument("shell", choices=tuple(SHELLS), metavar="SHELL", help=", ".join(SHELLS))
 
 

@@ -43,7 +43,10 @@ def add_bus(parser: argparse.ArgumentParser, more: str = "") -> None:
 
 @contextmanager
 def connected(args: argparse.Namespace, source: str = "app") -> Iterator[Client]:
-    """Connect to the one robot that the options name, as the command source `source`."""
+    """Connect to the one robot that the options name.
+
+    `source` is the command source as which the client sends commands.
+    """
     endpoint, robot_id, tls = robot_address(args)
     with connect(endpoint, robot_id=robot_id, source=source, tls=tls) as robot:
         yield robot
@@ -92,11 +95,13 @@ def require_followed(key: str) -> None:
     if row is None:
         return
     instead = {
-        "query": f"answers a query: acsard get {key}",
-        "service": f"is a service: acsard call {key.removeprefix('srv/')}",
+        "query": f"only answers queries: type acsard get {key}",
+        "service": f"is a service: type acsard call {key.removeprefix('srv/')}",
     }.get(row.direction)
     if row.key == "alive":
-        instead = "is a token without messages: acsard fleet lists the robots that are present"
+        instead = (
+            "is a Zenoh liveliness token without messages: acsard fleet lists the present robots"
+        )
     if instead is not None:
         raise UsageError(f"nothing is published on {key}: it {instead}")
 
@@ -115,15 +120,15 @@ def require_asked(key: str) -> None:
     if row is None:
         return
     if row.direction == "service":
-        raise UsageError(f"{key} is a service: acsard call {key.removeprefix('srv/')}")
+        raise UsageError(f"{key} is a service: type acsard call {key.removeprefix('srv/')}")
     if row.direction == "in":
         raise UsageError(
             f"{key} is an input and does not answer queries: acsard echo {key} follows it"
         )
     if row.key == "alive":
         raise UsageError(
-            "alive is a token and does not answer queries: acsard fleet lists the robots that "
-            "are present"
+            "the key alive is a Zenoh liveliness token and does not answer queries: acsard fleet "
+            "lists the robots that are present"
         )
 
 
@@ -136,9 +141,9 @@ def explained(
     A separate thread prints on standard error, so the caller never waits.
 
     Args:
-        look: returns the reason if no message has arrived in the first `after_s` s.
-        ceased: returns the reason if messages have stopped for `after_s` s. If it is None, only the
-            silence at the start is explained.
+        look: is called if no message arrives in the first `after_s` s, and returns the reason.
+        ceased: is called if no further message arrives for `after_s` s, and returns the reason. If
+            it is None, only the silence before the first message is explained.
         after_s: shortest silence that is explained, s.
 
     A reason that is "" is not printed.
@@ -183,7 +188,7 @@ def _none_yet(robot: Client, key: str) -> str:
         return ""
     reason = "" if seen.linked else _of_link(where)
     reason = reason or explain_silence(key, where.robot_id, where.endpoint, seen)
-    return f"waiting for {robot.key(key)}: {reason}"
+    return f"waiting for messages on {robot.key(key)}: {reason}"
 
 
 def _ceased(robot: Client) -> str:

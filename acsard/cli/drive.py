@@ -27,7 +27,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
             help="speed at the start; keys change it during the drive (default: %(default)s)",
         )
     parser.add_argument(
-        "--source", default="teleop", help="command source to send as (default: teleop)"
+        "--source",
+        default="teleop",
+        help="send the commands as this command source (default: teleop)",
     )
     add_bus(parser)
 
@@ -36,8 +38,8 @@ def main(args: argparse.Namespace) -> int:
     require_one(args)
     if not sys.stdin.isatty():
         raise UsageError(
-            "drive reads single keys, so run it in a terminal; a program must use acsard.client "
-            "instead"
+            "acsard drive reads single key presses, so run it in a terminal; a program must use "
+            "acsard.client instead"
         )
     with connected(args, args.source) as robot:
         if robot.where.tls and not has((us := robot.whoami()).role, COMMAND_ROLE):

@@ -41,18 +41,19 @@ from acsard.host.errors import Exit, NoAnswerError, UsageError
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "topic", nargs="+", help="for example odom, state, wheel_states, cmd/teleop"
+        "topic", nargs="+", help="Zenoh key, for example odom, state, wheel_states, cmd/teleop"
     )
     form = parser.add_mutually_exclusive_group()
     form.add_argument(
         "--short",
         action="store_true",
-        help="print one line of text per message (odom, state, cmd_vel_out and sim/pose only)",
+        help="print one line of text per message (only for odom, state, cmd_vel_out and sim/pose)",
     )
     form.add_argument(
         "--csv",
         action="store_true",
-        help="print the rows of a log (one or more of wheel_states, imu and sim/pose)",
+        help="print a CSV log for `acsard calibrate --log` (for one or more of the keys "
+        "wheel_states, imu and sim/pose)",
     )
     parser.add_argument("-n", type=count, metavar="N", help="end after N messages of each robot")
     parser.add_argument(
@@ -68,14 +69,18 @@ def main(args: argparse.Namespace) -> int:
     topic = args.topic[0]
     if args.csv:
         if named(args.id or ""):
-            raise UsageError("a log holds one robot: with --csv, --id takes one robot")
+            raise UsageError(
+                "a CSV log can hold only one robot: with --csv, name one robot in --id"
+            )
         for key in args.topic:
             if key not in KEYS:
                 raise UsageError(f"{key} cannot be in a log; --csv takes {', '.join(KEYS)}")
         with connected(args) as robot, silence_explained(robot, topic) as heard:
             return _record(robot, args.topic, args.n, args.timeout, heard)
     if len(args.topic) > 1:
-        raise UsageError("several keys need --csv, which puts them into one file")
+        raise UsageError(
+            "several keys can only be printed as one CSV log: add --csv, or name one key"
+        )
     short_form = _shortened(topic) if args.short else None
     require_followed(topic)
     with connected_to_many(args) as (robot, many):

@@ -25,13 +25,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--address",
         default=DEFAULT,
         metavar="HOST:PORT",
-        help=f"address to listen at, on this machine only (default: {DEFAULT})",
+        help=f"address to listen at; it must be a loopback address (default: {DEFAULT})",
     )
     parser.add_argument(
         "--drive",
         action="store_true",
-        help="also accept commands, service calls and settings; while this runs, any page that "
-        "is open in a browser on this machine can send them",
+        help="also accept commands, service calls and settings from Foxglove. While this command "
+        "runs, any page that is open in a browser on this machine can send them, too",
     )
     add_bus(parser)
 
@@ -47,8 +47,8 @@ def main(args: argparse.Namespace) -> int:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, lambda *_: bridge.end())
         try:
-            may = "; viewers can see and stop the robot, and with --drive they can also drive it"
-            where = f"ws://{address[0]}:{address[1]}: connect Foxglove there"
+            may = "; Foxglove can show and stop the robot. To drive it from Foxglove, add --drive"
+            where = f"ws://{address[0]}:{address[1]}: connect Foxglove to this address"
             told = f"{robot.where.robot_id} at {where}{'' if args.drive else may}"
             print(told, flush=True)
             bridge.run()

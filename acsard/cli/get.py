@@ -21,7 +21,7 @@ from acsard.host.errors import Exit
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("key", help="for example info, config, schema/Twist, state")
+    parser.add_argument("key", help="Zenoh key, for example info, config, schema/Twist, state")
     add_bus(parser, MANY)
 
 

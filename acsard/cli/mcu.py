@@ -44,7 +44,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     check = actions.add_parser(
         "check",
-        help="test dialect, wheels, watchdog and damaged lines; print the lines for acsard.toml",
+        help="test the board's protocol, wheels, watchdog and handling of damaged lines, and print "
+        "the settings for acsard.toml",
         description=DESCRIPTION,
     )
     add_config(check)
@@ -63,7 +64,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="with --yes: confirm that no wheel touches anything and that you watch the robot",
     )
-    add_outcome(check, "the found lines, and --port,")
+    add_outcome(check, "the settings that the check found, and the device of --port,")
 
 
 def main(args: argparse.Namespace) -> int:
@@ -93,7 +94,9 @@ def _checked(
     prompt.begin(f"port {port}{words}, configuration {where}", simulated=simulated)
     trouble: MendableError | None = None
     try:
-        with ended_by_signals("stopping: zeros go out, then the port is closed", exits=True):
+        with ended_by_signals(
+            "stopping: acsard sends zero speeds to the board, then closes the port", exits=True
+        ):
             procedure.run(_wire(config), prompt, config, tell)
     except MendableError as error:
         if not args.json:

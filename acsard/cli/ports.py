@@ -13,8 +13,8 @@ import msgspec
 from acsard.machine.serial_ports import serial_devices
 
 PLUGGED_IN = (
-    "is the board plugged in, by a cable with data lines? `dmesg | tail` shows the kernel's "
-    "messages"
+    "check that the board is plugged in, and that its USB cable is not only for charging; "
+    "`dmesg | tail` shows the kernel's messages about USB devices"
 )
 
 
@@ -40,7 +40,10 @@ def main(args: argparse.Namespace) -> int:
         for holder in port.holders:
             print(f"    held by     {holder.name} (pid {holder.pid})")
     if not any(port.usb_id for port in found):
-        print(f"none of these ports is on USB, so no board is here: {PLUGGED_IN}", file=sys.stderr)
+        print(
+            f"none of these ports is a USB port, so acsard finds no board: {PLUGGED_IN}",
+            file=sys.stderr,
+        )
         return 0
     likely = [port for port in found if port.board]
     if not likely:

@@ -89,7 +89,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "show",
         help="print the events of a recording as text",
         description="Print the events of a recording as text, one line per event. A line `gap` "
-        "stands for missing steps, as after damage to the file; the exit code stays 0.",
+        "marks missing steps, for example because the file is damaged; the exit code is still 0.",
     )
     shown.add_argument("--json", action="store_true", help="print one JSON object a line")
     shown.set_defaults(main=main_show)
@@ -97,11 +97,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "replay",
         help="run the recorded inputs through the program again, without a robot, and compare the "
         "results",
-        description="Run the recorded inputs through the robot again, and compare every line, "
-        "pose, mode, reason and event with the recorded ones. With --config, show what another "
-        "configuration would have changed. A part that cannot be read because of damage is not "
-        "compared. Exit codes: 0 everything is the same, 1 something differs, 65 a part was not "
-        "compared and the rest is the same.",
+        description="Run the recorded inputs through the program again, without a robot, and "
+        "compare every line to the board, pose, mode, reason and event with the recorded ones. "
+        "With --config, show what another configuration would have changed. A part that cannot be "
+        "read because of damage is not compared. Exit codes: 0 everything is the same, 1 something "
+        "differs, 65 a part was not compared and the rest is the same.",
     )
     replay.set_defaults(main=main_replay)
     recover = actions.add_parser(
@@ -110,7 +110,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         description="Write the intact part of an unfinished or damaged recording as a finished "
         "file. The recording itself is not changed.",
     )
-    recover.add_argument("file", metavar="FILE", help="the recording, or its number in the list")
+    recover.add_argument(
+        "file",
+        metavar="FILE",
+        help="file of the recording, or the recording's number in the list of `acsard recording`",
+    )
     recover.add_argument("new", metavar="NEW", help="the file to write")
     recover.set_defaults(main=main_recover)
     exported = actions.add_parser(
@@ -121,19 +125,24 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     exported.set_defaults(main=main_export)
     report = actions.add_parser(
         "report",
-        help="draw a recording as one HTML file with path, speeds, sources, link and events",
+        help="draw a recording as one HTML file with the robot's path and speeds, the "
+        "command sources, the serial link and the events",
         description=REPORT,
     )
     report.set_defaults(main=main_report)
-    number = "its number in the list of `acsard recording`"
-    one = f"a recording, or {number} (default: the newest)"
-    default = "the newest, or all if --from or --to is a date or a time"
-    several = f"a recording, {number}, or `all` (default: {default})"
+    number = "the recording's number in the list of `acsard recording`"
+    one = f"file of a recording, or {number} (default: the newest recording)"
+    default = "the newest recording, or all if --from or --to is a date or a time"
+    several = f"file of a recording, {number}, or `all` (default: {default})"
     for action, words in ((shown, several), (replay, one), (exported, several), (report, several)):
         action.add_argument("file", nargs="?", metavar="FILE", help=words)
     for action, name, default in (
-        (exported, "NEW", "the recording's name with another suffix, in this directory"),
-        (report, "NEW.html", "FILE.html in this directory"),
+        (
+            exported,
+            "NEW",
+            "the recording's name with the new format's suffix, in the working directory",
+        ),
+        (report, "NEW.html", "FILE.html in the working directory"),
     ):
         words = f"file to write (default: {default})"
         action.add_argument("new", nargs="?", metavar=name, help=words)
@@ -165,7 +174,7 @@ def _export_forms(parser: argparse.ArgumentParser) -> None:
         action="store_const",
         const="csv",
         default="mcap",
-        help="write a table with one row per feedback line; its first columns are those that "
+        help="write a CSV table with one row per feedback line, whose first columns are those that "
         "`acsard calibrate --log` reads",
     )
     form.add_argument(
@@ -204,8 +213,9 @@ def _own_config(parser: argparse.ArgumentParser, default: object) -> None:
         dest="own_config",
         default=default,
         metavar="FILE",
-        help="configuration file that names the directory as record.directory (default: "
-        "$ACSARD_CONFIG, ./acsard.toml, /etc/acsard/acsard.toml, or the built-in defaults)",
+        help="configuration file whose record.directory names the directory of the recordings "
+        "(default: $ACSARD_CONFIG, ./acsard.toml, /etc/acsard/acsard.toml, or the built-in "
+        "defaults)",
     )
 
 
@@ -233,7 +243,7 @@ def main(args: argparse.Namespace) -> int:
         show(table(rows, right={2, 3}))
     else:
         words = f" {in_words(first, last)}" if files else ""
-        mend = ": leave out --from and --to to list all" if words else ""
+        mend = ": leave out --from and --to to list all recordings" if words else ""
         print(f"no recordings{words} in {where}{mend}")
     return int(Exit.OK)
 
@@ -320,7 +330,8 @@ def _tell(one: TimelineEntry, as_json: bool) -> None:
 def main_replay(args: argparse.Namespace) -> int:
     """Replay a recording and compare the result with the recorded one.
 
-    Returns 1 if they differ (without --config), 65 if a part was not compared, else 0.
+    Returns 1 if the results differ and --config was not given, 65 if a part was not compared, else
+    0.
     """
     _refuse_times(args, "replay")
     recording = _recording(args)
@@ -419,7 +430,7 @@ def _files_to_write(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
         raise UsageError(
             f"this recording has {len(parts)} separate parts, because the daemon restarted or "
             "steps are missing, and acsard writes each part into its own file: either leave out "
-            "NEW, or choose a shorter span of time with --from and --to"
+            "the argument NEW, or choose a shorter span of time with --from and --to"
         )
     return parts
 
@@ -432,7 +443,9 @@ def _parts(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
         return _search(args)
     recording = _recording(args)
     if args.file is None and times:
-        _note(recording, "a number of seconds counts from its beginning")
+        _note(
+            recording, "the seconds of --from and --to count from the beginning of this recording"
+        )
     return [(recording, span(recording, args.begin, args.end))]
 
 
@@ -450,7 +463,10 @@ def _range(args: argparse.Namespace) -> tuple[float, float]:
 
 
 def _search(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
-    """Return each recording between --from and --to with its part in that time. Print the names."""
+    """Return each recording with steps between --from and --to, and the span of these steps.
+
+    Also print the names of these recordings.
+    """
     first, last = _range(args)
     where, files = _files(args)
     try:
@@ -497,10 +513,13 @@ def _recording(args: argparse.Namespace) -> Recording:
         files = [path for path in files if int(path.name.partition("-")[0]) == int(name)]
     if not files:
         which = "recording" if name is None else f"recording {name}"
-        raise MendableError(f"no {which} in {where}; `acsard recording` lists them")
+        raise MendableError(f"no {which} in {where}; `acsard recording` lists the recordings")
     recording = Recording(files[-1])
     if name is None and len(files) > 1:
-        _note(recording, f"the newest of {len(files)} recordings; `acsard recording` lists them")
+        _note(
+            recording,
+            f"this is the newest of {len(files)} recordings; `acsard recording` lists all",
+        )
     return recording
 
 
@@ -515,8 +534,8 @@ def _when(text: str) -> When:
 def _progress(recording: Recording) -> Iterator[Callable[[int], None]]:
     """Show the progress of the work on a recording, if standard error is a terminal.
 
-    Yield a function that the caller calls with the wall-clock time of the recording that the work
-    has reached, ns.
+    Yield a function that the caller calls to report progress. Its argument is the recorded
+    wall-clock time, ns, up to which the recording has been processed.
     """
     if not sys.stderr.isatty():
         yield lambda wall_ns: None
@@ -525,7 +544,7 @@ def _progress(recording: Recording) -> Iterator[Callable[[int], None]]:
     whole = f" of {(last.last_ns - began_ns) / 1e9:.0f}" if last else ""
 
     def tell(wall_ns: int) -> None:
-        text = f"\r{(wall_ns - began_ns) / 1e9:.0f}{whole} s"
+        text = f"\r{(wall_ns - began_ns) / 1e9:.0f}{whole} s of the recording"
         print(text, end="", file=sys.stderr, flush=True)
 
     try:
@@ -545,7 +564,10 @@ def _written(new: Path) -> Iterator[None]:
 
 
 def _percent(recording: Recording) -> Callable[[int], None]:
-    """Return a function of the wall-clock time, ns, that prints percentages for the web server."""
+    """Return a function that prints the progress in percent, for the web server to read.
+
+    Its argument is the recorded wall-clock time, ns, up to which the recording has been processed.
+    """
     last, began = read_end(recording.path), recording.about.wall_ns / 1e9
     end = last.last_ns / 1e9 if last else recording.path.stat().st_mtime
     told = 0

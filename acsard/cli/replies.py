@@ -25,7 +25,7 @@ def of_robot(whose: str, line: str) -> str:
 
 
 def json_line(encoding: str, payload: bytes) -> str:
-    """Return a message's payload as a line of JSON, `{"undecodable": ...}` if decoding fails."""
+    """Return a message's payload as a line of JSON, or `{"undecodable": ...}` if decoding fails."""
     try:
         form = detect(encoding, payload)
         if form == "cdr":
@@ -45,8 +45,8 @@ def of_each(
 ) -> dict[str, ServiceReply | AcsardError]:
     """Call a service of each robot in `ids` at the same time, and return the replies by robot id.
 
-    If `ids` contains "*", all robots that are present are called. Raises `NoAnswerError` if there
-    are none.
+    If `ids` contains "*", all robots that are present are called. Raises `NoAnswerError` if no
+    robot is present.
     """
     wanted = present(robot.session, ids, robot.where.endpoint) if ALL in ids else list(ids)
 

@@ -35,7 +35,7 @@ acsard {version}, robot {robot}
     acsard call stop{reach}  stop it, and keep it stopped until `acsard call clear`
 """
 
-_PAGE = "  page    {where}, for a browser; a line below says when it is ready\n"
+_PAGE = "  page    {where}, for a browser; a line below says when the page is ready\n"
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -49,12 +49,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--listen",
         metavar="ENDPOINT",
-        help="bus address to use instead of bus.listen, e.g. tcp/127.0.0.1:7448",
+        help="bus address to listen at instead of bus.listen, e.g. tcp/127.0.0.1:7448",
     )
     parser.add_argument(
         "--connect",
         metavar="ENDPOINT",
-        help="router to connect to instead of bus.connect, e.g. tcp/127.0.0.1:7447",
+        help="Zenoh router to connect to instead of the one in bus.connect, e.g. "
+        "tcp/127.0.0.1:7447",
     )
     parser.add_argument(
         "--record",
@@ -65,8 +66,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--no-gateway",
         action="store_true",
-        help="do not start `acsard gateway` for the tls/ endpoints, because it already runs as a "
-        "service",
+        help="do not start `acsard gateway` for the tls/ endpoints; use this option if the gateway "
+        "already runs as a service",
     )
 
 
@@ -149,8 +150,9 @@ def settings_file(where: str, config: Config, given: dict[str, object]) -> Setti
 def page(config: Config, where: str) -> list[str] | None:
     """Return the arguments with which `acsard web` serves the robot's page, or None to serve none.
 
-    It is served if `web.page` is set, standard output is a terminal, the daemon is not a systemd
-    service, and the page's libraries are installed. `where` is the path of the configuration file.
+    The page is served if `web.page` is set, standard output is a terminal, the daemon is not a
+    systemd service, and the page's libraries are installed. `where` is the path of the
+    configuration file.
     """
     looked_at = sys.stdout is not None and sys.stdout.isatty() and "INVOCATION_ID" not in os.environ
     there = find_spec("aiohttp") and find_spec("segno")
@@ -170,7 +172,7 @@ def page(config: Config, where: str) -> list[str] | None:
 def _bus(config: Config) -> str:
     bus = config.bus
     if bus.mode == "client":
-        return f"client of {', '.join(bus.connect)}"
+        return f"client of the Zenoh router at {', '.join(bus.connect)}"
     return ", ".join(bus.listen)
 
 

@@ -18,8 +18,8 @@ from acsard.terminal.output import show, table
 def add_options(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     for name, main, text in (
-        ("install", main_install, "write the files, enable and start the service"),
-        ("uninstall", main_uninstall, "stop and disable the service, remove the files"),
+        ("install", main_install, "write the service's files, then enable and start the service"),
+        ("uninstall", main_uninstall, "stop and disable the service, and remove its files"),
         ("status", main_status, "show which files are installed and whether the service runs"),
     ):
         action = actions.add_parser(name, help=text, description=text.capitalize() + ".")
@@ -32,14 +32,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
             action.add_argument(
                 "--force",
                 action="store_true",
-                help="also replace or remove files that have been edited",
+                help="also replace or remove files that somebody has edited since the installation",
             )
         if name == "uninstall":
             action.add_argument(
                 "--purge",
                 action="store_true",
-                help="also remove your configuration, certificates, drop-ins, recordings and "
-                "the page's invitations",
+                help="also remove your configuration, certificates, systemd drop-ins, recordings "
+                "and the web page's invitations",
             )
         action.set_defaults(main=main)
 
@@ -72,7 +72,10 @@ def main_uninstall(args: argparse.Namespace) -> int:
     )
     _do(steps, args.dry_run)
     if sys.prefix != sys.base_prefix:  # a venv: never advise to delete a Python of the system
-        print(f"\nThe program itself stays in {sys.prefix}; delete that directory to remove it")
+        print(
+            f"\nThe program itself stays in {sys.prefix}; to remove the program, delete that "
+            "directory"
+        )
     return 0
 
 
@@ -80,7 +83,7 @@ def main_status(args: argparse.Namespace) -> int:
     """Print the state of the service's files and units. Return 0 if the daemon's unit is active."""
     show(table((file.condition(), str(file.path)) for file in service.files()))
     state = service.state(service.UNIT)
-    print(state or "systemd does not answer on this machine: does it run here?")
+    print(state or "systemd does not answer: check that this machine runs systemd")
     if state:
         for unit in service.ALL[1:]:
             print(f"\n{unit}:\n{service.state(unit)}")
@@ -89,7 +92,9 @@ def main_status(args: argparse.Namespace) -> int:
 
 def _ready(args: argparse.Namespace) -> None:
     if not args.dry_run and os.geteuid() != 0:
-        raise NotPermittedError("run it with sudo, or use --dry-run to see what it would do")
+        raise NotPermittedError(
+            "run this command with sudo, or add --dry-run to see what the command would do"
+        )
 
 
 def _do(steps: Iterable[Step], dry_run: bool) -> None:
@@ -103,5 +108,6 @@ def _do(steps: Iterable[Step], dry_run: bool) -> None:
             raise
         except OSError as error:
             raise MendableError(
-                f"failed: {step}: {error.strerror}; fix that and run this command again"
+                f"this step failed: {step}: {error.strerror}; remove the cause and run the command "
+                "again"
             ) from None

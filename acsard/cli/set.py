@@ -41,8 +41,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "settings",
         nargs="*",
         metavar="KEY VALUE",
-        help="a key of acsard.toml with its table, for example limits.linear_speed; write a "
-        "list as [1, 2]",
+        help="a key of acsard.toml with the name of its table, for example limits.linear_speed, "
+        "and the new value; write a list as [1, 2]",
     )
     files = parser.add_mutually_exclusive_group()
     files.add_argument(
@@ -56,7 +56,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--write",
         action="store_true",
         help="also write the settings into the configuration file of this machine, whose comments "
-        f"stay (needs an extra: {install('write')})",
+        f"stay (needs the library tomlkit: {install('write')})",
     )
     parser.add_argument("--json", action="store_true", help="print the answer or the list as JSON")
     add_bus(parser, MANY + " (to change settings)")
@@ -115,15 +115,15 @@ def _require_for_many(args: argparse.Namespace, settings: dict[str, Plain]) -> N
         raise UsageError("name one robot in --id to list its settings")
     if args.write:
         raise UsageError(
-            f"--write changes only the file of this machine, but --id '{args.id}' names several "
-            "robots: use --keep instead, and each robot writes its own file"
+            f"--write changes only the configuration file of this machine, but --id '{args.id}' "
+            "names several robots: use --keep instead, and each robot writes its own file"
         )
 
 
 def _until(settings: dict[str, Plain]) -> str:
     """Return a text which says until when the settings stay in force."""
-    survives = "; a lowered limit survives the restart, except on the simulator"
-    return f"until the next start{survives if any(map(stays, settings)) else ''}"
+    survives = "; a lowered limit survives a restart of the daemon, except on the simulator"
+    return f"until the daemon's next start{survives if any(map(stays, settings)) else ''}"
 
 
 def _set_all(

@@ -40,14 +40,17 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         default=[],
         type=fault,
         metavar="NAME",
-        help=f"simulate a fault; may be repeated: {', '.join(FAULTS)}; with motors (a to d) or "
-        f"numbers: {', '.join(_with_names())}; reset=SECONDS (repeatedly). START is the time in "
-        "seconds until the fault begins. If SECONDS is 0, the fault does not end. EVERY is the "
-        "time in seconds from one stall to the next. BUMPER is 1 to 4. The battery starts with "
-        "PERCENT of its charge; a full battery lasts MINUTES while the robot is at rest",
+        help="simulate the fault NAME; repeat the option for several faults. NAME alone: "
+        f"{', '.join(FAULTS)}. NAME with motors (a to d) or numbers: {', '.join(_with_names())}; "
+        "reset=SECONDS (the MCU restarts every SECONDS). START is the time in seconds until the "
+        "fault begins. If SECONDS is 0, the fault does not end. EVERY is the time in seconds from "
+        "one stall to the next. BUMPER is 1 to 4. The battery starts with PERCENT of its charge; a "
+        "full battery lasts MINUTES while the robot is at rest",
     )
     parser.add_argument(
-        "--link", metavar="PATH", help="also make a symbolic link at PATH to the device"
+        "--link",
+        metavar="PATH",
+        help="also make a symbolic link at PATH to the simulated serial device",
     )
 
 
@@ -76,7 +79,7 @@ def _make_link(link: Path, device: str) -> None:
             link.unlink()
         link.symlink_to(device)
     except OSError as error:
-        words = f"cannot make the link {link}: {error.strerror}; give another --link"
+        words = f"cannot make the symbolic link {link}: {error.strerror}; give another --link"
         raise UsageError(words) from None
 
 
@@ -115,5 +118,5 @@ async def _play(config: Config, args: argparse.Namespace) -> int:
         faults = ", ".join((*config.sim.faults, *(fault.name for fault in args.fault))) or "none"
         print(f"simulated MCU on {device}, faults: {faults}; Ctrl-C ends it", file=sys.stderr)
         await ended.wait()
-    print(f"received {mcu.valid_lines} valid lines", file=sys.stderr)
+    print(f"the simulated MCU received {mcu.valid_lines} valid lines", file=sys.stderr)
     return 0

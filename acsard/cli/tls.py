@@ -29,10 +29,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     init = actions.add_parser(
         "init",
-        help="make a certificate authority, the robot's certificate and one for each role",
+        help="make a certificate authority, the robot's certificate and a client certificate for "
+        "each role",
         description="Make a certificate authority, the robot's certificate, and one certificate "
-        "each for viewer, operator and maintainer. Print the lines of acsard.toml "
-        "that use them.",
+        "each for viewer, operator and maintainer. Print the lines for acsard.toml "
+        "with which the robot uses the certificates.",
     )
     init.add_argument("--force", action="store_true", help="overwrite existing files")
     init.add_argument(
@@ -47,33 +48,38 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="make one more certificate",
         description="Make a certificate for one more person or program.",
     )
-    more.add_argument("name", type=_name, metavar="NAME", help="its common name, e.g. laptop-anna")
+    more.add_argument(
+        "name",
+        type=_name,
+        metavar="NAME",
+        help="common name of the new certificate, e.g. laptop-anna",
+    )
     more.add_argument(
         "--role",
         choices=ROLES,
-        help="role of the certificate; leave it out for a robot or a router",
+        help="role of the certificate; leave this option out for a robot or a router",
     )
     more.add_argument(
         "--write",
         type=Path,
         metavar="FILE",
-        help="also add the name to the list of its role in this acsard.toml",
+        help="also add NAME to the list of its role in the table [access] of this acsard.toml",
     )
     add_config(more)
     more.set_defaults(main=main_add)
     renew = actions.add_parser(
         "renew",
         help="replace a certificate that expires soon with a new one from the same authority",
-        description="Replace the robot's certificate before it expires. With --name, replace a "
-        "certificate that `tls add` made instead. The new certificate has the names and addresses "
-        "of the old one. All other certificates stay valid.",
+        description="Replace the robot's certificate before it expires. With --name, replace "
+        "not the robot's certificate but one that `tls add` made. The new certificate has the "
+        "names and addresses of the old one. All other certificates stay valid.",
     )
     renew.add_argument(
         "--name",
         type=_name,
         metavar="NAME",
-        help="renew the certificate in the subdirectory clients/NAME, for example that of robot4 "
-        "in a fleet (default: the robot's own certificate)",
+        help="renew the certificate in the subdirectory clients/NAME, for example the certificate "
+        "of robot4 in a fleet (default: the robot's own certificate)",
     )
     renew.set_defaults(main=main_renew)
     for action in (init, more, renew):
@@ -85,8 +91,8 @@ def _add_router(actions: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     router = actions.add_parser(
         "router",
         help="print the configuration of a fleet's router",
-        description="Print router.json5 for `acsard router` or zenohd. It says what each robot "
-        "and each person's certificate may do. The steps are in "
+        description="Print router.json5 for `acsard router` or zenohd. This file says what each "
+        "robot and each person's certificate may do. The steps to set up the router are in "
         "deploy/zenoh/README.md.",
     )
     router.add_argument("robots", nargs="+", metavar="ROBOT", help="ids of the robots")
@@ -97,8 +103,8 @@ def _add_router(actions: argparse._SubParsersAction[argparse.ArgumentParser]) ->
             type=_name,
             default=[],
             metavar="NAME",
-            help=f"another certificate with the role {role}, besides the one named {role}; may "
-            "be repeated",
+            help=f"name of one more certificate with the role {role}; a certificate named {role} "
+            "always has it. Repeat the option for several names",
         )
     router.set_defaults(main=main_router)
 
@@ -120,7 +126,8 @@ def _add_common(action: argparse.ArgumentParser) -> None:
         type=_address,
         default=[],
         metavar="NAME",
-        help="another host name or IP address of the robot, besides its own name; may be repeated",
+        help="one more host name or IP address for the certificate, for example another name of "
+        "the robot; repeat the option for several",
     )
 
 
@@ -165,8 +172,8 @@ def main_add(args: argparse.Namespace) -> int:
     if args.write:
         if not args.role:
             raise UsageError(
-                "--write adds the name to the list of a role: give the role, for "
-                "example --role operator"
+                "--write adds the name to the list of a role, but no role was given: add, for "
+                "example, --role operator"
             )
         require_tomlkit()
         require_changeable(args.write, keys, new=True)
@@ -181,7 +188,10 @@ def main_add(args: argparse.Namespace) -> int:
         names = write(keys(config)[f"access.{listed}"])
         print(_ADDED.format(place=place, name=args.name, where=where))
         print(f"[access]\n{listed} = {names}\n")
-    print("The daemon reads this when it starts: systemctl restart acsard, or restart `acsard run`")
+    print(
+        "The daemon reads the roles of certificates only when it starts: run `systemctl restart "
+        "acsard`, or restart `acsard run`"
+    )
     return 0
 
 
@@ -207,7 +217,7 @@ def main_router(args: argparse.Namespace) -> int:
 
 
 def _certified(names: list[str]) -> str:
-    return f"Clients may reach the robot as {', '.join(names)} (add more with --address).\n"
+    return f"The robot's certificate is valid for {', '.join(names)} (add more with --address).\n"
 
 
 def _admit_service(directory: Path) -> None:
@@ -278,7 +288,8 @@ Wrote {directory}:
                                    Move it off the robot; `tls add` and `tls renew` need it
   clients/<role>/                  one directory each for viewer, operator, maintainer
 
-{lines}The daemon reads this when it starts: systemctl restart acsard, or restart `acsard run`.
+{lines}The daemon reads bus.listen and bus.tls only when it starts: run
+`systemctl restart acsard`, or restart `acsard run`.
 
 Copy clients/<role>/ to the machine of each person with that role, and run there:
 

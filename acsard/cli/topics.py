@@ -34,7 +34,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def ros_table(config: Config) -> Topics:
-    """Return the ROS topics and services that are switched on, with the bus keys they mirror."""
+    """Return the ROS topics and services that are switched on, each with its bus key."""
     ros = config.ros
     rows = []
     for row in ros_names(ros, left_out(config)) if ros.bridge or ros.rmw else ():

@@ -36,20 +36,20 @@ NAME = re.compile(r"[A-Za-z0-9_.-]{1,32}\Z")
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = f"Needs an extra: {install('web')}."
+    parser.epilog = f"Needs extra libraries: `{install('web')}` installs them."
     add_bus(parser)
     parser.add_argument(
         "--address",
         action="append",
         metavar="URL",
-        help="address to listen at instead of web.address; may be repeated; "
-        "https://0.0.0.0:8443 is for other machines",
+        help="address at which to serve the page, instead of web.address; may be repeated; "
+        "https://0.0.0.0:8443 lets browsers on other machines connect",
     )
     parser.add_argument(
         "--record",
         metavar="DIRECTORY",
-        help="directory of the recordings until the robot reports its own (default: "
-        "record.directory)",
+        help="directory whose recordings the page offers, until the robot reports where it "
+        "records (default: record.directory)",
     )
     doing = parser.add_mutually_exclusive_group()
     doing.add_argument(
@@ -59,10 +59,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     doing.add_argument("--tokens", action="store_true", help="list the tokens")
     doing.add_argument(
-        "--revoke", metavar="NAME", help="revoke a token; the pages that use it close at once"
+        "--revoke",
+        metavar="NAME",
+        help="revoke a token; `acsard web` disconnects the pages that use the token at once",
     )
     parser.add_argument(
-        "--name", type=_name, help="name of the token, for example its user (default: the role)"
+        "--name",
+        type=_name,
+        help="name of the token, for example the name of the person who gets it (default: the "
+        "role)",
     )
     lasting = parser.add_mutually_exclusive_group()
     lasting.add_argument(
@@ -75,7 +80,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--hours",
         type=whole("hours", MOST_HOURS, "; for more use --days"),
         metavar="N",
-        help=f"hours until the token expires, for a visitor: 1 to {MOST_HOURS}",
+        help=f"instead of --days: hours until the token expires, for a visitor, 1 to {MOST_HOURS}",
     )
     parser.add_argument("--supervised", action="store_true", help=argparse.SUPPRESS)
 
@@ -146,9 +151,10 @@ def _invite(args: argparse.Namespace, config: Config, where: str) -> int:
     urls = invitations(listen, tls)
     if not urls:
         raise UsageError(
-            f"no browser could use the link: web.address in {where} has no https://. Either "
-            'add "https://0.0.0.0:8443" there, or name another file with --config, or give an '
-            "https:// address with --address; `acsard tls init` makes a certificate"
+            f"no browser could use the link: web.address in {where} has no https:// address. "
+            'Either add "https://0.0.0.0:8443" to web.address, or name another file with '
+            "--config, or give an https:// address with --address; `acsard tls init` makes the "
+            "certificate"
         )
     vault = _vault(args, config)
     days = 0 if args.hours else args.days or USUAL_DAYS
@@ -159,7 +165,7 @@ def _invite(args: argparse.Namespace, config: Config, where: str) -> int:
         print(f"  {url}#token={text}")
     print()
     segno.make(f"{urls[0]}#token={text}", error="l").terminal(sys.stdout, compact=True)
-    print(f"\nto end it sooner: acsard web --revoke {token.name}")
+    print(f"\nto revoke the token before that: acsard web --revoke {token.name}")
     if unknown := vault.unknown_to():
         print(unknown)
     return int(Exit.OK)
@@ -184,7 +190,10 @@ def _list(vault: Vault) -> int:
     if tokens:
         show(table((one.name, one.role, until(one.ends)) for one in tokens))
     else:
-        print(f"no tokens of {vault.robot} in {vault.path}; acsard web --invite ROLE makes one")
+        print(
+            f"no tokens for the robot {vault.robot} are in {vault.path}; `acsard web --invite "
+            "ROLE` makes one"
+        )
     return int(Exit.OK)
 
 

@@ -45,8 +45,8 @@ ends the drive. It exceeds the first 0.25 s of a new sender, whose commands have
 a short delay of a known sender."""
 
 SILENCE_NS = 3 * NS_PER_S // 10
-"""Time without a command after which the robot brakes, ns: a little more than a source's default
-timeout of 0.25 s."""
+"""Time without a command, ns, after which the robot is assumed to brake. It is a little longer than
+a source's default timeout of 0.25 s."""
 
 GATHER_NS = NS_PER_S // 25
 """Time for which the first command after a silence is held, ns, to see whether a burst follows. A
@@ -54,8 +54,8 @@ panel that sends at 20 Hz sends at most one command in this time. After a burst 
 commands, the next command waits again."""
 
 CROWD = 5
-"""Largest number of commands that a panel sends within `GATHER_NS`: five at 125 Hz. If more arrive,
-they have waited in a queue, which may contain further commands."""
+"""Largest number of commands that a panel is assumed to send within `GATHER_NS` (125 Hz). If more
+commands arrive, they have waited in a queue, which may contain further commands."""
 
 STALE_NS = NS_PER_S // 10
 """Age above which a nonzero command is dropped, ns, because the operator may no longer want it."""
@@ -83,7 +83,7 @@ class Wish(Struct, frozen=True):
 
 
 class Commander:
-    """Decides which commands of one sender are sent, and when. Only the newest one can wait.
+    """Decides which commands of one sender are sent, and when. Only the newest command can wait.
 
     Args:
         leads: whether to send a zero before the first command after each silence. It is for a
@@ -106,7 +106,8 @@ class Commander:
         self._lead = False
         self._hold_until_ns = 0
         self._burst = 0
-        """Number of commands in the wait after a silence (`GATHER_NS`); `send` resets it."""
+        """Number of commands that arrived during the wait after a silence (see `GATHER_NS`).
+        `send()` resets it."""
         self._crowded = False
         """Whether the last burst had more than `CROWD` commands."""
         self._moved_ns: int | None = None
@@ -167,8 +168,8 @@ class Commander:
         """Discard the command that waits, and end the drive of this sender.
 
         Returns a zero to send if the robot may still follow a nonzero command of this sender, else
-        None. `timeout_s` is the timeout of its source, s; later, a zero would only stop the next
-        sender.
+        None. `timeout_s` is the timeout of this sender's source, s. When it has passed
+        since the last nonzero command, a zero would only stop the next sender.
         """
         moved_ns, self._moved_ns = self._moved_ns, None
         self._wish = self._asked_ns = None
@@ -242,16 +243,16 @@ def objection(state: RobotState, source: str, sender: str) -> str:
     if state.sender in ("", sender):
         return ""
     return (
-        f"another program, {state.sender}, drives the robot as {source}: end it, or wait until it "
-        "is silent"
+        f"another program, {state.sender}, drives the robot as source {source}: end that program, "
+        "or wait until it sends no commands"
     )
 
 
 def no_command(source: str) -> str:
     """Return the text which says that the daemon receives no command of the source `source`."""
     return (
-        f"the daemon receives no command of source {source}; `acsard top` shows whether it refuses "
-        "commands"
+        f"the daemon receives no command of source {source}; `acsard top` shows whether the daemon "
+        "refuses commands"
     )
 
 

@@ -41,7 +41,7 @@ SLOWER, SLOWS_S = 0.97, 1.0
 `SLOWER` of its lowest speed so far."""
 
 
-CLOSED = "the connection was closed while the robot drove"
+CLOSED = "the connection to the daemon was closed while the robot was driving"
 
 
 class UnheardError(NotDrivenError):
@@ -141,7 +141,7 @@ def _stopping(checks: _Drive) -> Iterator[float]:
 
 
 class _Drive:
-    """Checks by the daemon's `state` whether the robot follows the commands of this client."""
+    """Checks, from the daemon's `state`, whether the robot follows the commands of this client."""
 
     def __init__(self, robot: Driven) -> None:
         self._robot = robot
@@ -176,11 +176,12 @@ class _Drive:
                 self._fine = now
         if watch.silent(now):
             raise NoAnswerError(
-                "the daemon's state cannot be read: does the daemon have another version? Use the "
-                "same version here"
+                "the daemon's state cannot be read: does the daemon run another version of acsard "
+                "than this program? Use the same version for both"
                 if watch.unreadable
-                else f"nothing received from the daemon for {watch.patience_s:g} s: is it "
-                "running with this robot.id? `acsard fleet` lists the robots"
+                else f"nothing received from the daemon for {watch.patience_s:g} s: does "
+                "the daemon run, and does it have the robot.id that this program uses? `acsard "
+                "fleet` lists the robots"
             )
 
     def require(self, grace: float) -> None:

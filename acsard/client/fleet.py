@@ -2,7 +2,7 @@
 
 A daemon is present while Zenoh shows its liveliness token. Zenoh's threads store the newest states
 undecoded, and the thread that reads the rows decodes them. Of the methods that this thread calls
-repeatedly, only `ask` may wait for the bus.
+repeatedly, only `Fleet.ask()` may wait for the bus.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Row(Struct, frozen=True):
     """Age of `state`, s; inf before a state has proved that the daemon runs."""
     version: str
     silent: bool = False
-    """Whether the robot counts as silent, because no state has arrived for long enough."""
+    """Whether the robot counts as silent, because no state has arrived for too long a time."""
 
 
 class _Known:
@@ -95,7 +95,10 @@ class Fleet:
             raise
 
     def rows(self) -> list[Row]:
-        """Return one row per robot, and drop the robots that have been silent for too long."""
+        """Return one row per robot. First drop the robots that have been silent for `forget_s` s.
+
+        A robot that `ids` names, or whose liveliness token is present, is never dropped.
+        """
         now = time.monotonic()
         with self._lock:
             for name, one in list(self._known.items()):
@@ -106,7 +109,7 @@ class Fleet:
             return [self._row(name, one, now) for name, one in self._known.items()]
 
     def due(self) -> list[tuple[str, str]]:
-        """Return the due queries for `ask`: pairs of robot id and key. Plan the next queries."""
+        """Return the due queries for `ask()`: pairs of robot id and key. Plan the next queries."""
         now, due = time.monotonic(), []
         with self._lock:
             for name, one in self._known.items():
@@ -119,7 +122,7 @@ class Fleet:
         return due
 
     def ask(self, due: Sequence[tuple[str, str]]) -> None:
-        """Send the queries that `due` returned; this may wait for the bus. Raises `ZError`."""
+        """Send the queries that `due()` returned; this may wait for the bus. Raises `ZError`."""
         for name, key in due:
             self._robot.like(name).ask(key, self._answer if key == "state" else self._info)
 

@@ -55,9 +55,10 @@ class Follower:
         """The newest state, or None before the first one. Until `heard` is true, it may be an old
         one from the storage of a router."""
         self.heard = False
-        """Whether any state has proved that the daemon runs (see `answered`)."""
+        """Whether any state has proved that the daemon runs (see `answered()`)."""
         self.last_seen = now
-        """Time of the last state that proved that the daemon runs, or of the start if none did."""
+        """Time of the last state that proved that the daemon runs. Before the first such state, it
+        is the time at which this object was created."""
         self.due = now + ask_s
         """Time of the next query, unless a state arrives before this time."""
         self.unreadable = 0
@@ -98,7 +99,7 @@ class Follower:
     def age(self, now: float) -> float:
         """Return the time since the last state that proved that the daemon runs, s.
 
-        Before the first such state, return the time since the start.
+        Before the first such state, return the time since this object was created.
         """
         return max(0.0, now - self.last_seen)
 
@@ -114,7 +115,10 @@ class Follower:
 
 
 def restarted(before: RobotState | None, state: RobotState) -> bool:
-    """Return whether the daemon has restarted between two states, which lowers a counter."""
+    """Return whether the daemon has restarted between two states.
+
+    The sign of a restart is that a counter in `STEADY` is lower in `state` than in `before`.
+    """
     return before is not None and any(
         state.counters.get(name, 0) < before.counters.get(name, 0) for name in STEADY
     )
@@ -188,8 +192,8 @@ class Watch(Follower):
         """
         if self.silent(now):
             return (
-                "nothing received from the daemon: does it run? `acsard doctor` on the robot "
-                "checks it"
+                "nothing received from the daemon: does the daemon run? `acsard doctor` on the "
+                "robot checks this"
             )
         return "" if self.state is None else objection(self.state, source, sender)
 

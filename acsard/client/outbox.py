@@ -1,7 +1,8 @@
 """Sends the commands of several senders from one thread, so that no caller waits for the bus.
 
 Each sender has a `Commander`, which keeps only its newest command. When a sender ends, the program
-must call `release`. The last zero of this sender is then sent, however long the bus was blocked.
+must call `Outbox.release()`. The last zero of this sender is then sent, however long the bus was
+blocked.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ class Outbox:
         self._news = Condition()
         self._busy = self._ended = False
         self.dead: Future[Never] = Future()
-        """Future with the exception that ended the thread, if any; then nothing is sent."""
+        """Future that receives the exception if one ends the thread. From then on, nothing is
+        sent."""
         self._thread = Thread(target=self._live, name="outbox", daemon=True)
         self._thread.start()
 
@@ -46,7 +48,7 @@ class Outbox:
         return silence
 
     def release(self, commander: Commander, timeout_s: float = LONGEST_S) -> None:
-        """Remove a sender; queue a zero for it if the robot may still follow its last command.
+        """Remove a sender. If the robot may still follow its last command, queue a zero.
 
         `timeout_s` is the timeout of the sender's source, s.
         """

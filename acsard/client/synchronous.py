@@ -101,7 +101,8 @@ class _Puts:
         # The lock is reentrant: a signal handler may also send while the same thread holds it.
         self._lock, self._next_s = threading.RLock(), 0.0
         self.moving: dict[Client, float] = {}
-        """The clients whose last command was not zero, with its time, s on the monotonic clock."""
+        """Maps each client whose last command was not zero to the monotonic time of that command,
+        s."""
 
     def wait(self) -> None:
         with self._lock:
@@ -156,8 +157,8 @@ class Client:
     def like(self, robot_id: str, name: str = "") -> Client:
         """Return another client on the same connection. It is a separate sender of commands.
 
-        `robot_id` is the id of its robot, which may be the same one. `name` is the name of the
-        sender; "" means the host name and the process id.
+        `robot_id` is the robot of the new client, which may be the robot of this client. `name` is
+        the name of the new sender; "" means the host name and the process id.
         """
         other = Client(self.session, robot_id, self.source, self.where.tls, self.where.endpoint)
         other.name, other._secret, other._puts = self.name, self._secret, self._puts
@@ -246,10 +247,10 @@ class Client:
     def set(self, settings: Mapping[str, Plain], *, keep: bool = False) -> schema.ServiceReply:
         """Change settings until the next start of the daemon, for example `{"rates.state": 5.0}`.
 
-        The daemon changes all of the settings or none. A lowered speed, acceleration or jerk in
-        `limits` stays lowered after the next start. With `keep`, the daemon also writes the
-        settings into its configuration file. The reply names the file, or says why the settings are
-        refused or not written.
+        The daemon changes all of the settings or none. Unlike other settings, a lowered speed,
+        acceleration or jerk in `limits` stays lowered after the next start. With `keep`, the daemon
+        also writes the settings into its configuration file. The reply names the file, or says why
+        the settings are refused or not written.
         """
         fields: dict[str, object] = {"settings": settings}
         return self.request("set", fields | {"keep": True} if keep else fields)
@@ -379,8 +380,9 @@ class Client:
             said = reply.err.payload.to_string() if reply.err is not None else ""
             if said == TIMED_OUT:
                 raise NoAnswerError(
-                    f"no answer on {self.key(name)} within {REPLY_TIMEOUT_S:g} s: the daemon or "
-                    "the network is stuck; try again, or run `acsard doctor` on the robot"
+                    f"no answer on the Zenoh key {self.key(name)} within {REPLY_TIMEOUT_S:g} s: "
+                    "the daemon or the network is stuck; try again, or run `acsard doctor` on the "
+                    "robot"
                 )
             # Repeat a query, but not a service call: since the first attempt, another client may
             # have called a service with the opposite effect.
@@ -403,14 +405,14 @@ class Client:
     def _refused(self, name: str) -> MendableError:
         if self.session.is_closed():
             return NoAnswerError(
-                "the connection of this client is closed: use a client within the `with` block of "
-                "`connect`"
+                "the connection of this client is closed: use the client only inside the `with` "
+                "block of `connect`"
             )
         return UsageError(f"{name!r} is not a key; `acsard topics` lists them")
 
     def _unanswered(self, name: str) -> MendableError:
         """Return the error for a query of the key `name` without a reply; the text says why."""
-        key, no_answer = name.partition("?")[0], f"no answer on {self.key(name)}"
+        key, no_answer = name.partition("?")[0], f"no answer on the Zenoh key {self.key(name)}"
         if unknown(key):
             return NoAnswerError(f"{no_answer}: {key} is not in the topic table ({key_hint(key)})")
         if self.where.tls:
@@ -433,8 +435,8 @@ class Client:
     def unheard(self, error: UnheardError | NoAnswerError) -> MendableError:
         """Return the error to raise in place of `error`, which ended a drive or a query.
 
-        It is one that `acsard.client` documents, and names this client's role if that may be the
-        reason.
+        The returned error is one of those that `acsard.client` documents. Its text names the role
+        of this client if the role may be the reason.
         """
         if isinstance(error, UnheardError) and not self.where.tls:
             return NotDrivenError(str(error))

@@ -74,7 +74,7 @@ _UNITS = (("d", 86_400), ("h", 3_600), ("min", 60), ("s", 1))
 
 
 def lasting(seconds: float) -> str:
-    """Format a duration in its two largest units ("2 h 5 min"), or below 1 min in s ("7.3 s")."""
+    """Format a duration in its two largest units ("2 h 5 min"). Below 1 min, use s ("7.3 s")."""
     if seconds < 59.95:
         return f"{round(seconds, 1):g} s"
     parts: list[tuple[int, str]] = []

@@ -9,12 +9,13 @@ in the same way as the MCU, and passes a line only if all of these conditions ho
 - No wheel is faster than in the last line sent, unless there is a fresh command, the link is up and
   the mode is `driving` (rule 2 of `acsard/README.md`).
 - Without a link, all wheel speeds are zero.
-- All wheel speeds are zero if the robot must be at rest by now. This is so after the longest ramp
-  to rest since the last fresh command, and after the longest stop since a stop, a fault or a
-  shutdown. `MARGIN_NS` is added to each of the two times.
+- All wheel speeds are zero if the robot has had enough time to brake to rest. This is the case if
+  the last fresh command is older than the longest ramp to rest, or if a stop, a fault or a shutdown
+  began longer ago than the longest stop takes. `MARGIN_NS` is added to each of these two durations.
 
 Otherwise the guard replaces the line with the stop line, and the robot latches a fault. The guard
-remembers when the two times began, so a recording stores its `Memory`.
+keeps the times of the last fresh command and of the last stop in its `Memory`. A recording stores
+the `Memory`, so that a replay makes the same decisions.
 """
 
 from __future__ import annotations
@@ -48,15 +49,16 @@ class Memory(Struct, frozen=True):
     last: bytes = b""
     """The last line that was written to the serial port; empty before the first one."""
     commanded_ns: int | None = None
-    """Monotonic time of the last step with a fresh command in mode `driving`, ns, if any."""
+    """Monotonic time, ns, of the last control step with a fresh command in mode `driving`. None
+    before the first such step."""
     halted_ns: int | None = None
     """Monotonic time at which the mode became one of `HALTED`, ns. None in any other mode."""
     ramp_ns: int = 0
-    """Time of a ramp from full speed to rest, ns. It is the longest with all limits that were in
-    force since the robot was last at rest."""
+    """Duration of a ramp from full speed to rest, ns. If the limits have changed since the robot
+    was last at rest, the longest duration that any of these limits gave is kept."""
     stop_ramp_ns: int = 0
-    """Time of a stop from full speed, ns. It is the longest with all limits that were in force
-    since the robot was last at rest."""
+    """Duration of a stop from full speed, ns. If the limits have changed since the robot was last
+    at rest, the longest duration that any of these limits gave is kept."""
 
 
 class Guard:
@@ -72,7 +74,11 @@ class Guard:
         self.use(config)
 
     def use(self, config: Config) -> None:
-        """Use `config` from now on. Until rest, the longer of the two ramp times applies."""
+        """Use `config` from now on.
+
+        Until the robot is at rest, the longer of the ramp times of the old and the new
+        configuration applies.
+        """
         self._require_check = config.mcu.link_check == "require"
         self._most = int(config.limits.wheel_speed * 100 + 1)
         self._timeouts = {s.name: s.timeout * 1e9 for s in config.commands.sources}
@@ -81,7 +87,7 @@ class Guard:
 
     @property
     def memory(self) -> Memory:
-        """The memory with which another guard can continue the checks of this one."""
+        """The memory with which another `Guard` can continue the checks of this `Guard`."""
         return Memory(self._last, self._commanded_ns, self._halted_ns, *self._longest)
 
     def left(self, line: bytes) -> None:
@@ -115,22 +121,22 @@ class Guard:
     def _objection(self, line: bytes, outputs: Outputs, before: Wheels) -> str:
         wheels = _wheels(line)
         if wheels is None or not (line[31:] == self._stop[31:] or self._sealed(line)):
-            return "it is not a complete line with four wheel speeds"
+            return "the line is not complete, or does not have four wheel speeds"
         if wheels == _ZERO:
             return ""
         if max(wheels) > self._most or min(wheels) < -self._most:
-            return "it moves a wheel faster than limits.wheel_speed"
+            return "the line moves a wheel faster than limits.wheel_speed"
         if not outputs.linked:
-            return "it moves a wheel while the serial link is not up"
+            return "the line moves a wheel while the serial link is not up"
         if self._require_check and b"#" not in line:
-            return "it moves a wheel without the checksum that mcu.link_check requires"
+            return "the line moves a wheel without the checksum that mcu.link_check requires"
         grows = wheels != before and any(
             abs(new) > abs(old) or new * old < 0 for new, old in zip(wheels, before, strict=True)
         )
         if grows and not self._commanded(outputs):
-            return "it speeds up a wheel without a fresh command, or not in mode driving"
+            return "the line speeds up a wheel without a fresh command, or not in mode driving"
         if self._late(outputs.now.mono_ns):
-            return "it still moves a wheel although the longest ramp to zero has ended"
+            return "the line still moves a wheel although the longest ramp to zero has ended"
         return ""
 
     def _late(self, now_ns: int) -> bool:

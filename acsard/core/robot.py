@@ -1,10 +1,10 @@
 """The robot as one pure object: `Robot.step(Inputs) -> Outputs` calls all its parts in order.
 
 A step updates the odometry with the feedback, chooses one command, checks that the mode allows it,
-limits it, converts it to wheel speeds and reports. It does no I/O: its inputs are time, bytes and
-commands, and its outputs are decisions. Only a step changes the memory of `Robot`, except that the
-control loop adds to `counters`. The control loop reads and writes the port, and `core/guard.py`
-checks each line before it is written.
+limits this command, converts it to wheel speeds and reports. A step does no I/O: its inputs are
+time, bytes and commands, and its outputs are decisions. Only a step changes the memory of `Robot`,
+except that the control loop adds to `counters`. The control loop reads and writes the port, and
+`core/guard.py` checks each line before it is written.
 """
 
 from __future__ import annotations
@@ -62,7 +62,8 @@ stall of the process. If 1.5 control periods are longer, that time applies inste
 
 UNHEARD_S = WATCHDOG_S - 0.05
 """If no line was written to the port for this time, s, the next speeds start from rest, because the
-MCU has stopped the motors after `WATCHDOG_S`. Its clock may run a little fast: hence the 0.05 s."""
+MCU has stopped the motors after `WATCHDOG_S`. The 0.05 s are there because the clock of the MCU may
+run a little fast."""
 
 HALTED = (Mode.STOPPED, Mode.FAULT, Mode.SHUTDOWN)
 """Modes in which the robot brakes at the stop deceleration."""
@@ -105,23 +106,23 @@ class Robot:
         self._choice = Choice()
         self._speeds = STILL
         self._made_of: tuple[int | None, Mode] | None = (None, self._life.mode)
-        """Arrival of the command, monotonic ns, and mode that determined the last computed line.
-        After a press of the emergency stop or a bumper, the whole value is None, so that a new line
-        is due at once."""
+        """The command and the mode for which the last line was computed. The command is represented
+        by its arrival time, monotonic ns, or None without a command. After a press of the emergency
+        stop or a bumper, the whole value is None, so that a new line is due at once."""
         self._made_ns = 0
         """Monotonic time at which the last line was computed, ns."""
         self._made = self._said = (self._limiter.state, 0)
-        """States of the limiter with their monotonic times, ns. `_made` belongs to the last
-        computed line, and `_said` to the last line written to the port. `_settle` undoes a line
-        that was not written."""
+        """Two states of the limiter, each with its monotonic time, ns. `_made` belongs to the last
+        computed line, and `_said` to the last line written to the port. If a line was not written,
+        `_settle` sets `_made` back to `_said`."""
         self._status = ("", "", "", "")
         self._battery_level = ""
-        """The level of the battery in the previous step, "" before its first report."""
+        """The level of the battery in the previous step, "" before the board's first report."""
         self.counters: Counter[str] = Counter()
-        """Counters since the start. `commands` counts accepted commands, and `command_<reason>`
-        refused ones. `commands_of_new_senders` counts the commands of senders whose delay is still
-        being checked. Other counters count events. The control loop adds the counters of the port
-        and of the bus."""
+        """Counters since the start of the daemon. `commands` counts accepted commands, and
+        `command_<reason>` refused ones. `commands_of_new_senders` counts the commands of senders
+        whose delay is still being checked. Other counters count events. The control loop adds the
+        counters of the port and of the bus."""
         self._refused = ""
         self._refused_ns: int | None = None
         self._sanity = Sanity(config.feedback)
@@ -131,7 +132,8 @@ class Robot:
         self._answered = UnansweredLines(config.mcu.reply_period)
         self._tally = EventThrottle()
         self._asked: tuple[str, str, int | None] = ("", "", None)
-        """Verb, client and time of the last request: each stop arrives twice but is logged once."""
+        """Verb, client and arrival time of the last request. A call `stop` reaches the robot twice
+        (for the stop and for the reply), and this value prevents a second log line."""
         self._told = CommandEvents(self._life.mode)
         self._port_trouble = ""
         self._linked_once = False
@@ -175,7 +177,7 @@ class Robot:
 
     @property
     def travelled(self) -> float:
-        """Distance driven since the start according to the odometry, forwards plus backwards, m."""
+        """Distance since the daemon's start by the odometry, forwards plus backwards, m."""
         return self._odometry.travelled
 
     def step(self, inputs: Inputs) -> Outputs:
@@ -300,7 +302,7 @@ class Robot:
     def _watch_inputs(self, now: Instant, events: list[Event]) -> None:
         """React to the emergency stop, bumpers, driver fault and battery that the board reports.
 
-        A press that has already ended still stops the robot.
+        A press that began and ended since the last step still stops the robot.
         """
         estop, bumpers, statuses = self._estop, self._bumpers, self.session.statuses
         events += estop.look(statuses, now.mono_ns)
@@ -342,8 +344,8 @@ class Robot:
     def _keep_away(self, now_ns: int) -> None:
         """Reduce the chosen command to its motion away from the pressed bumpers.
 
-        If no part of the command leads away from them, each sender must send a zero again.
-        Otherwise the robot would drive against the obstacle as soon as the bumper is released.
+        If no part of the command leads away from them, each sender must send a zero again. Without
+        this rule, the robot would drive against the obstacle as soon as the bumper is released.
         """
         twist = self._choice.twist
         if twist is None:
@@ -397,7 +399,9 @@ class Robot:
 
     def _serve(self, inputs: Inputs, events: list[Event]) -> tuple[Answer, ...]:
         if inputs.guard_trip:
-            trip = f"the guard replaced a line to the board by zeros: {inputs.guard_trip}"
+            trip = (
+                f"the daemon's guard replaced a line for the board with zeros: {inputs.guard_trip}"
+            )
             self._fault(trip, inputs.now, events)
             self._life.caused_again(inputs.now.mono_ns)
         if inputs.shutting_down and self._life.mode is not Mode.SHUTDOWN:

@@ -17,7 +17,7 @@ MOST_BINS = 1500
 """Maximum number of bins (time intervals) of a curve: two for each pixel of a picture's width."""
 
 FIRST_WIDTH = 0.001
-"""Bin width of a curve at the start, s. It is shorter than the interval between the robot's steps,
+"""Bin width of a new curve, s. It is shorter than the interval between the robot's steps,
 so a short recording is not thinned."""
 
 MOST_SPANS = 1500
@@ -25,7 +25,7 @@ MOST_SPANS = 1500
 MOST_PLACES = 4000
 
 FIRST_STRIDE = 0.001
-"""Minimum distance between two kept places at the start, m. It doubles when a path is full."""
+"""Minimum distance between two kept places of a new path, m. It doubles when the path is full."""
 
 
 class Point(NamedTuple):
@@ -107,7 +107,10 @@ class Span(NamedTuple):
 
 
 class Band:
-    """A state over time, as time spans. If there are too many, short ones are merged."""
+    """A state over time, as time spans.
+
+    If there are too many spans, short spans are merged with their neighbours.
+    """
 
     def __init__(self, ranks: Sequence[str], most: int = MOST_SPANS) -> None:
         """Create an empty band. When spans are merged, the kind earlier in `ranks` wins."""
@@ -162,7 +165,10 @@ class Place(NamedTuple):
 
 
 class Track:
-    """A thinned path. Each place of the path is less than twice `stride` away from a kept place."""
+    """A thinned path.
+
+    Each place of the path is less than `2 * self.stride` m away from a place that is kept.
+    """
 
     def __init__(
         self,

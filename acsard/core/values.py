@@ -30,7 +30,10 @@ class AcsardError(Exception):
 
 
 class Instant(Struct, frozen=True, gc=False):
-    """One moment, by the monotonic clock for ages and periods, and by the wall clock for stamps."""
+    """One moment as the time of two clocks.
+
+    The monotonic clock serves for ages and periods, the wall clock for stamps.
+    """
 
     mono_ns: int
     wall_ns: int
@@ -80,7 +83,10 @@ class PoseCovariance(Struct, frozen=True, gc=False):
 
 
 class TwistVariances(Struct, frozen=True, gc=False):
-    """Variances of one feedback line's twist in base_link: m2/s2, and rad2/s2 for `angular`."""
+    """Variances of the twist that one feedback line gives, in base_link.
+
+    The unit is m2/s2, but rad2/s2 for `angular`.
+    """
 
     linear: float
     lateral: float
@@ -111,12 +117,14 @@ class Command(Struct, frozen=True):
     clock: str = ""
     sender: str = ""
     cancelled: bool = False
-    """Whether the requested speeds are not zero but result in a zero twist, such as a speed along
-    y. Such a command does not count as the zero that a sender must send first."""
+    """Whether the sender requested a speed that the robot cannot follow, such as one along y, so
+    that `twist` is zero. Such a command is not the zero that a sender must send first."""
     sequence: int | None = None
-    """Number of this command, counted by its sender; None without one. Gaps mean lost commands."""
+    """Number that the sender gave to this command, or None. Gaps between the numbers of a sender
+    mean lost commands."""
     shared: bool = False
-    """Whether programs may share this `sender`: through a bridge, or if only the key is known."""
+    """Whether several programs may have the same `sender`, because they are behind a bridge or
+    because the daemon knows only the key of their commands."""
     ros: bool = False
     """Whether the command came from ROS. ROS tools do not send a zero command by themselves."""
     stamp_replaced: bool = False
@@ -132,14 +140,14 @@ Plain = bool | int | float | str | list[float | str]
 
 
 class Request(Struct, frozen=True):
-    """A service call or a stop. `id` identifies the caller; 0 means that no caller waits."""
+    """A service call or a stop. `id` identifies the caller; 0 if no caller waits for an answer."""
 
     verb: Verb
     id: int = 0
     pose: Pose | None = None
     asked_ns: int | None = None
-    """Monotonic time at which the request arrived, ns; None means the time of the step. A `clear`
-    needs it, because it must not undo a stop that arrived later."""
+    """Monotonic time at which the request arrived, ns. None means the time of the control step that
+    serves the request. A `clear` needs this time, because it must not undo a later stop."""
     by: str = ""
     """Name of the client that sent the request, as `core/incoming/commands.py` forms it."""
     settings: dict[str, Plain] = {}
@@ -157,7 +165,10 @@ class Answer(Struct, frozen=True):
 
 
 class Refusal(Struct, frozen=True):
-    """A refused command, counted in `command_<reason>`. Unknown `source` and `sender` are ""."""
+    """A refused command, which increments the counter `command_<reason>`.
+
+    `source` and `sender` are "" if they are unknown.
+    """
 
     reason: str
     text: str
@@ -189,7 +200,10 @@ Level = Literal["info", "warning", "error"]
 
 
 class Event(Struct, frozen=True):
-    """An event for the log. `event_throttle.py` joins those of one name into one line a second."""
+    """An event for the log.
+
+    `event_throttle.py` joins frequent events that have the same name into one log line per second.
+    """
 
     name: EventName
     text: str
@@ -213,11 +227,12 @@ class Estimate(Struct, frozen=True, gc=False):
     covariance: PoseCovariance
     twist_variances: TwistVariances
     positions: tuple[float, float, float, float]
-    """Wheel angles since the start, rad, continuous, in `WHEELS` order."""
+    """Angle that each wheel has rolled since the daemon started, rad, in `WHEELS` order. Each full
+    revolution adds 2 pi."""
     speeds: WheelSpeeds
     asked_ns: int | None = None
-    """Monotonic time at which the daemon wrote the command line that the feedback answers, ns. None
-    if it is unknown which line the feedback answers."""
+    """Monotonic time at which the daemon wrote the line that the feedback answers, ns. None if the
+    daemon does not know which line that is."""
     heard_ns: int = 0
     """Monotonic time, ns, at which the daemon had received the complete feedback line."""
 
@@ -229,18 +244,28 @@ class Wait(Struct, frozen=True):
         "nothing", "command", "proof", "late", "neutral", "zeros", "higher", "equal", "senders"
     ]
     source: str = ""
-    """The source that the condition is about. It must send a zero (`neutral`), must show that its
-    delays are steady (`proof`), sends late commands (`late`), sends only zeros (`zeros`), or drives
-    the robot with a higher or an equal priority (`higher`, `equal`)."""
+    """The source that the condition `what` names, "" if it names none.
+
+    - neutral, proof, late: The waiting source itself. It must send a zero, must show that its
+      delays are steady, or sends its commands too late.
+    - zeros: The source that controls the robot, but sends only zeros.
+    - higher, equal: The source that controls the robot with a higher or an equal priority.
+    """
     seconds: float = 0.0
-    """A duration, s. `neutral`: a shared sender must send no speed for this time after its zero.
-    `proof`: the delays must be steady for this time. `late`: commands arrive later than this."""
+    """A duration, s, whose meaning depends on `what`.
+
+    - neutral: A sender with a shared identity must send no speed for this time after its zero.
+    - proof: The delays of the commands must be steady for this time.
+    - late: The commands arrive with a delay that is longer than this time.
+    """
     senders: int = 0
     """Number of senders that wait while the robot follows another sender of the same source."""
     lasts: float = 0.0
-    """Duration of the wait, s, rounded down to a few values so that it seldom changes."""
+    """Time for which the source has sent speeds without a zero (`neutral`) or only zeros (`zeros`),
+    s. The time is rounded down to one of a few values, so that it seldom changes."""
     kept: str = ""
-    """The source that sends speeds but must wait for `source`, which sends only zeros."""
+    """Name of a source whose speeds have no effect, because `self.source` controls the robot and
+    sends only zeros. It is "another sender of NAME" if both senders belong to the same source."""
     ros: bool = False
     """Whether the sender that must send a zero uses ROS."""
     shared: bool = False
@@ -248,7 +273,10 @@ class Wait(Struct, frozen=True):
 
 
 class SourceStatus(Struct, frozen=True):
-    """A command source. `age_s` is the time since its last accepted command, None without one."""
+    """A command source.
+
+    `age_s` is the time since the last accepted command of the source, None before the first one.
+    """
 
     name: str
     priority: int
@@ -266,9 +294,11 @@ class WheelsStatus(Struct, frozen=True):
     slipping: tuple[str, ...] = ()
     """The sides that slip, `left` and `right`, now or within the last half second."""
     differ: tuple[float, float] = (0.0, 0.0)
-    """Learned fraction by which the front wheel turns more than the rear wheel, left and right."""
+    """Learned fraction by which the front wheel rolls farther than the rear wheel: first for the
+    left side, then for the right side."""
     slow: tuple[str, ...] = ()
-    """Wheels slow in the commanded direction, each with its share of the expected speed."""
+    """Wheels that are slower than commanded, each with its share of the expected speed, such as
+    "front_left 60%"."""
 
 
 class RoutersStatus(Struct, frozen=True):
@@ -331,7 +361,7 @@ the board no longer reports it, which counts as pressed."""
 BatteryLevel = Literal["ok", "warning", "return", "stop", "unknown"]
 """The level of the battery by the thresholds in `[battery]`; "ok" if no threshold is set. `unknown`
 means that the board does not report the value that is compared with the thresholds (V or %), or has
-reported it only for a few seconds."""
+reported it only for a few seconds so far."""
 
 
 class BatteryStatus(Struct, frozen=True, gc=False):
@@ -425,8 +455,8 @@ class Inputs(Struct, frozen=True):
     shutting_down: bool = False
     """Whether the daemon is going down. The robot then ramps to zero and stays there."""
     late_ns: int = 0
-    """Time from the start of the previous step to the writing of its line, ns, if the process
-    stalled in between; 0 otherwise."""
+    """Time from the start of the previous step to the writing of its line, ns. A time below 1 ms,
+    which is usual unless the process stalls, counts as 0."""
 
 
 class Outputs(Struct, frozen=True):
@@ -434,7 +464,8 @@ class Outputs(Struct, frozen=True):
 
     now: Instant
     due: bool
-    """Whether a line for the board was due in this step, for the control period or at once."""
+    """Whether this step had to compute a line for the board: the line of a control period, or an
+    extra line for a new command or mode."""
     line: bytes | None
     """The line for the board; None if no line was due."""
     speeds: WheelSpeeds
@@ -454,8 +485,8 @@ class Outputs(Struct, frozen=True):
     events: tuple[Event, ...] = ()
     answers: tuple[Answer, ...] = ()
     news: bool = False
-    """Whether the command or the mode has changed since the last computed line, or the emergency
-    stop or a bumper was pressed."""
+    """Whether there is a reason for an extra line: since the last computed line, the command or the
+    mode has changed, or the emergency stop or a bumper was pressed."""
     latches: Latches = Latches()
     """The latches in force after the step. A new object means that a latch or a limit changed."""
 
@@ -470,7 +501,7 @@ class Spread(Struct, frozen=True):
 
 
 class Measured(Struct, frozen=True):
-    """A latency of the daemon, us."""
+    """Statistics of one latency of the daemon, in us."""
 
     since_start: Spread = Spread()
     last_minute: Spread = Spread()
@@ -503,7 +534,7 @@ class Snapshot(Struct, frozen=True):
     feedback_age_s: float | None = None
     """Seconds since the last valid line of the board, None before the first one."""
     missed_last_minute: int = 0
-    """Number of periods without a step in the last minute."""
+    """Number of control periods in the last minute in which no control step ran."""
     figures: dict[str, Measured] = {}
     """The latencies of the daemon, by the names in `daemon/latencies.py`."""
     gyro: GyroStatus = GyroStatus()
@@ -520,11 +551,12 @@ class Snapshot(Struct, frozen=True):
     check: str = "plain"
     """The checksum that the serial lines carry, in words; "plain" without one."""
     encoders: tuple[int, ...] = ()
-    """Configured encoder counts per wheel turn, in `WHEELS` order. 0 if none is configured, or if
-    the board does not compute its speeds as a whole number of counts divided by a time."""
+    """Configured encoder counts per wheel revolution, in `WHEELS` order. 0 if none is configured,
+    or if the board does not compute its speeds as a whole number of counts divided by a time."""
     sender: str = ""
     """The sender whose command the robot follows, "" without one."""
     routers: RoutersStatus = RoutersStatus()
     recording: Recording = Recording()
     latch_file: str | None = None
-    """Why the latches would not survive a restart; "" if they would, None if not stored."""
+    """Why the latches would not survive a restart, in words; "" if they would. None if this daemon
+    has no latch file."""

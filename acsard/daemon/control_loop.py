@@ -61,16 +61,23 @@ FEEDBACK = ("odom", "tf", "wheel_states")
 
 QUERIES_PER_STEP = 8
 """Largest number of queries that one step answers. Further queries wait for the next step, so that
-a flood of queries does not cost a period."""
+a flood of queries does not make the control loop miss a period."""
 
 LATE_NS = 1_000_000
-"""Shortest delay that is passed to the robot, ns: from the start of a step to the write of its
-line. A shorter delay is passed as 0, because the sample times are not that accurate."""
+"""Shortest delay that counts between the start of a step and the write of its line, ns. A shorter
+delay is passed to the robot as 0, because the sample times are not that accurate."""
 
-NOT_STORED = "the disk has not stored this yet; until then, a restart may lose a stop"
+NOT_STORED = (
+    "the new state is not stored on the disk yet; if the daemon restarts before that, it may lose "
+    "a stop"
+)
 """Text added to an answer that no longer waits for the latch file, because the disk is slow."""
 
-BUS_STUCK = Event("bus_stuck", "the bus accepts no messages; driving goes on", "warning")
+BUS_STUCK = Event(
+    "bus_stuck",
+    "the Zenoh bus accepts no messages from the daemon; the daemon goes on driving the robot",
+    "warning",
+)
 
 
 class ControlLoop:
@@ -161,12 +168,15 @@ class ControlLoop:
 
     @property
     def retry_ns(self) -> int | None:
-        """Monotonic time at which the waiting command gets its step, ns; None if none waits."""
+        """Monotonic time, ns, of the extra step for a command that came too soon after a line.
+
+        None if no command waits.
+        """
         return self._pace.retry_ns(self._port.sent_ns) if self._pace.waits else None
 
     @property
     def listens(self) -> bool:
-        """Whether a command that arrives now gets a step of its own, before the next period."""
+        """Whether a command that arrives now gets an extra step before the next period."""
         return self._pace.listens
 
     def step(self, now: Instant, period: Period = NO_PERIOD) -> Outputs:
@@ -393,13 +403,19 @@ class ControlLoop:
     def _keep(self, request: Request, now: Instant) -> None:
         """Pass a `set` with `keep` to the settings file. Refuse it if there is no settings file."""
         if self._settings_file is None:
-            text = "nothing is set: this daemon has no configuration file; leave out `keep`"
+            text = (
+                "nothing is set: this daemon has no configuration file in which to keep settings; "
+                "leave `keep` out of the request"
+            )
             self._answers.append((now.mono_ns, Answer(request.id, False, text)))
         else:
             self._settings_file.keep(request, now.mono_ns)
 
     def _keepable(self, now: Instant) -> tuple[Request, ...]:
-        """Return each `set` with `keep` that the file can store. Queue the answers to others."""
+        """Return each `set` with `keep` that the settings file can store.
+
+        Queue an answer for each `set` with `keep` that it cannot store.
+        """
         if self._settings_file is None:
             return ()
         results = self._settings_file.results(now.mono_ns, self._others)

@@ -109,14 +109,17 @@ async def run(
     page: Sequence[str] | None = None,
     settings_file: SettingsFile | None = None,
 ) -> None:
-    """Run until a signal; raise a `MendableError` if the daemon cannot start.
+    """Run the daemon until a signal ends it.
+
+    Raises a `MendableError` if the daemon cannot start.
 
     Args:
         announce: called once when everything runs.
         gateway: arguments of the `acsard gateway` process, which this daemon starts if
             `bus.outside` names endpoints. None if the gateway is a service of its own.
         page: arguments of the `acsard web` process, or None for no page.
-        settings_file: the configuration file, to compare and store settings. None to do neither.
+        settings_file: the configuration file. The daemon compares it with the settings in force,
+            and stores settings in it. With None the daemon does neither.
     """
     wake = Wakeup()
     manager = Systemd(os.environ, os.getpid())
@@ -279,7 +282,7 @@ async def _patience(config: Config, log: Log, manager: Systemd) -> AsyncIterator
     if config.bus.mode == "peer":
         yield
         return
-    why = f"waits for the router at {', '.join(config.bus.connect)}"
+    why = f"the daemon waits for the Zenoh router at {', '.join(config.bus.connect)}"
     log.info("connecting", text=why)
 
     async def repeat() -> None:

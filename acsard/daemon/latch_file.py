@@ -44,8 +44,9 @@ from acsard.host.mailbox import Mailbox
 from acsard.host.threads import NoThreadError, in_thread
 
 START_S = 2.0
-"""Time limit of one write, of one sync, and of the read and write at the start together, s. If a
-disk takes longer, the daemon reports that it hangs."""
+"""Time limit of one write of the file and of one sync, s. When the daemon starts, it is the limit
+of the first read and write together. If the disk takes longer, the daemon reports that the disk
+hangs."""
 
 PACE_S = 0.05
 """Pause after each successful write, s. A flood of stops, each of which is a new latch, must not
@@ -67,7 +68,11 @@ NO_PLACE = "no directory"
 
 
 def place(config: Config, environ: Mapping[str, str]) -> Path:
-    """Return the path of this robot's latch file. Raise `OSError` if nothing names a directory."""
+    """Return the path of this robot's latch file.
+
+    Raises `OSError` if no directory can be found, for example because the user has no home
+    directory.
+    """
     name = f"{config.robot.id}.latches.json"
     try:
         if config.control.state_directory:
@@ -91,7 +96,10 @@ def place(config: Config, environ: Mapping[str, str]) -> Path:
 
 
 class LatchFile:
-    """The latch file of one robot. Call `start` once, then `keep` after every change."""
+    """The latch file of one robot.
+
+    Call `start()` once, and then `keep()` after every change of the latches.
+    """
 
     def __init__(self, config: Config, environ: Mapping[str, str]) -> None:
         self.where = NO_PLACE
@@ -112,12 +120,12 @@ class LatchFile:
         self._abandoned = False
         """True if `start` has given up waiting for the first read of the file."""
         self._found: Latches | None = None
-        """The latches that the file contained at the start; None until the file has been read."""
+        """The latches in the file when the daemon started; None until the file has been read."""
         self._blind = False
-        """True while the writing thread must still read a file that the start did not read in
-        time."""
+        """True if `start()` could not read the file in time, until the writing thread reads it."""
         self._missed = Latches()
-        """Latches in the file that the robot lacks, because the start could not read it in time."""
+        """Latches in the file that the robot does not have, because `start()` could not read the
+        file in time."""
         self._box = Mailbox[Latches](1)
         """The newest latches that `keep` was given, until the writing thread takes them."""
         self._news = Mailbox[Event](EVENTS)
@@ -261,15 +269,15 @@ class LatchFile:
 
     @property
     def trouble(self) -> str:
-        """Why the latches in force are not kept, in words; "" if they are kept."""
+        """Why the latches in force would not survive a restart, in words; "" if they would."""
         if not all(thread.is_alive() for thread in self._threads):
-            return "the thread that stores stops for the next start has ended; restart the daemon"
+            return "the thread that writes stops to the latch file has ended; restart the daemon"
         failed = self._failed or (HANGS if self._hangs else "")
         return unwritable(self.where, failed) if failed else ""
 
     @property
     def _hangs(self) -> bool:
-        """True if a sync, or a write that delays the newest latches, exceeds `START_S`."""
+        """True if a sync, or a write that delays the newest latches, has taken over `START_S`."""
         if self._failed:
             return False
         busy_ns = None if self._held is self._handed else self._busy_ns
@@ -279,7 +287,8 @@ class LatchFile:
     @property
     def _again(self) -> Event:
         return Event(
-            "latch_file", f"stops will survive a restart again; they are stored in {self.where}"
+            "latch_file",
+            f"stops survive a restart of the daemon again: they are stored in {self.where}",
         )
 
     def close(self) -> None:
@@ -306,7 +315,7 @@ class LatchFile:
             self._box.wait(None if latches is None else RETRY_S)
 
     def _try(self, latches: Latches, now: Instant) -> str:
-        """Write these latches and report a failure. Return its reason, or ""."""
+        """Write these latches. Report a failure and return its reason; return "" on success."""
         self._busy_ns = clock.mono_ns()
         with self._disk:
             if self._blind:
@@ -318,7 +327,10 @@ class LatchFile:
         return trouble
 
     def _read_late(self, now: Instant) -> None:
-        """Read the file that the start could not read, so that no latch in it is overwritten."""
+        """Read the file that `start()` could not read in time.
+
+        Without this call, the next write would overwrite the latches in the file.
+        """
         self._blind = False
         if self._found is None:
             try:
@@ -383,7 +395,11 @@ class LatchFile:
         return ""
 
     def _with_missed(self, latches: Latches) -> Latches:
-        """Add the missed latches for the next start, except a stop: the robot started stopped."""
+        """Return `latches` together with the latches in `self._missed`, for the next start.
+
+        A missed stop is left out. The robot has a stop of its own instead, because `start()`
+        could not read the file.
+        """
         missed = self._missed
         if latches.fault is not None:
             missed = replace_fields(missed, fault=None)
@@ -420,7 +436,7 @@ def _content(path: Path) -> bytes:
             raise OSError(errno.EINVAL, "it is not a regular file")
         data = file.read(MAX_BYTES + 1)
     if len(data) > MAX_BYTES:
-        raise OSError(errno.EFBIG, f"it has more than {MAX_BYTES} bytes")
+        raise OSError(errno.EFBIG, f"the file has more than {MAX_BYTES} bytes")
     return data
 
 

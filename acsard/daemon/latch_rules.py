@@ -17,7 +17,7 @@ from acsard.core.motion.lifecycle import number_after_restart
 from acsard.core.values import NS_PER_S, AcsardError, Event, Instant, Latch, Latches
 
 FORMAT = 1
-"""Version of the format. A file with another version counts as unreadable."""
+"""Version of the latch file's format. A file with another version counts as unreadable."""
 
 MAX_BYTES = 65_536
 """Largest size of a file that is read, bytes. Three latches and all limits take about 1 kB."""
@@ -68,7 +68,8 @@ def decode(robot: str, data: bytes) -> Latches:
         number = raw.get("format") if isinstance(raw, dict) else None
         if type(number) is int and number != FORMAT:
             raise LatchFileError(
-                f"another version wrote it (format {number}, but this daemon reads {FORMAT})"
+                f"another version of acsard wrote the file (format {number}, but this daemon reads "
+                f"format {FORMAT})"
             )
         content = msgspec.convert(raw, _Content)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
@@ -76,7 +77,7 @@ def decode(robot: str, data: bytes) -> Latches:
     if content.robot != robot:
         raise LatchFileError(f"it belongs to the robot {_safe(content.robot)!r:.60}")
     if msgspec.to_builtins(content) != raw:
-        raise LatchFileError("it is damaged (a name is missing or unknown)")
+        raise LatchFileError("it is damaged (a field name is missing or unknown)")
     return content.latches.after_restart()
 
 
@@ -137,18 +138,19 @@ class LatchKeeper(Protocol):
         """Wait until `holds(latches)` is true, but at most `seconds`."""
 
     def news(self) -> list[Event]:
-        """Return the events since the last call."""
+        """Return the events of the storage since the last call, such as a failed write."""
 
     @property
     def trouble(self) -> str:
-        """Why the latches in force are not kept, in words; "" if they are kept."""
+        """Why the latches in force would not survive a restart, in words; "" if they would."""
 
 
 class Handover:
     """Hands the latches of the control loop to their keeper, and reports when they are stored.
 
     The robot stops at once, but the answer to a stop waits until the stop would survive a kill of
-    the process. After `ANSWER_NS` the answer says that the stop is not stored yet.
+    the process. After `ANSWER_NS` the answer is sent in any case, and says that the stop is not
+    stored yet.
     """
 
     def __init__(self, latches: Latches, keeper: LatchKeeper | None) -> None:
@@ -157,7 +159,7 @@ class Handover:
         self._keeper = keeper
 
     def take(self, latches: Latches) -> None:
-        """Hand these latches to the keeper if they are not the same object as the last ones."""
+        """Hand these latches to the keeper, unless this object is the last one handed over."""
         if latches is not self.latches:
             self.latches = latches
             if self._keeper is not None:
@@ -181,7 +183,10 @@ class Handover:
         return self._keeper is None or self._keeper.holds(self.latches)
 
     def wait(self) -> None:
-        """Block until the latches are stored, at most `ANSWER_NS`. Call this only at the end."""
+        """Block until the latches are stored, at most `ANSWER_NS`.
+
+        Call this only when the control loop has ended, because the call would delay a step.
+        """
         if self._keeper is not None:
             self._keeper.wait(self.latches, ANSWER_NS / NS_PER_S)
 
@@ -190,7 +195,10 @@ class Handover:
 
     @property
     def trouble(self) -> str | None:
-        """Why the latches are not kept, in words; "" if they are kept, None without a keeper."""
+        """Why the latches would not survive a restart, in words; "" if they would.
+
+        None without a keeper, which means that latches are not stored.
+        """
         return None if self._keeper is None else self._keeper.trouble
 
 

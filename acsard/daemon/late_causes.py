@@ -1,9 +1,10 @@
 """Names the cause of a late control period from the kernel's counters. This module is pure.
 
 Each cause in the table `CAUSES` has a rule that compares the counters from before the lateness with
-those after it. It returns a clause for a sentence, or "" if its cause does not apply. A duration
-counts only if it is at least `SHARE` of the lateness. Otherwise the small delays of normal load
-would count as causes. Several causes may apply to one lateness, or none.
+the counters from after the lateness. A rule returns the cause in words, or "" if its cause does not
+apply. A delay counts as a cause only if it is at least `SHARE` of the lateness, or the cause's own
+share. Otherwise the small delays of normal load would count as causes. Several causes may apply to
+one lateness, or none.
 
 The kernel also reports how the control loop's thread spent the lateness: it ran, it was ready and
 waited for a processor, or it slept. A slow processor delays only a thread that runs or waits for a
@@ -21,26 +22,28 @@ from acsard.core.values import NS_PER_S, Event
 from acsard.host.kernel_counters import Conditions, Program, Reading, Scheduled
 
 SHARE = 0.5
-"""Smallest share of a lateness that a cause must explain, unless the cause has its own constant."""
+"""Smallest share of a lateness that a cause must explain. Some causes have a constant of their own,
+such as `DISK_SHARE`."""
 
 SLEPT_SHARE = 0.3
 """A disk counts as the cause only if the loop's thread slept for at least this share of the
-lateness. The share is low, because a thread that read pages from a fast virtual disk used the
-processor for as long as it slept."""
+lateness. The share is low, because in a test with a fast virtual disk, a thread that read pages
+from the disk ran on the processor for as long as it slept."""
 
 DISK_SHARE = 0.25
-"""Smallest share of a lateness at which the waiting of all programs for a disk counts. It is low,
-because the kernel counted only 0.28 to 0.45 of the time as waiting while a thread wrote to a disk
-all the time."""
+"""Smallest share of a lateness at which a wait for a disk by any program counts as a cause. The
+share is low, because in a test a thread wrote to a disk all the time, and the kernel counted only
+0.28 to 0.45 of this time as waiting."""
 
 LEAST_STOLEN_NS = 3 * NS_PER_S // 100
-"""Shortest steal time that counts as a cause, ns: three of the kernel's ticks. In a test on a
-virtual machine, 24 of 607 comparisons had one tick of steal time and one had two, although the
-lateness had another cause."""
+"""Shortest steal time (the host used the virtual machine's processor) that counts as a cause, ns:
+three of the kernel's ticks. In a test with 607 late periods that had another cause, the kernel
+counted one tick of steal time in 24 of them, and two ticks in one."""
 
 SUSPENDED_NS = NS_PER_S // 10
-"""Shortest time that counts as a suspend, ns. A suspend shows as a difference between two clocks
-(`suspended`). They are not read at the same moment, so they differ a little without a suspend."""
+"""Shortest time that counts as a suspend, ns. A suspend is measured as a change of the difference
+between CLOCK_BOOTTIME and CLOCK_MONOTONIC. These clocks are not read at the same moment, so the
+difference varies a little even without a suspend."""
 
 
 class Lateness(Struct, frozen=True, omit_defaults=True):
@@ -49,19 +52,20 @@ class Lateness(Struct, frozen=True, omit_defaults=True):
     late_ns: int
     """How late the step came, ns, counted from the due time of the first missed period."""
     loop: Scheduled
-    """Time that the loop's thread ran, and time that it waited for a processor. Both count from the
-    last period before the lateness to the late step."""
+    """Time that the loop's thread ran, and time that it was ready but waited for a processor. Both
+    times count from the last period before the lateness to the late step."""
     before: Reading
     after: Reading
     busiest: Program | None = None
-    """The process that used the processor most; None without a search, or if none used it much."""
+    """The process that used the processor most; None if no process was searched for, or if no
+    process used much."""
 
     def explains(self, duration_ns: int, share: float = SHARE) -> bool:
         return duration_ns >= share * self.late_ns
 
     @property
     def computed(self) -> bool:
-        """Whether the thread ran, or was ready without a processor, for `SHARE` of the lateness."""
+        """Whether the thread ran, or was ready to run, for `SHARE` of the lateness."""
         return self.explains(self.loop.ran_ns + self.loop.waited_ns)
 
     @property
@@ -75,12 +79,12 @@ class Cause(Struct, frozen=True):
 
     name: str
     rule: Callable[[Lateness], str]
-    """Returns the cause as a clause, or "" if this is not the cause."""
+    """Returns the cause in words, or "" if this is not a cause of the lateness."""
     advice: str
 
 
 def suspended(late: Lateness) -> str:
-    """Return the clause for a suspend, in which only CLOCK_BOOTTIME runs on, or ""."""
+    """Return the cause in words if this computer was suspended, else ""."""
     asleep_ns = late.after.asleep_ns - late.before.asleep_ns
     return (
         f"this computer was suspended for {_seconds(asleep_ns)}"
@@ -90,53 +94,56 @@ def suspended(late: Lateness) -> str:
 
 
 def undervoltage(late: Lateness) -> str:
-    """Return the clause for a low supply voltage (`rpi_volt` or `get_throttled`), or ""."""
+    """Return the cause in words if a low supply voltage slowed the loop down, else ""."""
     return low_voltage(late.after.conditions) if late.computed else ""
 
 
 def low_voltage(now: Conditions) -> str:
-    """Return the clause for a supply voltage that is too low now, or ""."""
+    """Return the cause in words if the supply voltage is too low now, else ""."""
     return "the supply voltage is too low, which slows the processor" if now.undervoltage else ""
 
 
 def heat(late: Lateness) -> str:
-    """Return the clause for a processor that heat slows down, or "".
+    """Return the cause in words if a hot processor slowed the loop down, else "".
 
-    The signs are a `thermal_throttle` count that has risen, and an active cooling device. On a
-    Raspberry Pi the bits 1 to 3 of get_throttled are signs too.
+    The signs of heat are a `thermal_throttle` count that has risen, and an active cooling device.
+    On a Raspberry Pi, the bits 1 to 3 of `get_throttled` are signs too.
     """
     hotter = late.after.conditions.throttled > late.before.conditions.throttled
     return hot(late.after.conditions, hotter) if late.computed else ""
 
 
 def hot(now: Conditions, hotter: bool = False) -> str:
-    """Return the clause for heat, or "". `hotter`: the count of slow-downs by heat has risen."""
+    """Return the cause in words if heat slows the processor now, or if it is `hotter`; else "".
+
+    `hotter` says whether the processor's count of slow-downs by heat has risen.
+    """
     return "the processor is too hot and runs slower" if now.hot or hotter else ""
 
 
 def governor(late: Lateness) -> str:
-    """Return the clause for a processor whose clock is limited, or "".
+    """Return the cause in words if a limited clock frequency slowed the loop down, else "".
 
-    The limit of the clock frequency (scaling_max_freq) is compared with the full frequency
-    (cpuinfo_max_freq). For a governor that keeps the lowest frequency, the limit is
-    scaling_min_freq.
+    The limit of the clock frequency (`scaling_max_freq`) is compared with the full frequency
+    (`cpuinfo_max_freq`). For a governor that keeps the lowest frequency, the limit is
+    `scaling_min_freq`.
     """
     return slow(late.after.conditions) if late.computed and not heat(late) else ""
 
 
 def slow(now: Conditions) -> str:
-    """Return the clause for a processor whose clock is limited now, or ""."""
+    """Return the cause in words if the processor's clock frequency is limited now, else ""."""
     clock = now.slow_clock
     if clock is None:
         return ""
     return (
-        f"the governor {clock.governor} keeps the processor at {clock.limit_mhz} of "
+        f"the CPU governor {clock.governor} keeps the processor at {clock.limit_mhz} of "
         f"{clock.full_mhz} MHz"
     )
 
 
 def cgroup_quota(late: Lateness) -> str:
-    """Return the clause for a used-up processor quota (throttled_usec in cpu.stat), or ""."""
+    """Return the cause in words if the daemon's CPU quota (cgroup) was used up, else ""."""
     without_ns = late.after.quota_ns - late.before.quota_ns
     if not late.explains(without_ns):
         return ""
@@ -144,7 +151,7 @@ def cgroup_quota(late: Lateness) -> str:
 
 
 def stolen(late: Lateness) -> str:
-    """Return the clause for steal time, in which the host took the processor away, or ""."""
+    """Return the cause in words if the host took the processor away (steal time), else ""."""
     stolen_ns = most_stolen(late.before, late.after)
     if stolen_ns < LEAST_STOLEN_NS or not late.explains(stolen_ns):
         return ""
@@ -158,7 +165,7 @@ def most_stolen(before: Reading, after: Reading) -> int:
 
 
 def memory(late: Lateness) -> str:
-    """Return the clause for memory pages read from a disk (major page faults), or ""."""
+    """Return the cause in words if memory pages had to be read from a disk, else ""."""
     pages = late.after.major_faults - late.before.major_faults
     if not pages or not late.slept:
         return ""
@@ -166,7 +173,7 @@ def memory(late: Lateness) -> str:
 
 
 def disk(late: Lateness) -> str:
-    """Return the clause for a wait for a disk, or "".
+    """Return the cause in words if the loop's thread waited for a disk, else "".
 
     The wait of the loop's own thread counts, if the kernel measures it. The wait of all programs
     counts only if the loop's thread itself read from a disk or wrote to one, because other programs
@@ -181,7 +188,7 @@ def disk(late: Lateness) -> str:
 
 
 def other_program(late: Lateness) -> str:
-    """Return the clause for other programs that used the processor (schedstat), or ""."""
+    """Return the cause in words if other programs used the loop's processor time, else ""."""
     if cgroup_quota(late) or stolen(late) or not late.explains(late.loop.waited_ns):
         return ""
     for_s = _seconds(late.loop.waited_ns)
@@ -199,49 +206,49 @@ CAUSES = (
     Cause("suspended", suspended, "disable suspend: systemctl mask sleep.target"),
     Cause("undervoltage", undervoltage, "use a stronger power supply and a shorter cable"),
     Cause("heat", heat, "cool the processor"),
-    Cause("governor", governor, "choose the governor schedutil or performance"),
+    Cause("governor", governor, "choose the CPU governor schedutil or performance"),
     Cause("quota", cgroup_quota, "raise CPUQuota= of the service, or --cpus of the container"),
     Cause("steal", stolen, "give the virtual machine a processor of its own"),
     Cause(
         "memory",
         memory,
-        "free memory, or run acsard as the service, which locks the daemon's memory",
+        "free memory, or run acsard as its systemd service, which locks the daemon's memory",
     ),
     Cause("disk", disk, "find the program that uses the disk (`iotop`), or use a faster disk"),
     Cause(
         "processor",
         other_program,
-        "run acsard as the service, and give other real-time programs a priority below 10",
+        "run acsard as its systemd service, and give other real-time programs a priority below 10",
     ),
 )
-"""The causes, the rarer ones first."""
+"""The causes in the order in which an event names them, the rarer ones first."""
 
 
 def causes(late: Lateness) -> tuple[tuple[str, ...], str]:
-    """Return a lateness's causes and a clause with their advice; `((), "")` if there are none."""
+    """Return the names of a lateness's causes, and a text that explains them with their advice."""
     found = [(cause, clause) for cause in CAUSES if (clause := cause.rule(late))]
     clauses = [f"{clause} ({cause.advice})" for cause, clause in found]
     return tuple([cause.name for cause, _ in found]), ", and ".join(clauses)
 
 
 BECAUSE = ", because "
-"""The words before the causes in the text of an event."""
+"""The words in the text of an event that separate the lateness from its causes."""
 
 
 def event_of(late: Lateness, clause: str, *, news: bool) -> Event:
-    """Return the event for a lateness. `clause` comes from `causes`, `news` is `Event.news`."""
+    """Return the event that reports a lateness. `clause` is the text from `causes`."""
     text = f"by {late.late_ns / NS_PER_S:.2f} s{BECAUSE}{clause}"
     return Event("missed_periods", text, "warning", kind="late", news=news)
 
 
 def cause_in(text: str) -> str:
-    """Return the duration and the causes in the text of an event or log line; "" without any."""
+    """Return the lateness and its causes from an event's text; "" if the text has no causes."""
     begin, because, clause = text.partition(BECAUSE)
     return begin.rpartition(": ")[2] + because + clause if because else ""
 
 
 STOLEN_SHARE = 0.02
-"""`present` reports steal time only above this share of the time."""
+"""Smallest share of the time between two readings at which `present` reports steal time."""
 
 
 def present(before: Reading, after: Reading, within_ns: int) -> list[tuple[str, str]]:

@@ -1,12 +1,12 @@
 """Watches for late control periods, and reports their cause if the kernel shows one.
 
 In each period the control loop reads only one small file, `schedstat`, with the processor times of
-its thread. This module's thread reads the kernel's other files, because that takes longer: four
-times a second, and once more after a lateness. `late_causes.py` compares the readings from before
-and after it.
+its thread. The kernel's other files take longer to read, so a thread of this module reads them. It
+does so four times a second, and once more after a late period. `late_causes.py` compares the
+reading from before the lateness with the one from after the lateness.
 
-This module's event has the name `missed_periods`, like the robot's own event. The robot's event
-comes first and states the number of missed periods. The cause is known only later.
+The event of this module has the name `missed_periods`, like an event of the robot. The robot's
+event comes first and states the number of missed periods. The cause is known only later.
 """
 
 from __future__ import annotations
@@ -31,18 +31,20 @@ OWN_TIMES = "/proc/thread-self/schedstat"
 """File with the processor times of the thread that opens it."""
 
 EVERY_S = 0.25
-"""Time between two readings while no period is late, s. A comparison with an older reading would
-include more delays of normal load."""
+"""Time between two readings of the kernel's counters while no period is late, s. With longer gaps,
+the difference between two readings would include more delays from before the lateness."""
 
 HISTORY = 12
-"""Number of kept readings. They cover 3 s, so that one from before a long lateness remains."""
+"""Number of readings that are kept. They cover 3 s, so that one of them is from before the lateness
+even if the lateness was long."""
 
 SETTLE_S = 0.03
 """Time from a late period to the reading after it, s. The kernel updates some counters only at its
 next tick, and ticks are at most 10 ms apart."""
 
 PAUSE_NS = NS_PER_S
-"""Shortest time between two reports, ns. The log shows one line a second for each name."""
+"""Shortest time between two reports of a cause, ns. The log shows at most one line a second for
+each event name."""
 
 CONDITIONS_NS = 10 * NS_PER_S
 """Age at which the conditions of the processor, such as its voltage, are read again, ns. On some
@@ -52,42 +54,45 @@ LOOK_S = 0.2
 """Time between the two readings of all processes in one search for the busiest process, s."""
 
 LOOK_AGAIN_NS = 10 * NS_PER_S
-"""Shortest time between two searches for the busiest process, ns. One takes 20 us per process."""
+"""Shortest time between two searches for the busiest process, ns. A search takes 20 us per
+process."""
 
 NEWS_NS = 60 * NS_PER_S
-"""Time after which a repetition of the same causes is logged immediately, ns. An earlier repetition
-waits for the next log line about missed periods (`Event.news`)."""
+"""Time after which an event with the same causes is logged immediately again, ns. An event that
+comes earlier waits for the next log line about missed periods (`Event.news`)."""
 
 MOST = 16
-"""Largest number of waiting late periods and of waiting events. Newer ones displace the oldest."""
+"""Largest number of late periods that wait for the thread, and of events that wait for `news`. A
+newer item displaces the oldest one."""
 
 
 class Late(Struct, frozen=True):
-    """A late period, as the control loop hands it to the thread."""
+    """A late period, which the control loop passes to the thread of `LateWatch`."""
 
     now_ns: int
     """Monotonic time of the step of the late period, ns."""
     late_ns: int
     before: bytes
-    """Content of `OWN_TIMES` at the period before the late one, b"" if it is unknown."""
+    """Content of `OWN_TIMES` in the period before the late one; b"" if it is unknown."""
     after: bytes
-    """Content of `OWN_TIMES` at the late period, b"" if it is unknown."""
+    """Content of `OWN_TIMES` in the late period; b"" if it is unknown."""
 
     @property
     def loop(self) -> Scheduled:
-        """Time that the loop's thread ran, and time that it waited, from `before` to `after`."""
+        """Times that the loop's thread ran and waited for a processor, from `before` to `after`."""
         before, after = scheduled(self.before), scheduled(self.after)
         return Scheduled(after.ran_ns - before.ran_ns, after.waited_ns - before.waited_ns)
 
 
 class LateWatch:
-    """The watch of one control loop. The loop's thread creates it, and calls `period` and `news`.
+    """Watches the periods of one control loop. The loop's thread must create it.
 
-    Its own thread runs while this context manager is entered.
+    The loop's thread also calls `period` and `news`. A second thread, which reads the kernel's
+    files, runs while this context manager is entered.
     """
 
     def __init__(self, kernel: Kernel | None = None) -> None:
-        """Prepare the thread. Tests pass a `kernel` of their own; None means the real one."""
+        """Prepare the thread. `kernel` reads the kernel's files; only tests pass one."""
         self._kernel = kernel
         self._box = Mailbox[Late](MOST)
         self._news = Mailbox[Event](MOST, lambda: None)
@@ -101,7 +106,8 @@ class LateWatch:
         self._readings: deque[tuple[int, Reading]] = deque(maxlen=HISTORY)
         """The last readings, each with the monotonic time at which it was complete, ns."""
         self._reported: dict[tuple[str, ...], int] = {}
-        """Monotonic time, ns, of the last event that was news, for each combination of causes."""
+        """For each combination of causes, the monotonic time, ns, of its last event that was logged
+        immediately (`Event.news`)."""
         self._busiest: Program | None = None
         self._searched_ns: int | None = None
 
@@ -123,10 +129,10 @@ class LateWatch:
     # The control loop's thread calls these methods.
 
     def period(self, now_ns: int, late_ns: int, missed: int) -> None:
-        """Process a period, and hand it to the thread if periods were missed.
+        """Process a period. If periods were missed, pass the lateness to the thread.
 
-        The step of the period began `late_ns` ns late, at the monotonic time `now_ns`, after
-        `missed` periods without a step.
+        The step of this period began `late_ns` ns late, at the monotonic time `now_ns`. Before it,
+        `missed` periods got no step.
         """
         before, times = self._times, b""
         # Without these times, the thread still finds some of the causes.
@@ -137,7 +143,7 @@ class LateWatch:
             self._box.put(Late(now_ns, late_ns, before, times))
 
     def news(self) -> list[Event]:
-        """Return the events since the last call."""
+        """Return the events that the thread has made since the last call."""
         return self._news.take() if self._news.waiting else []
 
     # The other methods run in the watch's thread.
@@ -167,7 +173,7 @@ class LateWatch:
         self._readings.append((clock.mono_ns(), reading))
 
     def _before(self, now_ns: int) -> Reading | None:
-        """Return the newest reading that was complete at monotonic `now_ns`, None without one."""
+        """Return the newest reading that was complete at monotonic `now_ns`; None if none was."""
         older = [reading for read_ns, reading in self._readings if read_ns <= now_ns]
         return older[-1] if older else None
 
@@ -186,7 +192,7 @@ class LateWatch:
         self._news.put(event_of(late, clause, news=news))
 
     def _busiest_of(self, kernel: Kernel) -> Program | None:
-        """Return the busiest process, or None. The search is at most `LOOK_AGAIN_NS` old."""
+        """Return the busiest process or None, from a search that is at most `LOOK_AGAIN_NS` old."""
         now_ns = clock.mono_ns()
         if self._searched_ns is None or now_ns - self._searched_ns >= LOOK_AGAIN_NS:
             self._busiest, self._searched_ns = kernel.busiest(LOOK_S), now_ns

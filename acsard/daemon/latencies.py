@@ -16,10 +16,11 @@ from typing import Literal, get_args
 from acsard.core.values import NS_PER_S, Estimate, Measured, Outputs, Spread
 
 PER_DECADE = 20
-"""Buckets per factor of ten. A percentile is accurate to 12 %."""
+"""Number of buckets of a histogram per factor of ten. A percentile is accurate to 12 %."""
 
 DECADES = 7
-"""Number of factors of ten, from 1 us. The end buckets also hold shorter and longer durations."""
+"""Number of factors of ten that the buckets cover, from 1 us on. The first bucket also holds
+shorter durations, and the last bucket also holds longer ones."""
 
 LAST = PER_DECADE * DECADES
 """Index of the last bucket."""
@@ -44,7 +45,10 @@ class Histogram:
         self._max = max(self._max, other._max)
 
     def spread(self) -> Spread:
-        """Return the spread. A percentile is the upper end of its bucket."""
+        """Return the median, the 99th percentile and the maximum of all values.
+
+        A percentile is the upper end of its bucket, but at most the maximum.
+        """
         totals = list(accumulate(self._buckets))
         p50, p99 = (self._percentile(totals, share) for share in (0.50, 0.99))
         return Spread(totals[-1], p50, p99, self._max)
@@ -147,7 +151,7 @@ class Stopwatch:
         self._cached_ns = -FRESH_NS
 
     def measured(self, now_ns: int) -> dict[str, Measured]:
-        """Return all figures by name. The values are at most a second old at monotonic `now_ns`."""
+        """Return all latencies by name, computed at most 1 s before monotonic `now_ns`."""
         if now_ns - self._cached_ns >= FRESH_NS:
             self._cached_ns = now_ns
             self._cached = {name: figure.measured(now_ns) for name, figure in self.figures.items()}
@@ -164,7 +168,11 @@ class Stopwatch:
             self._missed.add(now_ns, missed)
 
     def line(self, outputs: Outputs, sent_ns: int, before_ns: int) -> None:
-        """Record the age of the command in a line; `before_ns` is the time of the previous line."""
+        """Record the age that the command in a line had when the line was written.
+
+        `sent_ns` is the time at which the line was written, and `before_ns` that of the previous
+        line.
+        """
         command_ns = outputs.command_ns
         if command_ns is None or outputs.mode != "driving":
             return
@@ -176,8 +184,8 @@ class Stopwatch:
     def feedback(self, estimate: Estimate, told_ns: int | None) -> None:
         """Record the delays of a feedback line.
 
-        `told_ns` is the time at which its messages were queued for the bus. It is None if no client
-        subscribes to them.
+        `told_ns` is the time at which the line's messages were queued for the bus. It is None if no
+        client subscribes to these messages.
         """
         at_ns, asked_ns = estimate.heard_ns, estimate.asked_ns
         if asked_ns is not None:

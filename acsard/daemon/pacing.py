@@ -2,8 +2,8 @@
 
 An early line is written between two periods: for a new command or mode, or after a press of the
 emergency stop or a bumper. It replaces the line of the next period, so a flood of commands does not
-cause more lines. An early line must come at least the wire time of a line plus `BREATH_NS` after
-the previous line. Each period allows one attempt.
+cause more lines. The time from the previous line to an early line must be at least the wire time of
+a line plus `BREATH_NS`. In each period, only one early line may be attempted.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from msgspec import Struct
 
 
 class Period(Struct, frozen=True):
-    """Number of periods that ended since the last step, and monotonic due time of the first, ns."""
+    """Number of periods that ended since the last step, and due time of the first of them, ns."""
 
     expired: int
     due_ns: int
@@ -22,15 +22,20 @@ NO_PERIOD = Period(0, 0)
 
 
 BREATH_NS = 1_000_000
-"""Time for the board's reply between two lines, in addition to the wire time of a line, ns."""
+"""Time that the board has for its reply between two lines, ns. The wire time of a line comes on
+top."""
 
 IDLE_WAKES = 3
-"""If more steps than this in a period had input but no new command or mode, further input waits for
-the next period. This bounds the cost of a flood of messages."""
+"""Largest number of steps in a period that had input but no new command or mode. After one more
+such step, further input waits for the next period. This limit bounds the cost of a flood of
+messages."""
 
 
 class Pace:
-    """Decides when a line may be written. `sent_ns` is the monotonic time of the last line, ns."""
+    """Decides when a line may be written.
+
+    `sent_ns`, an argument of its methods, is the monotonic time of the last line, ns.
+    """
 
     def __init__(self, line_ns: int, period_ns: int) -> None:
         self._gap_ns = line_ns + BREATH_NS
@@ -41,13 +46,13 @@ class Pace:
         self._tried = False
         """Whether this period's attempt to write an early line was made."""
         self._waiting = False
-        """Whether a new command came too soon after a line, and must wait before it is sent."""
+        """Whether a new command came too soon after the last line, so it has not been sent yet."""
         self._idle = 0
 
     def period_ended(self, missed: int) -> bool:
-        """Record the end of a period. Return whether its line must be written (`Inputs.tick`).
+        """Record the end of a period. Return whether a line must be written for this period.
 
-        The line is left out if an early line has replaced it and no period was `missed`.
+        No line is needed if an early line has replaced it, unless periods were `missed`.
         """
         ahead, self._ahead, self._tried = self._ahead, False, False
         self._idle = 0
@@ -80,9 +85,9 @@ class Pace:
 
     @property
     def waits(self) -> bool:
-        """Whether a new command waits because the last line was written too short a time ago."""
+        """Whether a new command waits because it came too soon after the last line."""
         return self._waiting and self._possible and not self._tried
 
     def retry_ns(self, sent_ns: int) -> int | None:
-        """Return when the waiting command may be written (monotonic ns), or None if none waits."""
+        """Return when the waiting command may be written, monotonic ns; None if none waits."""
         return sent_ns + self._gap_ns if self.waits else None

@@ -15,34 +15,39 @@ from acsard.daemon.bus.zenoh_sessions import MESSAGE_BYTES
 from acsard.host.errors import Exit, ExitError
 
 MAX_BYTES = 50_000
-"""Largest size of the file, bytes. It is lower than `MESSAGE_BYTES`, because JSON needs two bytes
-for each quotation mark and each line end."""
+"""Largest size of the URDF file, bytes. It is lower than `MESSAGE_BYTES`, because JSON needs two
+bytes for each quotation mark and each line end."""
 
 MAX_JSON = MESSAGE_BYTES - 1024
-"""Largest size of the description as JSON, bytes. The rest is for the key and Zenoh's headers."""
+"""Largest size of the description as JSON, bytes. The other 1024 bytes of a message are for the
+Zenoh key and Zenoh's headers."""
 
 XACRO = "/xacro}"
-"""Text in the tag of a xacro element, which ElementTree writes as "{NAMESPACE}NAME". The namespace
-is http://www.ros.org/wiki/xacro, http://ros.org/wiki/xacro or similar."""
+"""Text by which the tag of a xacro element is found. ElementTree writes such a tag as
+"{NAMESPACE}NAME", and the namespace is http://www.ros.org/wiki/xacro, http://ros.org/wiki/xacro or
+similar."""
 
 DOCUMENT_TYPE = "<!DOCTYPE"
-"""Refused in the file, because the entities of a document type could expand to any length."""
+"""Beginning of a document type. A URDF file with one is refused, because the entities of a document
+type could expand to any length."""
 
 
 def robot_description(path: str) -> str:
-    """Return the URDF at `path`, or "" if `path` is "". Raises `ExitError` if it is not usable."""
+    """Return the URDF at `path`, or "" if `path` is "". Raises `ExitError` for an unusable file."""
     if not path:
         return ""
     file = Path(path)
     try:
         # Reading a pipe would never end.
         if file.exists() and not file.is_file():
-            raise _error(path, "it is not a file; name the URDF itself")
+            raise _error(path, "it is not a regular file; name the URDF file itself")
         with file.open("rb") as opened:
             data = opened.read(MAX_BYTES + 1)
     except FileNotFoundError:
         raise _error(
-            path, 'there is no such file; give its full path, or ros.urdf = "" for no description'
+            path,
+            'there is no such file; write the full path of the URDF, or set ros.urdf = "" to '
+            "publish no robot description",
         ) from None
     except PermissionError:
         raise _error(
@@ -58,7 +63,7 @@ def robot_description(path: str) -> str:
     try:
         text = data.decode("utf-8-sig")
         if DOCUMENT_TYPE in text:
-            raise _error(path, f"it has a document type, {DOCUMENT_TYPE} ...>; take it out")
+            raise _error(path, f"it has a document type, {DOCUMENT_TYPE} ...>; remove this tag")
         root = ET.fromstring(text)
     except UnicodeDecodeError:
         raise _error(path, "it is not UTF-8 text; save it as UTF-8") from None
@@ -81,7 +86,7 @@ def _too_large(path: str) -> ExitError:
     return _error(
         path,
         f"it has more than {MAX_BYTES} bytes, or more than {MAX_JSON} as JSON, which is too long "
-        "for a message on the bus; shorten it, or let robot_state_publisher publish it",
+        "for a message on the bus; shorten the URDF, or let robot_state_publisher publish it",
     )
 
 

@@ -1,8 +1,8 @@
 """Compares the configuration file with the settings in force, and changes the file.
 
-A `set` with `keep` has two stages. First a thread checks that the file can be changed; if it
-cannot, nothing is set. Then the robot uses the settings, and the thread changes the file. The
-control loop never waits for the disk.
+A `set` request with the field `keep` changes the settings and the file. It has two stages. First a
+thread checks that the file can be changed. If the file cannot be changed, nothing is set. Then the
+robot uses the settings, and the thread changes the file. The control loop never waits for the disk.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from acsard.host.errors import MendableError
 from acsard.host.mailbox import Mailbox
 
 LOOK_S = 2.0
-"""Time between two checks for a changed file, s."""
+"""Time between two checks whether the file has changed, s."""
 
 NAMED = 3
 """Largest number of settings that `SettingsFile.differ` names, so that `state` stays short."""
@@ -39,10 +39,12 @@ NAMED = 3
 MAX_TEXT = 200
 
 PATIENCE_NS = 5 * NS_PER_S // 2
-"""Longest time from a `set` with `keep` to its answer, ns. A client waits for 3 s."""
+"""Longest time from a `set` request with `keep` to the daemon's reply, ns. A client waits for 3
+s."""
 
 JOBS = 32
-"""Largest number of `set` requests with `keep` that wait. More are refused at once."""
+"""Largest number of `set` requests with `keep` that wait for their reply. Further requests are
+refused at once."""
 
 Signature = tuple[int, int, int]
 """Inode, size in bytes and modification time in ns of a file."""
@@ -51,7 +53,7 @@ _decoder = Decoder(Settings)
 
 
 def keeps(encoding: str, payload: bytes) -> bool:
-    """Return whether the payload of a valid `set` asks to change the configuration file too."""
+    """Return whether a valid `set` request also asks to change the configuration file."""
     return _decoder.decode(encoding, payload).keep
 
 
@@ -63,11 +65,12 @@ class _Checked(Struct, frozen=True):
 
 
 class _Pending(Struct):
-    """A `set` request with `keep` that has no answer yet."""
+    """A `set` request with `keep` that has no reply yet."""
 
     request: Request
     due_ns: int
-    """Monotonic time at which the request is overdue, ns, unless the robot is deciding about it."""
+    """Monotonic time after which the request is answered with a failure, ns. This does not apply
+    while the robot is deciding about the request."""
     edit: Edit | None = None
     """The change of the file, once the thread has checked it; None before."""
     answer: Answer | None = None
@@ -94,34 +97,40 @@ class SettingsFile:
         self._in_force = self._written = started
         self._signature: Signature | None = None
         self._box = Mailbox[Request | Literal["look"]](JOBS)
-        """The requests to check. "look" only wakes the thread."""
+        """The requests whose settings the thread must check. The item "look" only wakes the
+        thread."""
         self._changes = deque[tuple[Edit, Answer]]()
-        """The changes to write before the next check, each with the robot's answer."""
+        """The changes to write to the file before the next check, each with the robot's answer."""
         self._results = Mailbox[_Checked | Answer](JOBS)
         self._pending: dict[int, _Pending] = {}
         self._started = self._limits = started.limits
         """`_started` has the limits at the start of the daemon. `_limits` has the same limits, but
         with the new value of each limit that the daemon has written to the file since then."""
         self._kept: tuple[Latches, LimitsConfig, LimitsConfig, Latches] | None = None
-        """Cache of `latches`: its last arguments, the `_limits` at that time, and its result."""
+        """Cache of the method `latches`: the arguments of the last call, the `_limits` at that
+        time, and the result."""
 
     # The control loop calls the methods below.
 
     def start(self) -> None:
-        """Start the thread. If the process cannot start one, nothing is compared."""
+        """Start the thread. If no thread can be started, the file is not compared or changed."""
         thread = threading.Thread(target=self._work, name="settings file", daemon=True)
         try:
             thread.start()
         except RuntimeError as error:
-            self.differ = f"this process cannot compare settings and file ({error})"
+            self.differ = f"the daemon cannot compare its settings with its file ({error})"
 
     def use(self, config: Config) -> None:
-        """Compare the file with `config`, the settings in force without the key `speed_limit`."""
+        """Compare the file with `config`, and again whenever the file changes.
+
+        `config` has the settings in force, but not the limit that clients set by the Zenoh key
+        `speed_limit`.
+        """
         self._in_force = config
         self._look()
 
     def keep(self, request: Request, now_ns: int) -> None:
-        """Queue a `set` with `keep` for the check of the file. `results` returns the outcome."""
+        """Queue a `set` request with `keep` for the thread. `results` returns the outcome."""
         full = len(self._pending) >= JOBS
         # A request beyond the limit is overdue from the start, so that `results` refuses it in this
         # step.
@@ -130,7 +139,7 @@ class SettingsFile:
             self._box.put(request)
 
     def _look(self) -> None:
-        """Wake the thread. In a full mailbox, "look" would displace a request."""
+        """Wake the thread, unless it has requests to process, which "look" could displace."""
         if not self._box.waiting:
             self._box.put("look")
 
@@ -138,8 +147,8 @@ class SettingsFile:
         """Process the robot's answer to any request. Return whether the answer must wait.
 
         An answer waits if its request is a `set` with `keep` whose settings the robot has used. The
-        thread then writes the file, and `results` returns the answer. The caller sends all
-        others.
+        thread then writes the file, and `results` returns the answer. The caller sends all other
+        answers to the clients.
         """
         pending = self._pending.get(answer.id)
         if pending is None or pending.edit is None:
@@ -191,15 +200,16 @@ class SettingsFile:
 
     @property
     def limits(self) -> LimitsConfig:
-        """The limits at the start of the daemon, with the values written to the file since."""
+        """The limits at the daemon's start, updated with those written to the file since then."""
         return self._limits
 
     def latches(self, latches: Latches, now: LimitsConfig) -> Latches:
-        """Return the robot's latches, changed for the next start of the daemon.
+        """Return the robot's latches as they must be stored for the next start of the daemon.
 
-        The next start reads the limits from the file. If the daemon has written limits to the file,
-        `lowered` therefore has the limits that are lower in `now` than in the file. `now` has the
-        limits in force, without the limit from the key `speed_limit`.
+        The next start reads the limits from the configuration file. So if the daemon has written
+        limits to the file, `lowered` in the result has those limits that are lower in `now` than in
+        the file. `now` has the limits in force, but not the limit that clients set by the Zenoh key
+        `speed_limit`.
         """
         file = self._limits
         if file is self._started:
@@ -267,7 +277,7 @@ class SettingsFile:
             return f"the configuration file cannot be read: {error.strerror or error}"
         except ConfigError as error:
             self._signature = None
-            return f"the daemon could not start with the file as it is now: {error.problems[0]}"
+            return f"the daemon could not start again with its present file: {error.problems[0]}"
         found = differences(self._in_force, self._written)
         told = [one.words(key) for key, one in found.items()]
         return listed(told, NAMED)

@@ -1,7 +1,8 @@
 """Supervises the TLS gateway, a fleet's router or the web page, each a process of its own.
 
-A process that sends no signs of life is ended and started again. If the gateway is a service,
-systemd does this with the unit `acsard-gateway.service`, whose limits only systemd can set.
+A process that sends no signs of life is ended and started again. If the gateway runs as a service,
+systemd supervises it instead (`acsard-gateway.service`), because only systemd can set the limits of
+that service.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ class Kind(Struct, frozen=True):
 
 
 GATEWAY = Kind("the TLS gateway", "gateway_ended")
-"""The TLS gateway. It is always restarted, as a person may correct its files during a drive."""
+"""The TLS gateway. It is always restarted, because a person may correct its files while the robot
+drives."""
 
 ROUTER = Kind(
     "the router",
@@ -52,8 +54,8 @@ PAGE = Kind(
     frozenset({Exit.OK, Exit.USAGE, Exit.IN_USE, Exit.NO_PERMISSION, Exit.BAD_CONFIG}),
     LATER_S,
 )
-"""The web page. Its pause is longer, because a page that keeps failing must not take processor time
-from the robot. The process itself reports why it ends."""
+"""The process of the web page. Its pause before a restart is longer, because a page that keeps
+failing must not take processor time from the robot. The process itself reports why it ends."""
 
 
 async def keep_running(
@@ -61,7 +63,8 @@ async def keep_running(
 ) -> int:
     """Run `acsard` with the arguments `words`, and start it again when it ends, until cancelled.
 
-    Returns the exit code if it is final for `kind`. `log` gets an event for each restart.
+    Returns the exit code if `kind` says that it is final, so that there is no restart. `log` gets
+    an event for each restart.
     """
     final = kind.final | kind.final_at_first
     while True:

@@ -108,7 +108,8 @@ class Next(Struct, frozen=True):
     retry_ns: int | None
     """Monotonic time of the next step for a waiting command, ns; None if no command waits."""
     period_ended: bool = True
-    """Whether the step ran at the end of a period. If so, the next stop gets a step of its own."""
+    """Whether the step ran at the end of a period. If so, the next stop command gets a step of its
+    own."""
 
 
 class Wakeup:
@@ -158,7 +159,7 @@ class Wakeup:
             pass  # the event loop has closed, so nothing is left to wake
 
     async def run(self, step: Callable[[], Next | None]) -> None:
-        """Run `step` on every event until it returns None. Raise any exception that it raises."""
+        """Run `step` on every event until `step` returns None. An exception in `step` is raised."""
         self._over = self._loop.create_future()
         with self._alarm:
             self._step = step

@@ -61,14 +61,15 @@ class Bridge:
         self._relay = Relay(robot, context, self._wake.set)
         self._relay.offer(facts)
         self._deaf = facts.deaf
-        """Why commands of other programs cannot be shown; "" if they can or the viewers know it."""
+        """Why commands of other programs cannot be shown; "" if they can, or if the viewers have
+        already been told why."""
         logging.getLogger("foxglove").addHandler(Refusals(self._notices))
         listener = Listener(self._shown, self._drives, self._settings)
         offered = services(robot, ros, CALLED if acts else STOPS)
         self._server = start(f"acsard {self._id}", address, listener, offered, context, acts=acts)
         self._objections: dict[int, Objections] = {}
         self._watch: Watch | None = None
-        """Follows the robot's `state` while a viewer drives; otherwise None."""
+        """Follows the robot's `state` while a viewer drives; None while no viewer drives."""
         self._here = self._was_here = True
         key = robot.key("alive")
         self._token = robot.session.liveliness().declare_subscriber(key, self._alive, history=True)
@@ -123,7 +124,7 @@ class Bridge:
         self._notices.send(self._server, self._relay.log, newcomers=bool(fresh))
 
     def _went(self) -> bool:
-        words = f"the daemon of {self._id} is gone; this bridge waits for it"
+        words = f"the daemon of robot {self._id} is gone; `acsard foxglove` waits for it"
         self._notices.say("error", "daemon", words, stays=GONE)
         return True
 
@@ -136,7 +137,7 @@ class Bridge:
             return False
         self._learn(facts)
         self._notices.over(GONE)
-        self._notices.say("info", "daemon", f"the daemon of {self._id} is back")
+        self._notices.say("info", "daemon", f"the daemon of robot {self._id} is back")
         return True
 
     def _learn(self, facts: Facts) -> None:

@@ -1,11 +1,11 @@
 """Drives the robot from the panels of Foxglove viewers. To the daemon, each viewer is one sender.
 
-A panel repeats its command while a button is held, and sends nothing after the release. But the
-daemon lets a sender drive only after a zero command. So this module sends one before the first
-command after each silence.
+A panel repeats its command while a button is held, and sends nothing after the button is released.
+But the daemon lets a sender drive only after a zero command. So this module sends a zero command
+before the first command after each silence.
 
-A burst of commands after a silence has been delayed on its way, so this module drops it. The daemon
-could detect the delay only from stamps, which few panels send.
+If a burst of commands follows a silence, the network has delayed these commands, so this module
+drops them. The daemon could detect the delay only from stamps, which few panels send.
 """
 
 from __future__ import annotations
@@ -27,15 +27,16 @@ from acsard.foxglove.notices import Notices
 from acsard.host import clock
 
 SLOW_NS, SLOW_TIMES = 5 * NS_PER_S // 2, 3
-"""A panel publishes too seldom if `SLOW_TIMES` messages in a row come after a silence of more than
-`commander.SILENCE_NS` (0.3 s) and at most `SLOW_NS` (2.5 s)."""
+"""A panel publishes too seldom if `SLOW_TIMES` messages in a row each come after a silence of more
+than `commander.SILENCE_NS` (0.3 s) and at most `SLOW_NS` (2.5 s)."""
 
 _receiver = Receiver(JointsConfig(), Kinematics(DriveConfig()))
-"""Decoder of velocity commands (twists), which do not depend on the joints and wheels."""
+"""Decoder of velocity commands (twists). It has the default joints and wheels, because a twist does
+not depend on them."""
 
 
 def encoding_of(encoding: str, schema_name: str) -> str:
-    """Return the Zenoh encoding of a viewer's channel. Raises `DecodeError` if it cannot drive.
+    """Return the Zenoh encoding of a channel. Raises `DecodeError` if the channel cannot drive.
 
     `encoding` is "json" or "cdr", and `schema_name` is a ROS type such as "geometry_msgs/Twist".
     """
@@ -52,12 +53,12 @@ def encoding_of(encoding: str, schema_name: str) -> str:
     if encoding == "json":
         return encoding_name("json")
     raise DecodeError(
-        "unknown_encoding", f"the encoding is {encoding or '(none)'}: use json or cdr"
+        "unknown_encoding", f"the channel's encoding is {encoding or '(none)'}: use json or cdr"
     )
 
 
 def wish(encoding: str, payload: bytes) -> Wish:
-    """Decode a velocity command in a Zenoh encoding. Raises `DecodeError` if it is not valid."""
+    """Decode a velocity command; `encoding` is a Zenoh encoding. Raises `DecodeError`."""
     found = _receiver.command(Arrival("cmd/app", True, payload, encoding, 0, None, ""))
     return Wish(found.twist, found.stamp_ns)
 
@@ -68,7 +69,7 @@ class Viewer:
     def __init__(self, robot: Client) -> None:
         self.robot, self.commander = robot, Commander(leads=True, gathers=True)
         self.channels: dict[int, tuple[str, str]] = {}
-        """By channel id: (Zenoh encoding, ""), or ("", reason why the channel cannot drive)."""
+        """Maps a channel's id to (Zenoh encoding, ""), or to ("", reason why it cannot drive)."""
         self._slow = 0
 
     def is_slow(self, silence_ns: int | None) -> bool:
@@ -101,7 +102,7 @@ class Drives:
     def advertised(
         self, client: int, channel: int, topic: str, encoding: str, schema_name: str
     ) -> None:
-        """Register a viewer's channel. If it cannot drive, `came` reports the reason."""
+        """Register a viewer's channel. If the channel cannot drive, `came` reports the reason."""
         found, problem = "", ""
         if topic != self.topic:
             problem = f"no program listens on {topic}: send commands to {self.topic} instead"

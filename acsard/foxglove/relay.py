@@ -1,7 +1,7 @@
 """Forwards messages from the bus to the Foxglove viewers.
 
-It subscribes only to topics that a viewer looks at, so any other topic costs no time here or in the
-daemon. If messages arrive faster than they can be forwarded, the oldest are dropped.
+The relay subscribes only to topics that a viewer looks at, so any other topic costs no time here or
+in the daemon. If messages arrive faster than they can be forwarded, the oldest are dropped.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class News:
         self._told: list[LogEvent] = []
 
     def of(self, events: Events) -> list[Log]:
-        """Return the new events as log messages. After a restart of the daemon, all are new."""
+        """Return the new events as log messages. After the daemon restarts, all events are new."""
         known, told, stamp_ns = self._total, self._told, events.stamp.to_ns()
         if events.total < known:
             if stamp_ns <= self._stamp_ns:
@@ -68,14 +68,15 @@ class Way(Struct, frozen=True):
     """How the daemon interprets the commands that arrive on one key of the bus."""
 
     native: str
-    """The daemon's own key, without the robot's id. "*" stands for the name of a certificate."""
+    """The daemon's own key for these commands, without the robot's id. "*" stands for the name of a
+    certificate."""
     encoding: str = ""
     """Encoding of all commands on the key; "" if each command names its encoding."""
     via: Via = "native"
 
 
 def ways(key_of: Callable[[str], str], ros: RosConfig, source: str) -> dict[str, Way]:
-    """Return how the daemon interprets the commands of `source`, by the key on which they arrive.
+    """Return a `Way` for each key on which commands of the source `source` may arrive.
 
     The keys are the daemon's own and those of ROS. `key_of` adds the robot's id to a key.
     """
@@ -126,7 +127,10 @@ class Commanders:
         return self._ways.keys()
 
     def follow(self, topics: Collection[str]) -> None:
-        """Subscribe to the commands of `topics` only. Over TLS, commands are not permitted."""
+        """Subscribe to the commands of `topics` only.
+
+        A client over TLS may not receive the commands of other clients, so it subscribes to none.
+        """
         wanted = set() if self._deaf else self._ways.keys() & set(topics)
         for topic in self._heard.keys() - wanted:
             self._heard.pop(topic).undeclare()
@@ -134,7 +138,7 @@ class Commanders:
             self._heard[topic] = _Heard(self._robot.session, self._ways[topic], self._wake)
 
     def take(self) -> Iterator[tuple[str, TwistStamped]]:
-        """Yield each decodable command that has arrived since the last call, with its topic."""
+        """Yield each valid command that has arrived since the last call, with its topic."""
         for topic, heard in self._heard.items():
             for arrival, wall_ns in heard.take():
                 try:
@@ -204,7 +208,7 @@ class Relay:
         """Number of samples that could not be decoded."""
 
     def offer(self, facts: Facts) -> None:
-        """Offer the robot's topics to the viewers. Topics that were offered before stay."""
+        """Offer the robot's topics to the viewers. Topics that were offered earlier stay."""
         self._commanders.use(facts)
         for row, source in facts.rows():
             topic = row.topic(facts.config.ros.namespace, source)
@@ -226,8 +230,8 @@ class Relay:
     def follow(self, topics: Collection[str], fresh: Collection[str]) -> None:
         """Subscribe only to the keys of `topics`, the topics that viewers look at.
 
-        Topics in `fresh` have a new viewer, for whom the last message of a seldom one is
-        repeated.
+        Each topic in `fresh` has a new viewer. If such a topic is published seldom, its last
+        message is sent again for the new viewer.
         """
         if self.log_topic in fresh:
             self._news = News()  # a viewer that opens the log sees the last events

@@ -16,7 +16,7 @@ from acsard.host.errors import ReplyError
 
 
 class Facts(Struct, frozen=True):
-    """Facts about a robot. `config` has the default values if this client may not read it."""
+    """Facts about a robot. `config` has the default values if this program may not read it."""
 
     config: Config
     tables: object
@@ -40,21 +40,21 @@ class Facts(Struct, frozen=True):
 
 
 def key_of(row: Channel, source: str) -> str:
-    """Return the key of the topic's messages, without the robot's id."""
+    """Return the Zenoh key of the topic's messages, without the robot's id."""
     return row.native.replace(SOURCE, source)
 
 
 def learn(robot: Client) -> Facts:
-    """Query the robot for its configuration, its sources and the permissions of this client.
+    """Query the robot for its configuration, command sources and the permissions of this client.
 
     Raises the errors of `Client.get`, and `ReplyError` if a reply is not readable.
     """
     forbidden, role, deaf = "", "maintainer", ""
     if robot.where.tls:
         deaf = (
-            "clients over TLS cannot receive the commands of the sources (/cmd_vel_in/…): to see "
-            "these, either run `acsard foxglove` on the robot, or use `acsard recording export` "
-            "later"
+            "clients over TLS cannot receive the commands that programs send to the robot "
+            "(/cmd_vel_in/…): to see these commands, either run `acsard foxglove` on the robot, or "
+            "use `acsard recording export` later"
         )
         us = robot.whoami()
         role = us.role

@@ -32,7 +32,7 @@ from acsard.host import clock
 from acsard.host.errors import InUseError, NotPermittedError
 
 POLL_NS = 5 * NS_PER_S
-"""Time between two reads of the settings, which other clients may change, ns."""
+"""Time between two queries for the robot's settings, which other clients may change, ns."""
 
 
 class Shown:
@@ -59,7 +59,7 @@ class Shown:
         self._wake()
 
     def take(self) -> tuple[set[str], set[str]]:
-        """Return the topics with viewers, and those that got a viewer since the last call."""
+        """Return all topics with viewers, and the topics with a new viewer since the last call."""
         with self._lock:
             fresh, self._fresh = self._fresh, set()
             return set(self._viewers), fresh
@@ -82,7 +82,7 @@ class Settings:
         self.learn(tables)
 
     def learn(self, tables: object) -> dict[str, Any]:
-        """Store the configuration, None if unreadable, and return the settings that changed."""
+        """Store the configuration `tables` (None: unreadable), and return the changed settings."""
         now = {} if tables is None else live_settings(tables)
         with self._lock:
             news = changes(self._known, now)
@@ -91,7 +91,7 @@ class Settings:
         return news
 
     def get(self, names: Collection[str]) -> dict[str, Any]:
-        """Return the settings with these names, or all if `names` is empty, without a query."""
+        """Return the known settings with these names (all if `names` is empty) without a query."""
         with self._lock:
             self._asked = True
             return asked(self._known, names)
@@ -227,16 +227,16 @@ def start(
         another = f"--address {host}:{max(1024, port % 65535 + 1)}"
         if os.strerror(errno.EACCES) in str(error):
             raise NotPermittedError(
-                f"you may not listen on {host}:{port}; take a port above 1023: {another}"
+                f"no permission to listen on {host}:{port}; use a port above 1023: {another}"
             ) from None
         raise InUseError(
-            f"cannot listen on {host}:{port}: {error}; stop the program that uses it (another "
-            f"acsard foxglove, or foxglove_bridge?), or use another port: {another}"
+            f"cannot listen on {host}:{port}: {error}; stop the program that uses the port "
+            f"(another acsard foxglove, or foxglove_bridge?), or use another port: {another}"
         ) from None
 
 
 class Refusals(logging.Handler):
-    """Log handler that reports the clients which the library refuses, and ignores other errors."""
+    """Log handler that reports each client that foxglove-sdk refuses. Ignores other log lines."""
 
     def __init__(self, notices: Notices) -> None:
         super().__init__(logging.ERROR)
@@ -253,7 +253,8 @@ class Refusals(logging.Handler):
 
 
 CALLED: tuple[Verb, ...] = tuple(verb for verb in SERVICES if verb != "set")
-"""Services with the option `--drive`: all but `set`, because viewers set parameters instead."""
+"""Services that viewers may call with the option `--drive`: all but `set`, because viewers change
+settings as parameters instead."""
 
 STOPS: tuple[Verb, ...] = ("stop",)
 """Services that viewers may call without the option `--drive`. Any web page in a local browser can

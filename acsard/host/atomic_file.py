@@ -9,7 +9,8 @@ from contextlib import suppress
 from pathlib import Path
 
 NEW_MODE = 0o644
-"""Default mode of a new file. The user of the systemd service must be able to read the file."""
+"""Default mode of a new file: 0o644, because the user of the systemd service must be able to read
+the file."""
 
 
 def replace(

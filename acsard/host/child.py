@@ -3,9 +3,9 @@
 Each child gets a session of its own, so that a Ctrl-C at the terminal reaches only the parent,
 which then ends its children. A child does not outlive its parent.
 
-`Child` is used in the parent, and `Parent` in the child. A socket, the child's standard input,
-connects them. The child writes signs of life to it, and ends when the parent closes its end. The
-parent kills a child that falls silent.
+The parent uses `Child`, and the child uses `Parent`. A socket connects the two processes, and it is
+the child's standard input. The child writes signs of life to the socket, and ends when the parent
+closes the socket. The parent kills a child that falls silent.
 """
 
 from __future__ import annotations
@@ -31,23 +31,26 @@ from acsard.core.values import NS_PER_S
 from acsard.host import clock
 
 OUR_UNIT = ("NOTIFY_SOCKET", "INVOCATION_ID")
-"""Variables of systemd that a child does not inherit, so that it cannot notify as the parent."""
+"""Environment variables of systemd that a child does not inherit. With them, the child could send
+systemd notifications in its parent's name."""
 
 BEAT_S = 0.5
 """Longest time between two signs of life of a child, and between two checks by its parent, s."""
 
 SILENT_NS = 3 * NS_PER_S
-"""Time without a sign of life after which a child is killed, ns. The TLS gateway ends itself after
-1 s without progress, so this limit is for a process that cannot even do that."""
+"""Time without a sign of life after which the parent kills a child, ns. The TLS gateway ends itself
+after 1 s without progress, so this limit is for a process that cannot even end itself."""
 
 START_NS = 15 * NS_PER_S
-"""Longest wait for a child's first sign of life, ns. Python starts slowly on a busy machine."""
+"""Longest time for which the parent waits for a child's first sign of life, ns. Python starts
+slowly on a busy machine."""
 
 
 class Silence:
     """Detects that another process has given no sign of life for longer than `most_ns`, ns.
 
-    Of the time between two calls, at most 0.5 s counts, because both processes may be stopped.
+    Of the time between two calls of `too_long`, at most 0.5 s counts, because during a longer time
+    the computer may have stopped both processes.
     """
 
     def __init__(self, most_ns: int) -> None:
@@ -84,7 +87,7 @@ class Limits(Struct, frozen=True):
 
 
 def limit(pid: int, limits: Limits) -> None:
-    """Set the limits of a child, and let the kernel end it first when memory runs out."""
+    """Set a child's limits, and make the kernel end the child first if memory runs out."""
     try:
         with suppress(OSError):
             Path(f"/proc/{pid}/oom_score_adj").write_bytes(b"1000")
@@ -158,7 +161,7 @@ class Child:
         """Why the child was killed, or "" if it was not killed."""
 
     def run(self) -> int:
-        """Run the child to its end and return its exit code. Raises `OSError` if none can start."""
+        """Run the child and return its exit code. Raises `OSError` if the child cannot start."""
         ours, its = socket.socketpair()
         with ours:
             with its:
@@ -177,7 +180,7 @@ class Child:
             return process.wait()
 
     def _falls_silent(self, ours: socket.socket) -> bool:
-        """Wait until the child falls silent, ends or is released. Return True if it fell silent."""
+        """Wait until the child falls silent, ends or is released. Return whether it fell silent."""
         silence, before_ns, alive = Silence(START_NS), clock.mono_ns(), False
         while True:
             beat = ours.recv(4096) if select.select([ours], [], [], BEAT_S)[0] else None
@@ -192,7 +195,7 @@ class Child:
             before_ns = now_ns
 
     def release(self) -> None:
-        """Close the child's standard input, which makes it end. Any thread may call this."""
+        """Close the child's standard input, so that the child ends. Any thread may call this."""
         self._over = True
         if self._ours is not None:
             try:
@@ -222,7 +225,7 @@ class Parent:
                 os.write(self.fd, b".")  # fails if the buffer is full or the parent has gone
 
     def gone(self) -> bool:
-        """Return whether the parent has closed its end. Call this only when `fd` is readable."""
+        """Return whether the parent has closed the socket. Call this only when `fd` is readable."""
         try:
             return not os.read(self.fd, 64)
         except BlockingIOError:
@@ -234,6 +237,7 @@ class Parent:
 def end_with_parent(number: signal.Signals) -> None:
     """Let the kernel send the signal `number` to this process when its parent ends.
 
-    It is also sent if the parent crashes, or if only the thread that started this process ends.
+    The kernel also sends the signal if the parent crashes, or if only the thread that started this
+    process ends.
     """
     ctypes.CDLL(None).prctl(1, number)  # PR_SET_PDEATHSIG in linux/prctl.h

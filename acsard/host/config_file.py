@@ -35,7 +35,8 @@ def find(path: str | None) -> tuple[str, bytes]:
         except OSError as error:
             raise ExitError(
                 Exit.BAD_CONFIG,
-                f"cannot read {named}: {error.strerror}; correct --config, or its permissions",
+                f"cannot read {named}: {error.strerror}; correct --config or ACSARD_CONFIG, or the "
+                "permissions of the file",
             ) from None
     for place in PLACES:
         try:
@@ -45,8 +46,8 @@ def find(path: str | None) -> tuple[str, bytes]:
         except OSError as error:
             raise ExitError(
                 Exit.BAD_CONFIG,
-                f"cannot read {place}: {error.strerror}; correct its permissions, or name another "
-                "file with --config",
+                f"cannot read {place}: {error.strerror}; correct the permissions of this file, "
+                "or name another file with --config",
             ) from None
     return "built-in defaults", b""
 
@@ -62,8 +63,8 @@ def writable(path: str | None) -> Path:
     if not text and not Path(where).is_file():
         raise MendableError(
             "--write has no configuration file to change. Run this command on the robot, because a "
-            "file on another machine changes nothing there. Then either name the robot's file with "
-            "--config, or make an acsard.toml on the robot (it may be empty)",
+            "file on another machine does not affect the robot. Then either name the "
+            "robot's file with --config, or make an acsard.toml on the robot (it may be empty)",
         )
     if _is_reference(Path(where)):
         raise MendableError(
@@ -92,7 +93,7 @@ class Edit(Struct, frozen=True):
 def keepable(file: Path | None, keys: Keys) -> Edit:
     """Prepare the change that writes these settings into the file of the running daemon.
 
-    Raises `MendableError` if the file is None (the daemon runs without one), tracked by git or
+    Raises `MendableError` if the file is None (the daemon runs without a file), tracked by git or
     read-only, if tomlkit is missing, or if the old or new text is not a valid configuration.
     """
     if file is None:
@@ -102,7 +103,7 @@ def keepable(file: Path | None, keys: Keys) -> Edit:
         )
     try:
         if any(key.startswith("commands.sources.") for key in keys):
-            raise ValueError("a source's timeout in [[commands.sources]] cannot be changed there")
+            raise ValueError("the daemon cannot write a timeout of [[commands.sources]] to a file")
         place = file.resolve(strict=True)
         _require_writable(place)
         if is_tracked(place):
@@ -117,9 +118,11 @@ def keepable(file: Path | None, keys: Keys) -> Edit:
 
 
 def keep(edit: Edit) -> None:
-    """Write a prepared change. If another program has changed the file since, prepare it again.
+    """Write a prepared change to the file.
 
-    Raises `MendableError` and leaves the file unchanged if the change cannot be written.
+    If another program has changed the file since the change was prepared, this function prepares
+    the change again. Raises `MendableError` and leaves the file unchanged if the change cannot be
+    written.
     """
     try:
         # A change takes 0.2 s to compute, and a person's editor may write the file meanwhile.
@@ -178,21 +181,21 @@ def _is_reference(file: Path) -> bool:
 
 
 def require_tomlkit() -> None:
-    """Raise `MendableError` if tomlkit is missing, before a person spends minutes on a check."""
+    """Raise `MendableError` if tomlkit is missing. Call this before long work, not after it."""
     try:
         import tomlkit  # noqa: F401
     except ImportError:
         raise MendableError(
-            f"--write needs the library tomlkit; run: {install('write')}, or leave --write out and "
-            "paste the lines",
+            f"--write needs the library tomlkit; run: {install('write')}, or leave out --write and "
+            "copy the printed lines into the file",
         ) from None
 
 
 def change(file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = False) -> Keys:
     """Set keys in an `acsard.toml`, and return the keys with their values.
 
-    `keys` may be a function of the file's configuration. `new` creates a missing file. Raises
-    `MendableError` and leaves the file unchanged if it cannot be changed.
+    `keys` may be a function of the file's configuration. If `new` is true, a missing file is
+    created. Raises `MendableError` and leaves the file unchanged if it cannot be changed.
     """
     try:
         place, text, given = _changed(file, keys, new)

@@ -1,7 +1,8 @@
 """Computes the changed text of an `acsard.toml` for the daemon, in a separate process.
 
-tomlkit needs 0.1 s, and holds the interpreter lock for half a millisecond at a time. In a thread of
-the daemon, it made the control loop up to 12 ms late, and 3 of 559 periods were missed.
+tomlkit needs 0.1 s, and holds the interpreter lock for half a millisecond at a time. In a test with
+tomlkit in a thread of the daemon, the control loop was up to 12 ms late, and missed 3 of 559
+periods.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from acsard.host.child import environment
 from acsard.host.extras import install
 
 EDIT_S = 2.0
-"""Time limit of the process, s. It takes 0.2 s on a computer that is not busy."""
+"""Time limit of the process, s. The process takes 0.2 s on a computer that is not busy."""
 
 
 class Task(Struct, frozen=True):
@@ -51,13 +52,16 @@ def edited_apart(text: str, keys: Mapping[str, object]) -> str:
             words, input=task, capture_output=True, env=environment(), timeout=EDIT_S
         )
     except subprocess.TimeoutExpired:
-        text = f"this computer was too busy for {EDIT_S:g} s: type the command again"
+        text = (
+            f"the robot's computer was too busy to make the change within {EDIT_S:g} s: type the "
+            "command again"
+        )
         raise ValueError(text) from None
     try:
         result = msgspec.json.decode(done.stdout, type=Result)
     except msgspec.DecodeError:
         told = done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
-        raise ValueError(f"the process that changes it failed: {told}") from None
+        raise ValueError(f"the process that changes the file failed: {told}") from None
     if result.error:
         raise ValueError(result.error)
     return result.text
@@ -73,7 +77,10 @@ def main() -> None:
     try:
         result = Result(edited(task.text, task.keys))
     except ImportError:
-        result = Result(error=f"the robot needs the library tomlkit; run there: {install('write')}")
+        result = Result(
+            error="the robot needs the library tomlkit; run this command on the robot: "
+            f"{install('write')}"
+        )
     except (ValueError, ConfigError) as error:
         result = Result(error=str(error))
     sys.stdout.buffer.write(msgspec.json.encode(result))

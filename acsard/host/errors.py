@@ -1,8 +1,8 @@
 """Errors with an external cause that a person can fix, and the exit codes of acsard.
 
-Each is an `AcsardError`. Most are also the built-in exception for such a case, so a caller may
-catch either. The text says what is wrong and how to fix it. Bugs, and states of the robot such as a
-lost port, have no errors here.
+Each error class is an `AcsardError`. Most are also the built-in exception for such a case (for
+example `FileNotFoundError`), so a caller may catch either. The text says what is wrong and how to
+fix it. Bugs have no error class here, and neither have states of the robot such as a lost port.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ WORDS: dict[int, str] = {
     Exit.INCOMPLETE: "part of the recording is damaged",
     Exit.NO_PORT: "no such port",
     Exit.UNREACHABLE: "daemon unreachable",
-    Exit.IN_USE: "port, bus address or robot id in use",
+    Exit.IN_USE: "another process uses the port, bus address or robot id",
     Exit.NO_PERMISSION: "no permission",
     Exit.BAD_CONFIG: "bad configuration",
 }
@@ -108,7 +108,7 @@ class RecordingError(MendableError, ValueError):
 
 
 class ExitError(MendableError):
-    """Ends the subcommand with any exit code. The text says what is wrong and how to fix it."""
+    """Error with the exit code `code`. The text says what is wrong and how to fix it."""
 
     def __init__(self, code: Exit, text: str) -> None:
         super().__init__(text)

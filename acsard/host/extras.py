@@ -1,7 +1,7 @@
 """Finds the command that installs an extra, a group of optional libraries in `pyproject.toml`.
 
-acsard is in no package index. So the command names the directory from which acsard was installed,
-or only the libraries.
+acsard is not in any package index. So the command names the directory from which acsard was
+installed, or only the libraries.
 """
 
 from __future__ import annotations
@@ -33,13 +33,16 @@ def install(extra: Extra) -> str:
 
 def missing(library: str, extra: Extra) -> MendableError:
     """Return the error about a missing library, with the command that installs its extra."""
-    return MendableError(f"needs the library {library}; run: {install(extra)}")
+    return MendableError(
+        f"this command needs the library {library}; to install it, run: {install(extra)}"
+    )
 
 
 def wanted_by(installed: Distribution, extra: Extra) -> list[str]:
-    """Return the arguments of `pip install` for an extra: its source directory with the extra.
+    """Return the arguments of `pip install` for an extra, such as `DIRECTORY[EXTRA]`.
 
-    If the directory from which `installed` was installed no longer exists, return the libraries.
+    If the directory from which `installed` was installed no longer exists, return the names of the
+    libraries in the extra instead.
     """
     told = json.loads(installed.read_text("direct_url.json") or "{}")
     url = urlsplit(told.get("url", ""))

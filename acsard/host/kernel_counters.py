@@ -1,7 +1,7 @@
 """Reads the kernel's counters that can explain why a program was late.
 
-A value is 0 if this computer does not have its file or this user may not read it. Reading can take
-a few milliseconds, so the control loop never does it.
+A value is 0 if this computer does not have the value's file, or if this user may not read the file.
+Reading can take a few milliseconds, so the control loop never does it.
 """
 
 from __future__ import annotations
@@ -56,18 +56,18 @@ class Reading(Struct, frozen=True, omit_defaults=True):
 
     asleep_ns: int = 0
     steal_ns: tuple[int, ...] = ()
-    """Time in which the host of a virtual machine ran something else, for each processor."""
+    """Time in which the host of a virtual machine ran something else, for each processor, ns."""
     disk_ns: int = 0
-    """Time in which at least one program waited for a disk."""
+    """Time in which at least one program waited for a disk, ns."""
     own_disk_ns: int = 0
-    """Time in which the first thread of this process waited for a disk. Most kernels measure it
-    only if the setting kernel.task_delayacct is on."""
+    """Time in which the first thread of this process waited for a disk, ns. Most kernels measure it
+    only if the setting `kernel.task_delayacct` is on."""
     own_bytes: int = 0
     """Number of bytes that the first thread of this process read from disks and wrote to them."""
     major_faults: int = 0
     """Number of memory pages that this process had to read from a disk before it could continue."""
     quota_ns: int = 0
-    """Time in which this process did not run because its cgroup had used up its CPU quota."""
+    """Time in which this process did not run because its cgroup had used up its CPU quota, ns."""
     conditions: Conditions = Conditions()
 
 
@@ -101,12 +101,12 @@ def scheduled(text: bytes) -> Scheduled:
 
 
 def steal(text: str, tick_ns: int) -> tuple[int, ...]:
-    """Return the steal time of each processor, ns, from `/proc/stat`; `tick_ns` is a clock tick."""
+    """Return each processor's steal time, ns, from `/proc/stat`; a clock tick lasts `tick_ns`."""
     return tuple([int(row[8]) * tick_ns for row in _processors(text) if len(row) > 8])
 
 
 def iowait(text: str, tick_ns: int) -> int:
-    """Return the longest time, ns, that a processor was idle while a program waited for I/O."""
+    """Return the longest time, ns, that one processor was idle while a program waited for I/O."""
     return max((int(row[5]) * tick_ns for row in _processors(text)), default=0)
 
 
@@ -117,7 +117,7 @@ def _processors(text: str) -> list[list[str]]:
 
 
 def stalled(text: str) -> int:
-    """Return the time in which a task waited, ns, from a file such as `/proc/pressure/io`."""
+    """Return how long at least one task waited, ns, from a file such as `/proc/pressure/io`."""
     for line in text.splitlines():
         if line.startswith("some "):
             return int(line.rpartition("total=")[2]) * 1000
@@ -142,7 +142,7 @@ def disk_bytes(text: str) -> int:
 
 
 def fields(text: str) -> list[str]:
-    """Return the fields of `/proc/PID/stat` from field 3 of proc(5) on."""
+    """Return the fields of `/proc/PID/stat` from `state` on (field 3 in the manual proc(5))."""
     return text.rpartition(")")[2].split()
 
 
@@ -158,9 +158,9 @@ def program(text: str, tick_ns: int) -> Program:
 def busiest(
     before: Iterable[Program], after: Iterable[Program], within_ns: int, priority: int
 ) -> Program | None:
-    """Return the process that ran most between two readings, with the time that it ran in between.
+    """Return the process that ran longest between two readings, and how long it ran.
 
-    The readings are `within_ns` apart. Returns None if no process used a quarter of a processor.
+    The readings are `within_ns` apart. Returns None if no process used a quarter of one processor.
     Processes that cannot delay a thread of kernel priority `priority` are ignored.
     """
     # A process whose nice value is higher by 9 can still delay the thread noticeably. At a
@@ -254,10 +254,11 @@ class Kernel:
         )
 
     def busiest(self, seconds: float) -> Program | None:
-        """Return the other process that uses the most processor time during the next `seconds` s.
+        """Return the process that uses the most processor time during the next `seconds` s.
 
-        Returns None if no process uses a quarter of a processor and has enough priority to delay
-        this process. Processes of other users are not considered if the kernel hides them.
+        This process itself does not count. Returns None if no other process uses a quarter of a
+        processor and has enough priority to delay this one. Processes of other users are not
+        considered if the kernel hides them.
         """
         before, began_ns = list(self.programs()), clock.mono_ns()
         time.sleep(seconds)

@@ -128,7 +128,8 @@ class Writer:
 def write_through(stream: TextIO, text: str) -> None:
     """Write directly to the stream's file descriptor, without the stream's buffer.
 
-    A thread stuck in a write would hold the buffer's lock and prevent the flush at the end.
+    If a thread hung in a write through the buffer, it would hold the buffer's lock. Python could
+    then not flush the stream when the process ends.
     """
     try:
         fd = stream.fileno()

@@ -48,16 +48,19 @@ class Mailbox(Generic[T]):
     def __init__(self, most: int, wake: Callable[[], object] | None = None) -> None:
         """Create a mailbox for at most `most` items.
 
-        `put` calls `wake` on the writer's thread after storing an item. The default ends `wait`.
+        `put` stores an item, and then calls `wake` on the writer's thread. If `wake` is None, `put`
+        ends the reader's `wait` instead.
         """
         self.waiting: deque[T] = deque(maxlen=most)
-        """The items that wait, the oldest on the left. Only the reader may remove items. It is
-        public because a method call for each of forty mailboxes in each step would be slow."""
+        """The items that wait, the oldest on the left. Only the reader may remove items. This
+        attribute is public, because a method call for each of forty mailboxes in each step would be
+        slow."""
         self.lost = 0
         """Number of items that newer ones have displaced; approximate with several writers."""
         self._bell = Bell()
         self.wake = wake or self._bell.ring
-        """Function that wakes the reader. A writer that calls `store` must call it afterwards."""
+        """Function that wakes the reader. A writer that calls `store` must call `wake`
+        afterwards."""
         self.closed = False
         """Whether no more items will arrive. Earlier items may still wait."""
 
@@ -66,7 +69,7 @@ class Mailbox(Generic[T]):
     def store(self, item: T) -> bool:
         """Store an item without waking the reader. Return False if the oldest item was dropped.
 
-        With several writers, the result may be wrong.
+        With several writers at the same time, the result may be wrong.
         """
         items = self.waiting
         room = len(items) < items.maxlen  # type: ignore[operator]
@@ -90,7 +93,7 @@ class Mailbox(Generic[T]):
     # The reader's side
 
     def wakes(self, wake: Callable[[], object]) -> None:
-        """Make writers call `wake` from now on. They then no longer end the reader's `wait`.
+        """Make writers call the function `wake` from now on. They then no longer end `self.wait`.
 
         `wake` is called at once if an item waits or the mailbox is closed.
         """

@@ -16,7 +16,7 @@ from acsard.host.processes import called
 
 
 def own_name() -> str:
-    """Return the user, the machine and the program (if it has a name), as "alice@laptop patrol"."""
+    """Return the user, the machine and the program's name if any, like "alice@laptop patrol"."""
     try:
         user = pwd.getpwuid(os.getuid()).pw_name
     except KeyError:
@@ -28,7 +28,7 @@ def own_name() -> str:
 
 
 def sender_id(name: str, secret: str = "") -> str:
-    """Return the id `NAME/SECRET` of a sender of commands. If `secret` is "", a new one is made."""
+    """Return the id `NAME/SECRET` of a sender of commands. If `secret` is "", make a new secret."""
     return f"{name[:MAX_NAME]}/{secret or new_secret()}"
 
 
@@ -38,7 +38,10 @@ def new_secret() -> str:
 
 
 def own_addresses() -> list[str]:
-    """Return this machine's IP addresses, but no loopback or link-local ones; [] if `ip` fails."""
+    """Return this machine's IP addresses without loopback and link-local ones.
+
+    The result is [] if the command `ip` fails.
+    """
     try:
         found = json.loads(called(("ip", "-json", "address"), 5.0).stdout or "[]")
     except (OSError, ValueError, subprocess.TimeoutExpired):

@@ -1,6 +1,7 @@
 """Token buckets that limit rates, and places that limit how many things exist at once.
 
-A bucket with room for one unit enforces a shortest interval. This module reads no clock.
+A bucket with room for one unit enforces a shortest time between two units. This module reads no
+clock.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ class Buckets:
     """A token bucket for each name, and one for all names together."""
 
     def __init__(self, of_one: Rate, in_all: Rate | None = None) -> None:
-        """Limit each name to the rate `of_one`, and all together to `in_all` unless it is None."""
+        """Limit each name to the rate `of_one`, and all names together to `in_all` if it is set."""
         self._of_one = of_one
         self._shared = None if in_all is None else Bucket(in_all)
         self._buckets: dict[str, Bucket] = {}
@@ -57,7 +58,7 @@ class Buckets:
         return name not in self._buckets or self._buckets[name].room(now_ns)
 
     def take(self, name: str, now_ns: int) -> bool:
-        """Consume a unit of this name's bucket and of the common one; False if either is empty."""
+        """Consume a unit of the name's bucket and of the shared one; False if either is empty."""
         if name not in self._buckets:
             # Drop the full buckets, which equal new ones, so that many names do not fill the
             # memory.

@@ -15,8 +15,9 @@ PRIORITY = 10
 """Real-time priority of the control loop: below that of the kernel's interrupt threads (50)."""
 
 SPIN_S = 1
-"""Time that the control loop may run without a pause before the kernel ends the process, s. The
-loop precedes all ordinary programs. A step takes a thousandth of this time."""
+"""Time that the control loop may run without a pause before the kernel ends the process, s. This
+limit is needed because the loop has priority over all ordinary programs. A step takes a thousandth
+of this time."""
 
 DOZE = "/dev/cpu_dma_latency"
 """The kernel's device through which a process limits how long a processor may take to wake."""
@@ -39,17 +40,17 @@ def ask() -> str:
     if not refused:
         return ""
     return (
-        f"no permission for {', '.join(refused)}, so a control period or a command can be late. "
-        "Either run the service, which has permission (acsard service install), or give the user "
-        "rtprio 10 and memlock unlimited in /etc/security/limits.conf, or set "
-        "control.real_time = false"
+        f"the daemon has no permission for {', '.join(refused)}, so a control period or a command "
+        "can be late. Either run the daemon as the systemd service, which has permission (acsard "
+        "service install), or give the user who runs it the limits rtprio 10 and memlock unlimited "
+        "in /etc/security/limits.conf, or set control.real_time = false"
     )
 
 
 def has(pid: int) -> bool | None:
     """Return whether the first thread of a process (0: this one) has real-time scheduling.
 
-    In the daemon, this thread runs the control loop. Returns None if it cannot be read.
+    In the daemon, this thread runs the control loop. Returns None if the scheduling cannot be read.
     """
     try:
         policy = os.sched_getscheduler(pid)

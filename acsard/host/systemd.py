@@ -94,5 +94,5 @@ def status_of(outputs: Outputs) -> str:
     if outputs.mode == "driving":
         twist = outputs.applied
         turn = f", {twist.angular:.1f} rad/s" if abs(twist.angular) >= 0.05 else ""
-        return f"driving {twist.linear:.1f} m/s{turn} by {outputs.source}"
+        return f"driving at {twist.linear:.1f} m/s{turn}, commanded by {outputs.source}"
     return f"{outputs.mode}: {outputs.reason}"

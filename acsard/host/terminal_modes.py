@@ -19,9 +19,9 @@ def coloured(stream: TextIO) -> bool:
 
 @contextmanager
 def one_by_one() -> Iterator[None]:
-    """Let standard input deliver each key press at once, and restore the terminal at the end.
+    """Let standard input deliver each key press at once, until the block ends.
 
-    Ctrl-S becomes an ordinary key. Otherwise it would block a program that drives the robot.
+    Ctrl-S becomes an ordinary key. Otherwise Ctrl-S would block a program that drives the robot.
     """
     before = termios.tcgetattr(sys.stdin)
     tty.setcbreak(sys.stdin)

@@ -29,8 +29,8 @@ class _Itimerspec(ctypes.Structure):
 class TimerFd:
     """A timer whose file descriptor becomes readable when the timer expires.
 
-    The kernel has no timerfd for CLOCK_MONOTONIC_RAW, the daemon's clock. So `set` gives the kernel
-    the remaining time and not the time of the expiration.
+    The kernel has no timerfd for CLOCK_MONOTONIC_RAW, the daemon's clock. So `set` tells the kernel
+    how long to wait, and not the time at which the timer expires.
     """
 
     def __init__(self) -> None:
@@ -54,7 +54,7 @@ class TimerFd:
             raise OSError(ctypes.get_errno(), "timerfd_settime failed")
 
     def expirations(self) -> int:
-        """Return how often the timer has expired since the last call."""
+        """Return how many times the timer has expired since the last call."""
         try:
             return int.from_bytes(os.read(self._fd, 8), sys.byteorder)
         except OSError as error:

@@ -16,12 +16,12 @@ COMMIT_FILE = "commit"
 """Name of the file with the commit, which `deploy/build_hook.py` adds to the package."""
 
 DIGITS = 9
-"""Number of digits of the commit in the version."""
+"""Number of digits of the commit's hexadecimal hash that the version contains."""
 
 
 @lru_cache(1)
 def version() -> str:
-    """Return the version, as `0.1.0+g1a2b3c4d5` if the commit of the source is known."""
+    """Return the version, such as `0.1.0+g1a2b3c4d5` if the commit of the source is known."""
     commit = _text(_PACKAGE / COMMIT_FILE) or commit_of(_PACKAGE.parent)
     return f"{__version__}+g{commit[:DIGITS]}" if commit else __version__
 

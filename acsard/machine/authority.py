@@ -1,8 +1,8 @@
-"""Creates the certificate authority of a robot, and certificates that it signs, as files.
+"""Creates the certificate authority of a robot and the certificates that it signs, all as files.
 
 The keys are P-256 keys, in files that only their owner can read. People make their phones trust the
-authority, so its certificate limits the hosts for which it may sign. A thief of its key can pose as
-a robot or as a host of a private network, but not as any other web site.
+authority, so its certificate limits the hosts for which it may sign. A thief of the authority's key
+can pose as a robot or as a host of a private network, but not as any other web site.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from acsard.host.atomic_file import replace
 from acsard.machine.certificates import CA_KEY
 
 LOCAL = ("local", "localhost")
-"""Host names for which every authority may sign certificates, with all names below them."""
+"""Host names for which every authority may sign certificates. All names below them, such as
+`robot.local`, are permitted too."""
 
 PRIVATE = (
     "10.0.0.0/8", "100.64.0.0/10", "127.0.0.0/8", "169.254.0.0/16", "172.16.0.0/12",
@@ -46,10 +47,10 @@ class Authority:
     ) -> Authority:
         """Create an authority with the common name `name`, and write its files into `directory`.
 
-        Its own certificate is valid for five times `days`. It may sign for the host names in
-        `addresses` and `LOCAL`, with all names below them, and for the IP addresses in `addresses`
-        and `PRIVATE`. For an IPv6 address in `addresses`, it may sign for the whole /64 network.
-        Common names, which identify clients on the bus, are not limited.
+        The authority's own certificate is valid for five times `days`. It may sign for the host
+        names in `addresses` and `LOCAL`, with all names below them. It may also sign for the IP
+        addresses in `addresses` and `PRIVATE`. For an IPv6 address in `addresses`, it may sign for
+        the whole /64 network. Common names, which identify clients on the bus, are not limited.
         """
         directory.mkdir(mode=0o755, parents=True, exist_ok=True)
         key = ec.generate_private_key(ec.SECP256R1())
@@ -84,7 +85,8 @@ class Authority:
     def permits(self, address: str) -> bool:
         """Return whether this authority may sign a certificate for a host name or IP address.
 
-        Without a list of permitted names, all are permitted. acsard always writes a list.
+        If the authority's certificate has no list of permitted names, all names are permitted. An
+        authority that acsard has made always has a list.
         """
         try:
             constraints = self._certificate.extensions.get_extension_for_class(x509.NameConstraints)
@@ -106,7 +108,7 @@ class Authority:
         )
 
     def names_in(self, directory: Path) -> list[str]:
-        """Return the names and addresses in the certificate in `directory`; [] if it is missing."""
+        """Return the names and addresses in the certificate in `directory`; [] if unreadable."""
         try:
             found = x509.load_pem_x509_certificate((directory / CERTIFICATE).read_bytes())
             names = found.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
@@ -118,8 +120,8 @@ class Authority:
     def issue(self, directory: Path, name: str, addresses: list[str], days: float) -> None:
         """Sign a certificate for servers and clients, and write it into `directory`.
 
-        Its key and the authority's certificate are written too. `name` is the common name.
-        `addresses` are the host names and IP addresses of the certificate's owner.
+        The key of the new certificate and the authority's certificate are written too. `name` is
+        the common name. `addresses` are the host names and IP addresses of the certificate's owner.
         """
         directory.mkdir(mode=0o755, parents=True, exist_ok=True)
         key = ec.generate_private_key(ec.SECP256R1())

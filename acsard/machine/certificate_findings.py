@@ -40,7 +40,10 @@ def certificates(tls: str) -> Iterator[Finding]:
             text = f"{file} is missing, or you may not read it"
             yield Finding("certificates", "failure", text, _mend_of_absent(directory))
         elif name == KEY and file.stat().st_mode & 0o077:
-            text, mend = f"other users may read {file}", f"chmod 600 {shlex.quote(str(file))}"
+            text, mend = (
+                f"users other than the owner may read the private key {file}",
+                f"chmod 600 {shlex.quote(str(file))}",
+            )
             yield Finding("certificates", "failure", text, mend)
     try:
         require_usable(tls)
@@ -52,7 +55,7 @@ def certificates(tls: str) -> Iterator[Finding]:
     mend = (
         renewal(tls, first(found)[0])
         if found
-        else f"run {install('tls')}, so that acsard can read the certificates"
+        else f"run `{install('tls')}`, which installs the library that reads certificates"
     )
     yield Finding("certificates", LEVELS[level], f"{tls}: {words}", mend if level else "")
 
@@ -67,36 +70,45 @@ def renewal(tls: str, whose: str) -> str:
     if whose == AUTHORITY:
         return (
             f"on the machine that has {CA_KEY}, in the directory of that file, run `acsard tls "
-            "init --force --directory .`; then make and copy a new certificate for each client"
+            "init --force --directory .`; then make a new certificate for each client, and copy it "
+            "to that client"
         )
     if not whose and name == OWN:
-        there = "" if (directory / CA_KEY).exists() else f", after you have put {CA_KEY} there"
+        there = (
+            ""
+            if (directory / CA_KEY).exists()
+            else f", after you have copied {CA_KEY} into that directory"
+        )
         return f"run `{_command('renew', directory)}`{there}"
     to = tls
     if whose:
         name, to = host_of(whose.rpartition(" ")[2]), "the router"
     return (
         f"on the machine that has {CA_KEY}, in the directory of that file, run `acsard tls renew "
-        f"--name {shlex.quote(name)} --directory .`; then copy clients/{name}/*.pem to {to}"
+        f"--name {shlex.quote(name)} --directory .`; then copy clients/{name}/*.pem from there to "
+        f"{to}"
     )
 
 
 def _mend_of_absent(directory: Path) -> str:
     """Return the remedy if a certificate file in the directory is missing or cannot be read."""
     if (directory / CA_KEY).exists():
-        return f"run `{_command('renew', directory)}`, or run this command again with sudo"
+        return f"run `{_command('renew', directory)}`, or run this check again with sudo"
     if not directory.is_dir() or not any(directory.iterdir()):
-        return f"run `{_command('init', directory)}`, or copy the files of `acsard tls add` there"
+        return (
+            f"run `{_command('init', directory)}`, or copy the files that `acsard tls add` made "
+            "into that directory"
+        )
     return (
-        f"either run this command with sudo, or copy {CA}, {CERTIFICATE} and {KEY} there again "
-        f"from the machine that has {CA_KEY}"
+        f"either run this check with sudo, or copy {CA}, {CERTIFICATE} and {KEY} into that "
+        f"directory again from the machine that has {CA_KEY}"
     )
 
 
 def _command(action: str, directory: Path) -> str:
-    """Return the command line of an action of `acsard tls` in this directory.
+    """Return the shell command for an action of `acsard tls` in this directory.
 
-    With sudo it has the full path of acsard, because sudo does not search this user's PATH.
+    A command with sudo has the full path of acsard, because sudo does not search this user's PATH.
     """
     there = next(one for one in (directory, *directory.absolute().parents) if one.exists())
     program = "acsard"

@@ -38,14 +38,15 @@ ADDRESS = re.compile(r"[A-Za-z0-9:]([A-Za-z0-9.:-]{0,251}[A-Za-z0-9:])?\Z")
 
 LABEL = r"[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?"
 HOST_LIKE = re.compile(rf"{LABEL}(\.{LABEL})*\Z")
-"""Pattern of a common name that looks like a host name. `10.0.0.5` matches it as well."""
+"""Pattern of a common name that looks like a host name. It also matches `10.0.0.5`."""
 
 
 def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -> list[str]:
-    """Create an authority, the robot's certificate and one for each role, in `directory`.
+    """Create an authority, the robot's certificate and a client certificate for each role.
 
-    Returns the names and addresses in the robot's certificate: those of this machine, and
-    `addresses`. An existing authority is replaced only if `force` is set.
+    All files are written into `directory`. Returns the names and addresses in the robot's
+    certificate: those of this machine, and `addresses`. An existing authority is replaced only if
+    `force` is set.
     """
     if (directory / CA).exists() and not force:
         raise MendableError(
@@ -81,7 +82,8 @@ def add(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path
 def renew_client(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path:
     """Replace the client certificate with the common name `name`, and return its directory.
 
-    The new one contains `addresses`, and those of the old one that the authority permits.
+    The new certificate contains `addresses`. It also contains those names and addresses of the old
+    certificate that the authority permits.
     """
     authority = _load(directory)
     clients = directory / "clients"
@@ -102,8 +104,8 @@ def renew_client(directory: Path, name: str, addresses: Sequence[str], days: int
 def renew(directory: Path, addresses: Sequence[str], days: int) -> list[str]:
     """Replace the robot's own certificate, and return the names and addresses in the new one.
 
-    The new one contains `addresses`, and the names and addresses of this machine and of the old
-    certificate that the authority permits.
+    The new certificate contains `addresses`. It also contains those names and addresses of this
+    machine and of the old certificate that the authority permits.
     """
     authority = _load(directory)
     _require_permitted(authority, addresses)
@@ -132,10 +134,10 @@ def _require_permitted(authority: Authority, addresses: Sequence[str]) -> None:
     if barred:
         named = " ".join(f"--address {one}" for one in barred)
         raise MendableError(
-            f"the authority may not sign for {', '.join(barred)}: its certificate permits only "
-            "private networks, .local names, and the names and addresses given to `tls init`. "
-            f"`acsard tls init --force {named}` makes a new authority; then every client needs a "
-            "new certificate",
+            f"the certificate authority may not sign a certificate for {', '.join(barred)}: the "
+            "authority's own certificate permits only private networks, .local names, and the "
+            "names and addresses that were given to `acsard tls init`. `acsard tls init --force "
+            f"{named}` makes a new authority; then every client needs a new certificate",
         )
 
 
@@ -147,7 +149,7 @@ def _robot_names(more: Sequence[str]) -> list[str]:
 
 
 def keys(config: Config, directory: Path) -> dict[str, object]:
-    """Return the settings that open the bus to the network with the certificates in `directory`."""
+    """Return the settings with which the bus uses the certificates and accepts other machines."""
     listen = list(config.bus.listen)
     if not any(endpoint.startswith("tls/") for endpoint in listen):
         listen.append(f"tls/0.0.0.0:{PORT}")
@@ -172,22 +174,28 @@ def _load(directory: Path) -> Authority:
         raise
     except FileNotFoundError:
         if (directory / CA).exists():
-            text = f"{directory} has no {CA_KEY}: copy the authority's key back there first"
+            text = (
+                f"{directory} has no {CA_KEY}: first copy the key of the certificate authority "
+                "back into that directory"
+            )
         else:
             text = (
-                f"{directory} has no authority: name the directory of {CA_KEY} with --directory; "
-                "if there is none yet, run `acsard tls init` first"
+                f"{directory} has no certificate authority: name the directory that contains "
+                f"{CA_KEY} with --directory; if you have no authority yet, run `acsard tls init` "
+                "first"
             )
         raise MendableError(text) from None
     except (OSError, ValueError) as error:
-        raise MendableError(f"cannot use the authority in {directory}: {error}") from None
+        raise MendableError(
+            f"cannot use the certificate authority in {directory}: {error}"
+        ) from None
 
 
 def _password() -> str:
     if not sys.stdin.isatty():
         raise UsageError(
-            "the authority's key is encrypted: run this in a terminal, where it asks for the "
-            "password",
+            "the private key of the certificate authority is encrypted: run this command in a "
+            "terminal, where it asks for the password",
         )
     return getpass(f"password of {CA_KEY}: ")
 

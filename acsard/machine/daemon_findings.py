@@ -47,43 +47,45 @@ from acsard.host.processes import name_of
 from acsard.machine.finding import LEVELS, Finding, Level
 
 SHOWN = 6
-"""Largest number of keys with different values that a finding names."""
+"""Largest number of configuration keys that a finding about different values names."""
 
 
 OPTIONS = (
     "mcu.port", "mcu.baud_rate", "robot.id", "bus.listen", "bus.connect", "record.directory",
     "ros.namespace",
 )  # fmt: skip
-"""Keys that `acsard run` takes as options. A difference from the file is probably intended."""
+"""Configuration keys that are also options of `acsard run`. If the daemon's value of such a key
+differs from the file, this is probably intended."""
 
 WAYS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = (
     (
         lambda key: key in OPTIONS,
         "ok",
-        "from its options (`acsard run --help`) or from another file, or the file has changed "
+        "they come from the options of `acsard run` or from another file, or the file has changed "
         "since the daemon started",
-        "to keep {which}, write these lines into the file: {lines}",
+        "to keep {which} after a restart, write these lines into the file: {lines}",
     ),
     (
         lambda key: key not in OPTIONS and live(key) is None,
         "warning",
-        "from another file or from its environment, or the file has changed since the daemon "
-        "started",
+        "they come from another file or from the daemon's environment, or the file has changed "
+        "since the daemon started",
         "if the daemon runs with another file, name that file with --config; otherwise either "
-        "write the daemon's values into this file, or restart the daemon. The "
-        "findings below are about the running daemon",
+        "write the daemon's values into this file, or restart the daemon with the values of this "
+        "file. The findings below are about the running daemon",
     ),
     (
         lambda key: live(key) is not None,
         "warning",
-        "set while the daemon ran, or from another file, or the file has changed since the daemon "
-        "started",
+        "they were set while the daemon ran, or come from another file, or the file has changed "
+        "since the daemon started",
         "when the daemon starts again, it uses the file's values; `acsard set KEY VALUE --write` "
         "writes a value into the file",
     ),
 )
-"""Reasons why the daemon's value of a key may differ from the file's. Each row has a function that
-says whether it applies to a key, the level of the finding, the reason and the remedy."""
+"""Reasons why the daemon's value of a configuration key may differ from the value in the file. Each
+row has a function that says whether the reason applies to a key, the level of the finding, the
+reason and the remedy."""
 
 
 class Running(Struct, frozen=True):
@@ -99,15 +101,16 @@ class Running(Struct, frozen=True):
     """Time from the request for `state` to its answer, ns."""
     rows: tuple[DiagnosticStatus, ...] = ()
     here: bool = True
-    """Whether the daemon's process is on this machine. Its address may lead to another machine."""
+    """Whether the daemon's process is on this machine. The daemon's address may lead to another
+    machine."""
     events: tuple[LogEvent, ...] = ()
 
 
 def asked(config: Config, address: Address) -> Running:
     """Query the daemon at this address. Raises an `AcsardError` if it does not answer.
 
-    `config` is the configuration in the local file. It is used, corrected by the daemon's `info`,
-    if this client may not query the daemon's configuration.
+    `config` is the configuration in the local file. If this client may not query the daemon's
+    configuration, `config` is used instead, corrected by the daemon's `info`.
     """
     endpoint, robot_id, tls = address
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
@@ -123,7 +126,7 @@ def asked(config: Config, address: Address) -> Running:
 
 
 def _configuration(robot: Client, info: Info, file: Config) -> Config:
-    """Return the daemon's configuration; if it is not readable, `file` corrected by `info`."""
+    """Return the daemon's configuration. If unreadable, return `file` with `info`'s values."""
     try:
         return from_builtins(robot.get("config"))
     except (AcsardError, msgspec.ValidationError):  # not permitted, or a daemon of another version
@@ -137,16 +140,22 @@ def compared(running: Running, file: Config) -> Iterator[Finding]:
     info, others = running.info, differences(running.config, file)
     who = f"acsard {info.version}, pid {info.pid}"
     if not others:
-        yield Finding("configuration", "ok", f"the running daemon ({who}) uses the file's values")
+        yield Finding(
+            "configuration",
+            "ok",
+            f"the running daemon ({who}) uses the configuration file's values",
+        )
         return
     for belongs, level, how, mend in WAYS:
         its = {key: one for key, one in others.items() if belongs(key)}
         if not its:
             continue
         told = [one.words(key) for key, one in its.items()]
-        text = f"the running daemon ({who}) has other values ({how}): "
+        text = f"the running daemon ({who}) has other values than the file ({how}): "
         text += listed(told, SHOWN, "; ")
-        mend = mend.format(which="them" if len(its) > 1 else "it", lines=_tables(its))
+        mend = mend.format(
+            which="these values" if len(its) > 1 else "this value", lines=_tables(its)
+        )
         yield Finding("configuration", level, text, mend)
 
 
@@ -175,9 +184,9 @@ def link(running: Running) -> Iterator[Finding]:
     if state.link != "up":
         if state.link == "down":
             mend = (
-                "see the finding about the port above"
+                "see the finding about the serial port above"
                 if running.here
-                else "run `acsard doctor` on that machine, which checks its port"
+                else "run `acsard doctor` on the daemon's machine, where it checks the serial port"
             )
         if config.mcu.simulated or is_ours(state.reason):
             mend = BUSY
@@ -195,8 +204,8 @@ def link(running: Running) -> Iterator[Finding]:
     if late := state.counters.get(f"link_lost{'' if config.mcu.simulated else '_host_stall'}", 0):
         late_times = many(late, "time")
         text = (
-            f"lost {late_times} since the daemon's start because this computer did not run the "
-            "daemon in time"
+            f"the link was lost {late_times} since the daemon's start because the daemon's "
+            "computer did not run the daemon in time"
         )
         yield Finding("link", "warning" if late > often else "ok", text, BUSY)
     problems = [*lost(passed, config), *(refused(passed) or refused(state.counters))]
@@ -206,7 +215,7 @@ def link(running: Running) -> Iterator[Finding]:
     for times, text in went:
         yield Finding("link", "warning" if times > often else "ok", text, mend)
     if not problems and not late and not went:
-        yield Finding("link", "ok", "up, and no serial line is lost")
+        yield Finding("link", "ok", "the link is up, and no line to or from the board is lost")
     if state.wheel_fault:
         yield Finding("wheels", "warning", state.wheel_fault, mend)
     yield from _emergency_stop(config, state, mend)
@@ -220,7 +229,9 @@ def _emergency_stop(config: Config, state: RobotState, mend: str) -> Iterator[Fi
     elif state.emergency_stop == "silent":
         yield Finding("emergency stop", "failure", SILENT, CHECK)
     elif state.emergency_stop:
-        yield Finding("emergency stop", "ok", "the board reports it, and it is released")
+        yield Finding(
+            "emergency stop", "ok", "the board reports that the emergency stop is released"
+        )
     elif config.safety.estop == "required":
         yield Finding("emergency stop", "failure", MISSING, mend)
 
@@ -231,7 +242,7 @@ def _bumpers(config: Config, state: RobotState, mend: str) -> Iterator[Finding]:
         # If the board has fallen silent, all bumpers count as pressed.
         todo = f"{RELEASE}; if none is pressed, {CHECK}; then `acsard call clear`"
         if safety.bumper == "away":
-            todo = f"drive away from it in a straight line; if the robot is stopped, {todo}"
+            todo = f"drive straight away from the obstacle; if the robot is stopped, {todo}"
         yield Finding("bumpers", "warning", bumpers.pressed_words(safety.bumpers, pressed), todo)
     elif pressed is not None:
         text = f"the board reports {many(len(pressed), 'bumper')}, and none is pressed"
@@ -260,14 +271,17 @@ def _battery(config: BatteryConfig, battery: BatterySummary | None, mend: str) -
 
 
 def lost(passed: Mapping[str, int], config: Config) -> Iterator[str]:
-    """Yield a warning if the board answered too few lines. `passed` has the counts of 1 s."""
+    """Yield a warning if the board answered too few lines.
+
+    `passed` says by how much each counter rose within a second.
+    """
     sent, came = passed.get("lines_sent", 0), passed.get("lines", 0)
     # With fewer than 40 lines, a fraction means nothing.
     if config.mcu.reply_period or sent < 40 or came >= (1 - LOST) * sent - 1:
         return
     yield (
-        f"the board answered only {came} of {sent} lines that were sent in a second: lines or "
-        "answers get lost, or the board reports at times of its own instead of answering"
+        f"the board answered only {came} of the {sent} lines that the daemon sent in a second: "
+        "lines or answers get lost, or the board sends reports at its own times instead of answers"
     )
 
 
@@ -281,7 +295,7 @@ def refused(counters: Mapping[str, int]) -> list[str]:
     if sum(kinds.values()) <= LOST * max(1, counters.get("lines", 0)):
         return []
     told = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in kinds.items())
-    return [f"lines of the microcontroller that were rejected: {told}"]
+    return [f"the daemon rejected lines from the microcontroller, by reason: {told}"]
 
 
 def gone(counters: Mapping[str, int]) -> list[tuple[int, str]]:
@@ -292,60 +306,69 @@ def gone(counters: Mapping[str, int]) -> list[tuple[int, str]]:
     times = counters.get("link_lost", 0) - counters.get("link_lost_host_stall", 0)
     text = (
         f"the link was lost {many(times, 'time')} since the daemon's start: the board restarts, is "
-        "silent at times or was unplugged; the log says when (link_stale, link_down)"
+        "silent at times or was unplugged; the events link_stale and link_down in the log say when"
     )
     return [(times, text)] if times > 0 else []
 
 
 def check(running: Running) -> str:
-    """Return a text with the command that examines the board, and the preparation that it needs."""
+    """Return the command that examines the board, and the preparation that the command needs."""
     port = running.config.mcu.port
     return (
-        f"`acsard mcu check --port {port}` finds the cause, with the wheels lifted; stop the "
-        f"daemon first: systemctl stop acsard, or kill {running.info.pid}"
+        f"`acsard mcu check --port {port}` finds the cause. Before you run it, lift the wheels off "
+        f"the ground, and stop the daemon: run `systemctl stop acsard`, or kill {running.info.pid}"
     )
 
 
 GYRO_MENDS: dict[GyroDoes, str] = {
     "used": "",
     "waiting for rest": "",
-    "silent": "is its driver running, and does it publish on the key `imu` (ROS topic imu/data)?",
-    "disagrees": "turn more slowly, or drive on other ground; if that does not help, check that "
-    "its z axis points up and that it sends rad/s",
-    "reversed": "if the wheels turn the right way (`acsard mcu check`), mount it with its z axis "
-    "up, or let its driver negate angular_velocity.z",
-    "in degrees": "let its driver send rad/s: divide the degrees per second by 57.3",
-    "dead": "check its cable and its driver: does angular_velocity.z change when the robot turns?",
-    "not believed": "check that its z axis points up and that it sends rad/s; then `acsard "
-    "calibrate` measures the track width",
+    "silent": "check that the gyro's driver runs, and that it publishes on the Zenoh key `imu` "
+    "(the ROS topic imu/data)",
+    "disagrees": "turn the robot more slowly, or drive on other ground; if that does not help, "
+    "check that the gyro's z axis points up and that its driver sends rad/s",
+    "reversed": "check with `acsard mcu check` that the wheels turn the right way; if they do, "
+    "mount the gyro with its z axis up, or let its driver negate angular_velocity.z",
+    "in degrees": "let the gyro's driver send rad/s: divide the degrees per second by 57.3",
+    "dead": "check the gyro's cable and its driver: angular_velocity.z must change when the robot "
+    "turns",
+    "not believed": "check that the gyro's z axis points up and that its driver sends rad/s; then "
+    "measure the track width with `acsard calibrate`",
 }
 """Maps the gyro's status in `state` to the remedy; "" if the status needs no remedy."""
 
 CAUSES_SHOWN = 3
-"""Largest number of late control periods whose causes are shown. Older ones are left out."""
+"""Largest number of late control periods whose causes the doctor shows. Older ones are left out."""
 
 CAUSES_PAGE = "deploy/systemd/README.md explains each cause of lateness"
 
 START = (
-    "see systemctl status acsard; or start the daemon: acsard run; if it was started with "
-    "--listen, name that address with --connect"
+    "if the daemon is a systemd service, `systemctl status acsard` shows why it does not run; "
+    "otherwise start it with `acsard run`. If the daemon was started with --listen, name the "
+    "address that it got there with --connect"
 )
 
 ANOTHER = (
-    "select a daemon with another id with --id (`acsard fleet` lists the robots); or does "
-    "another program use that port?"
+    "if the daemon has another robot id, name that id with --id (`acsard fleet` lists the robots); "
+    "otherwise check whether another program listens at that address"
 )
 
-SIGN = "or sign the commands (deploy/clients/README.md), which then need no common clock"
+SIGN = (
+    "or let the clients sign their commands (deploy/clients/README.md): signed commands do not "
+    "need a common clock"
+)
 
 
-START_ROUTER = "start it there (rmw_zenohd, zenohd, `acsard router`): the daemon connects by itself"
+START_ROUTER = (
+    "start the Zenoh router at that address (rmw_zenohd, zenohd or `acsard router`): the daemon "
+    "then connects by itself"
+)
 
 
 PUT_ROUTER = (
     "a daemon does not forward the messages of other daemons, so `acsard fleet` and `acsard call "
-    "stop --id '*'` do not reach the robots behind it: connect all robots to a router "
-    "(deploy/zenoh/README.md)"
+    "stop --id '*'` do not reach a robot that is connected only to another daemon: connect all "
+    "robots to a Zenoh router (deploy/zenoh/README.md)"
 )
 
 
@@ -357,22 +380,33 @@ def routers(config: Config) -> Iterator[Finding]:
         if endpoint.startswith("tls/"):
             continue
         text = (
-            f"connects to {endpoint}: every program behind that router has the rights of this "
-            "machine"
+            f"the daemon connects to the router at {endpoint} without TLS: every program that is "
+            "connected to that router has the rights of this machine"
         )
-        yield Finding("bus", "warning", text, "keep the router on loopback, or behind TLS")
+        yield Finding(
+            "bus",
+            "warning",
+            text,
+            "let the router listen only on loopback, or let the daemon connect to it over TLS",
+        )
 
 
 def found(config: Config, address: Address) -> Running | Finding:
-    """Return the daemon's answers, or a finding. Raises `UsageError` for an invalid endpoint."""
+    """Return the daemon's answers, or a finding that says why there are none.
+
+    Raises `UsageError` for an invalid endpoint.
+    """
     endpoint = address.endpoint
     if not answers(endpoint):
         if config.bus.mode == "client" and endpoint in map(reachable, config.bus.connect):
             text = (
-                f"cannot be asked: the router at {endpoint} is missing, and this tool "
-                "reaches the daemon only through it"
+                f"this tool reaches the daemon only through the Zenoh router at {endpoint}, and no "
+                "program listens there"
             )
-            mend = "start the router first; see `systemctl status acsard`"
+            mend = (
+                "start that router (rmw_zenohd, zenohd or `acsard router`), then run `acsard "
+                "doctor` again; until then, `systemctl status acsard` shows the state of the daemon"
+            )
             return Finding("daemon", "warning", text, mend)
         return Finding("daemon", "warning", f"no program listens at {endpoint}", START)
     try:
@@ -380,14 +414,19 @@ def found(config: Config, address: Address) -> Running | Finding:
     except NoAnswerError as error:
         return Finding("daemon", "failure", str(error), ANOTHER)
     except AcsardError as error:
-        return Finding("daemon", "failure", str(error), "does another program use that port?")
+        return Finding(
+            "daemon", "failure", str(error), "check whether another program listens at that address"
+        )
 
 
 def daemon(running: Running) -> Iterator[Finding]:
     """Yield the findings that follow from the daemon's answers."""
     state = running.state
     level: Level = "failure" if state.mode == "fault" else "ok"
-    mend = f"see the reason; `acsard call clear` releases it; {check(running)}"
+    mend = (
+        "correct the cause that this reason names, then release the fault with `acsard call "
+        f"clear`; {check(running)}"
+    )
     mend = mend if level == "failure" else ""
     yield Finding("daemon", level, f"{state.mode}: {state.reason}", mend)
     yield from link(running)
@@ -397,19 +436,25 @@ def daemon(running: Running) -> Iterator[Finding]:
     yield from linked(rows)
     yield from certificate(rows.get("acsard: certificate"), running.here)
     if state.counters.get("gateway_full"):
-        text = "at times, clients from the network used all connections: the log names them"
-        mend = "remove the client's certificate from [access], or end its program"
+        text = (
+            "at times, clients from the network used all connections of the TLS gateway: the log "
+            "names these clients"
+        )
+        mend = "remove such a client's certificate from [access], or end the client's program"
         yield Finding("gateway", "warning", text, mend)
     if state.latch_file_error:
-        mend = "free disk space, or name a writable directory: control.state_directory"
+        mend = "free disk space, or set control.state_directory to a writable directory"
         yield Finding("latch file", "warning", state.latch_file_error, mend)
     # If the daemon runs on this machine, `compared` has read its file.
     if state.settings_differ and not running.here:
         mend = (
-            "when the daemon restarts, it uses the file's values; `acsard set KEY VALUE --keep` "
-            "writes a value into that file"
+            "when the daemon restarts, it uses the values of the file; `acsard set KEY VALUE "
+            "--keep` writes a value into the file"
         )
-        text = f"the settings in force differ from the robot's file: {state.settings_differ}"
+        text = (
+            "the daemon's settings differ from the configuration file on the robot: "
+            f"{state.settings_differ}"
+        )
         yield Finding("configuration", "warning", text, mend)
     yield from late(running)
 
@@ -418,16 +463,16 @@ def certificate(row: DiagnosticStatus | None, here: bool) -> Iterator[Finding]:
     """Yield a finding if a certificate that the daemon or its gateway uses expires soon."""
     if row is None or not row.level:
         return
-    mend = "run `acsard doctor` on that machine, which examines its files"
+    mend = "run `acsard doctor` on the daemon's machine, where it examines the certificate files"
     if here:
         mend = (
-            "if the files above are new, give the services copies of them: run `sudo systemctl "
-            "try-reload-or-restart acsard-gateway acsard-web`, and if the robot connects to a "
-            "router, also `sudo systemctl reload acsard`. The robot uses the new files for its "
-            "next connection. A restart of its daemon ends this warning at once, but stops the "
-            "robot"
+            "if you have already renewed the certificate files of the findings above, give the "
+            "services copies of them: run `sudo systemctl try-reload-or-restart acsard-gateway "
+            "acsard-web`, and if the robot connects to a router, also `sudo systemctl reload "
+            "acsard`. The daemon uses the new files for its next connection. A restart of the "
+            "daemon ends this warning at once, but stops the robot"
         )
-    text = f"the daemon's certificate that ends first: {row.message}"
+    text = f"the daemon reports about its certificate that expires first: {row.message}"
     yield Finding("certificates", LEVELS[min(row.level, 2)], text, mend)
 
 
@@ -440,10 +485,11 @@ def late(running: Running) -> Iterator[Finding]:
     missed, lines = counters.get("missed_periods", 0), counters.get("lines_sent", 0)
     told = [row.message for row in running.rows if row.name == "acsard: control loop" and row.level]
     if missed > 0.01 * max(1, lines):
-        told = [f"missed {missed} control periods"]
+        told = [f"the daemon missed {missed} control periods"]
     for text in told:
         mend = (
-            "`top` shows which other program uses the processor; the service has real-time priority"
+            "`top` shows which other program uses the processor; a daemon that runs as the systemd "
+            "service has real-time priority"
         )
         yield Finding("daemon", "warning", text, mend)
     causes = [
@@ -453,15 +499,16 @@ def late(running: Running) -> Iterator[Finding]:
     ]
     for event, cause in causes[-CAUSES_SHOWN:]:
         level: Level = "warning" if told else "ok"
-        text = f"was late before {utc(event.stamp.to_ns())}: {cause}"
+        text = f"the daemon missed control periods before {utc(event.stamp.to_ns())}: {cause}"
         yield Finding("daemon", level, text, CAUSES_PAGE)
 
 
 def clocks(running: Running) -> Iterator[Finding]:
-    """Yield a warning if the daemon's clock differs from this machine's, or if it replaced stamps.
+    """Yield warnings about a daemon's clock that differs from this machine's, and replaced stamps.
 
-    The daemon read its clock at an unknown moment between the request and the answer. So a
-    difference of up to 0.4 s plus half of that time is tolerated.
+    The daemon read its clock at an unknown moment between the request and the answer. So a clock
+    difference of up to 0.4 s plus half of the time between request and answer is tolerated. Zenoh
+    replaces the stamps of commands from a computer whose clock is more than 0.5 s ahead.
     """
     its_ns, counters = running.state.stamp.to_ns(), running.state.counters
     apart = (its_ns - running.looked_ns) / NS_PER_S
@@ -469,20 +516,31 @@ def clocks(running: Running) -> Iterator[Finding]:
     if not running.here and abs(apart) > 0.4 + running.trip_ns / 2 / NS_PER_S:
         way = "ahead of" if apart > 0 else "behind"
         text = f"the daemon's clock is {abs(apart):.1f} s {way} this machine's"
-        yield Finding("clock", "warning", text, f"let NTP set both clocks (timedatectl), {SIGN}")
+        yield Finding(
+            "clock",
+            "warning",
+            text,
+            f"let NTP set the clocks of both machines (timedatectl), {SIGN}",
+        )
     replaced = counters.get("stamps_replaced", 0)
     if replaced:
-        text = f"{replaced} commands came from clocks over 0.5 s ahead: their stamps were replaced"
-        yield Finding("clock", "warning", text, f"let NTP set both clocks, {SIGN}")
+        text = (
+            f"{replaced} commands came from computers with clocks more than 0.5 s ahead: Zenoh "
+            "replaced the time stamps of these commands"
+        )
+        yield Finding(
+            "clock", "warning", text, f"let NTP set the clocks of daemon and clients, {SIGN}"
+        )
 
 
 def gyro(does: str, counters: Mapping[str, int]) -> Iterator[Finding]:
-    """Yield a finding about the gyro's status `does`, and one if the daemon rejected samples."""
+    """Yield a finding about the gyro's status `does`, and one about samples that were rejected."""
     words = next((text for name, text in WORDS.items() if name == does), does)
     if does != "off":
         mend = next(
             (text for name, text in GYRO_MENDS.items() if name == does),
-            "does the daemon have another version? Use the same version here",
+            "this tool does not know this status: if the daemon has another version of acsard, use "
+            "the daemon's version here",
         )
         yield Finding("gyro", "warning" if mend else "ok", words, mend)
     refused = {n.removeprefix("imu_"): c for n, c in counters.items() if n.startswith("imu_") and c}
@@ -490,10 +548,15 @@ def gyro(does: str, counters: Mapping[str, int]) -> Iterator[Finding]:
         most = sorted(refused.items(), key=lambda one: -one[1])
         told = ", ".join(f"{count} {reason.replace('_', ' ')}" for reason, count in most)
         mend = (
-            "the log names the sender (imu_refused): let it send finite values in rad/s, from only "
-            "one gyro, whose z axis points up"
+            "the event imu_refused in the log names the sender: let the sender send finite values "
+            "in rad/s, from only one gyro, whose z axis points up"
         )
-        yield Finding("gyro", "warning", f"samples on imu that were rejected: {told}", mend)
+        yield Finding(
+            "gyro",
+            "warning",
+            f"the daemon rejected samples on the Zenoh key `imu`, by reason: {told}",
+            mend,
+        )
 
 
 def linked(rows: Mapping[str, DiagnosticStatus]) -> Iterator[Finding]:
@@ -512,5 +575,8 @@ def gateway(config: Config) -> Iterator[Finding]:
         if answers(endpoint):
             yield Finding("gateway", "ok", f"open at {endpoint}")
         else:
-            mend = "see systemctl status acsard-gateway; `acsard run` starts one by itself"
+            mend = (
+                "`systemctl status acsard-gateway` shows why the TLS gateway does not run; without "
+                "the systemd service, `acsard run` starts a gateway by itself"
+            )
             yield Finding("gateway", "warning", f"no program listens at {endpoint}", mend)

@@ -5,7 +5,7 @@ link. The doctor opens no port, and only queries a robot.
 
 If a daemon runs, the doctor examines the daemon's configuration, which may differ from the file
 after an edit or through options. If the daemon runs on another machine, the doctor examines only
-its reports, because its port, files and gateway are there.
+the daemon's reports, because the daemon's port, files and gateway are on that machine.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from acsard.machine.finding import Finding, Level
 from acsard.machine.serial_ports import BOARDS, serial_devices
 
 REAL = (
-    "run the daemon as the service (deploy/systemd), which has real-time priority; without it, "
-    "load makes the daemon late"
+    "run the daemon as the systemd service (deploy/systemd), which has real-time priority; without "
+    "this priority, other programs on a busy computer make the daemon late"
 )
 
 
@@ -40,20 +40,28 @@ def meddlers() -> Iterator[Finding]:
     """Yield findings about programs that take or disturb serial ports."""
     if running("brltty"):
         mend = (
-            "sudo apt remove brltty, unless you use a Braille display: brltty takes CH340 and "
-            "FTDI ports"
+            "run `sudo apt remove brltty`, unless you use a Braille display: brltty takes the "
+            "serial ports of CH340 and FTDI chips"
         )
-        yield Finding("brltty", "failure", "runs", mend)
+        yield Finding("brltty", "failure", "the program brltty runs", mend)
     if running("ModemManager") and not Path("/etc/udev/rules.d/70-acsar.rules").is_file():
         mend = "install deploy/udev/70-acsar.rules (`acsard service install` does that)"
-        yield Finding("ModemManager", "warning", "runs, and sends data to new serial ports", mend)
+        yield Finding(
+            "ModemManager",
+            "warning",
+            "the program ModemManager runs, and sends data to new serial ports",
+            mend,
+        )
 
 
 def clock_set() -> Iterator[Finding]:
     """Yield a finding that says whether the wall clock, which dates all messages, is set."""
     year = time.gmtime(clock.now().wall_ns / NS_PER_S).tm_year
     if year < 2026:  # boards without a battery start in the past
-        mend = "set the clock (timedatectl), or run chrony; odometry stamps are wall-clock times"
+        mend = (
+            "set this computer's clock (timedatectl), or run chrony: the time stamps of the "
+            "odometry come from this clock"
+        )
         yield Finding("clock", "warning", f"the year is {year}", mend)
     else:
         yield Finding("clock", "ok", f"the year is {year}")
@@ -62,19 +70,29 @@ def clock_set() -> Iterator[Finding]:
 def scheduling(wanted: bool, pid: int | None) -> Iterator[Finding]:
     """Yield a finding that says whether the daemon has or would get real-time scheduling.
 
-    `wanted` is control.real_time. If `pid` is None, the permissions of this user are examined.
+    `wanted` is the setting `control.real_time`. `pid` is the daemon's process. If `pid` is None,
+    the permissions of this user are examined.
     """
     has = None if pid is None else real_time.has(pid)
     if not wanted:
-        yield Finding("real time", "ok", "is not requested (control.real_time = false)")
+        yield Finding(
+            "real time",
+            "ok",
+            "the configuration does not request real-time scheduling (control.real_time = false)",
+        )
     elif has:
-        yield Finding("real time", "ok", f"the running daemon (pid {pid}) uses it")
+        yield Finding("real time", "ok", f"the running daemon (pid {pid}) has real-time scheduling")
     elif has is False:
-        yield Finding("real time", "warning", f"the running daemon (pid {pid}) lacks it", REAL)
+        yield Finding(
+            "real time",
+            "warning",
+            f"the running daemon (pid {pid}) does not have real-time scheduling",
+            REAL,
+        )
     elif real_time.allowed():
-        yield Finding("real time", "ok", "is permitted")
+        yield Finding("real time", "ok", "this user may use real-time scheduling")
     else:
-        yield Finding("real time", "warning", "is not permitted for this user", REAL)
+        yield Finding("real time", "warning", "this user may not use real-time scheduling", REAL)
 
 
 LOOK_S = 0.3
@@ -91,7 +109,10 @@ def slowness(kernel: Kernel | None = None) -> Iterator[Finding]:
     for clause, advice in causes:
         yield Finding("computer", "warning", f"{clause}, so the daemon can be late", advice)
     if not causes:
-        text = "the kernel reports no undervoltage, heat, slow clock or high steal time"
+        text = (
+            "the kernel reports no undervoltage, no overheating, no slowed processor clock and no "
+            "high steal time"
+        )
         yield Finding("computer", "ok", text)
 
 
@@ -99,14 +120,19 @@ def serial_port(config: Config) -> Iterator[Finding]:
     """Yield findings about the port: whether it exists, may be opened, and is used by others."""
     path = config.mcu.port
     if path == "sim":
-        mend = '`acsard ports` lists the ports; write, for example, mcu.port = "/dev/acsar"'
-        yield Finding("port", "warning", "the built-in simulator: no robot will move", mend)
+        mend = (
+            "to drive a robot, set mcu.port to the board's serial port, for example "
+            '"/dev/acsar"; `acsard ports` lists the ports'
+        )
+        yield Finding(
+            "port", "warning", "mcu.port selects the built-in simulator: no robot will move", mend
+        )
         return
     if not os.path.exists(path):
         seen = ", ".join(port.device for port in serial_devices()) or "none"
         mend = (
-            "plug the board in; its name in /dev/serial/by-id stays the same when you plug it in "
-            "again (`acsard ports` lists the names)"
+            "plug the board in. The board's name in /dev/serial/by-id stays the same when you plug "
+            "the board in again: it is the best value of mcu.port (`acsard ports` lists the names)"
         )
         yield Finding("port", "failure", f"{path} does not exist; the ports are: {seen}", mend)
         return
@@ -117,7 +143,11 @@ def serial_port(config: Config) -> Iterator[Finding]:
     yield _permission(path)
     for holder in holders(path):
         level: Level = "ok" if holder.name == "acsard" else "failure"
-        mend = "" if level == "ok" else f"end it: kill {holder.pid}; or make it use another port"
+        mend = (
+            ""
+            if level == "ok"
+            else f"end that program (`kill {holder.pid}`), or let it use another port"
+        )
         text = f"{path} is in use by {holder.name} (pid {holder.pid})"
         yield Finding("port", level, text, mend)
     yield from _hardware(Path(os.path.realpath(path)).name)
@@ -129,11 +159,21 @@ def _hardware(name: str) -> Iterator[Finding]:
     if usb and usb[0].usb_id and not usb[0].board:
         known = ", ".join(sorted(BOARDS))
         text = f"{usb[0].usb_id} is not one of the common boards ({known})"
-        yield Finding("port", "warning", text, "if it is your MCU, add its ids to 70-acsar.rules")
+        yield Finding(
+            "port",
+            "warning",
+            text,
+            "if this is your microcontroller, add its USB id to deploy/udev/70-acsar.rules",
+        )
     timer = Path(f"/sys/class/tty/{name}/device/latency_timer")
     if timer.is_file() and timer.read_text().strip() != "1":
-        text = f"its FTDI chip delays bytes by {timer.read_text().strip()} ms"
-        yield Finding("port", "warning", text, f"install 70-acsar.rules, or: echo 1 > {timer}")
+        text = f"the FTDI chip of the port delays bytes by {timer.read_text().strip()} ms"
+        yield Finding(
+            "port",
+            "warning",
+            text,
+            f"install deploy/udev/70-acsar.rules, or run as root: echo 1 > {timer}",
+        )
 
 
 def _permission(path: str) -> Finding:
@@ -143,7 +183,10 @@ def _permission(path: str) -> Finding:
         group = Path(path).group()
     except KeyError:
         group = str(os.stat(path).st_gid)
-    mend = f"sudo usermod -aG {group} $USER, then log in again (the service has the group itself)"
+    mend = (
+        f"run `sudo usermod -aG {group} $USER`, then log in again (the systemd service needs no "
+        "such step, because its unit names the group)"
+    )
     return Finding(
         "port", "failure", f"{path} belongs to group {group}, but you are not in it", mend
     )
@@ -174,9 +217,12 @@ def examine(
     running = found(config, address)
     if isinstance(running, Running) and not running.here:
         elsewhere = (
-            f"runs on another machine (its pid {running.info.pid} is not an acsard process here)"
+            f"the daemon runs on another machine (here, its pid {running.info.pid} is not a "
+            "process of acsard)"
         )
-        yield Finding("daemon", "ok", f"{elsewhere}: check its port, files and TLS gateway there")
+        yield Finding(
+            "daemon", "ok", f"{elsewhere}: check its serial port, files and TLS gateway there"
+        )
         yield from certificates(address.tls)
         yield from daemon(running)
         return

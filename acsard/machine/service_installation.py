@@ -24,7 +24,8 @@ from acsard.host.errors import MendableError, NotPermittedError
 from acsard.host.processes import called
 
 HOME = "/opt/acsard/venv"
-"""Path of the venv in the unit files of `deploy/`. The installation replaces it by the real one."""
+"""Path of the venv in the unit files of `deploy/`. The installation replaces it by the path of the
+venv that runs acsard."""
 
 OUT_OF_SIGHT = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
 """Directories that are hidden from the service."""
@@ -87,7 +88,8 @@ def _closed(path: Path) -> Path | None:
 
 
 OURS = ("bin", "acsard", "acsard.service.d", "acsard-gateway.service.d", "acsard-web.service.d")
-"""Names of the directories that are removed when they have become empty."""
+"""Names of the directories that the removal of the service also removes if they have become
+empty."""
 
 
 class File(Struct, frozen=True):
@@ -204,7 +206,7 @@ Step = Write | Remove | Keep | Run
 
 def _unreadable(path: Path, error: OSError) -> MendableError:
     if isinstance(error, PermissionError):
-        return NotPermittedError(f"no permission to read {path}; run it with sudo")
+        return NotPermittedError(f"no permission to read {path}; run this command with sudo")
     return MendableError(f"cannot read {path}: {error.strerror}; check the file")
 
 
@@ -217,7 +219,10 @@ LAN = "lan.conf"
 TLS = "/etc/acsard/tls"
 """Directory in which `lan.conf` expects the certificates."""
 STATES = {
-    UNIT: (Path("/var/lib/acsard"), "its recordings, and the stop that survives a restart"),
+    UNIT: (
+        Path("/var/lib/acsard"),
+        "the daemon's recordings, and the stop that survives a restart",
+    ),
     PAGE: (Path("/var/lib/acsard-web"), "invitations to the page"),
 }
 """State directories of the units, each with a description of its content."""
@@ -275,8 +280,9 @@ def admitting(directory: Path) -> Write | Keep | None:
     """Return the step that gives the service's TLS gateway the certificates in `directory`.
 
     Return None if the service is not installed, or if the user is not root. The step writes a
-    drop-in of the gateway's unit. Without it, the gateway may use only loopback and cannot read
-    root's files. An existing drop-in keeps its networks, because they may have been narrowed.
+    drop-in file of the gateway's unit. Without this file, the gateway may use only loopback and
+    cannot read root's files. An existing drop-in keeps its networks, because a person may have
+    narrowed them.
     """
     if os.geteuid() != 0 or not (UNITS / GATEWAY).exists():
         return None
@@ -323,8 +329,8 @@ def installing(wanted: Iterable[File], found: Found, *, force: bool) -> list[Ste
     if changed and not force:
         paths = ", ".join(changed)
         raise MendableError(
-            f"these files differ from those of this version: {paths}; look at them, and replace "
-            "them with --force"
+            "these files differ from the files that this version of acsard installs: "
+            f"{paths}; look at the differences, and replace the files with --force"
         )
     return [*steps, *INSTALLED]
 
@@ -335,7 +341,7 @@ def own_places() -> list[Path]:
 
 
 def strangers(files: Iterable[File], places: Iterable[Path]) -> list[Path]:
-    """Return the paths in the directories `places` that the installation did not write."""
+    """Return the paths below the directories `places` that the installation did not write."""
     ours = {file.path for file in files}
     inside = (path for place in places if place.is_dir() for path in sorted(place.iterdir()))
     return [path for path in inside if path not in ours]
@@ -353,9 +359,10 @@ def uninstalling(
     """Return the steps that remove the service, with a reason for each file that stays.
 
     `others` are further paths in the service's directories. `stateful` are the units that have a
-    state directory. A changed file stays unless `force` or `purge` is set. Only `purge` removes a
-    changed file with `kept`, the `others`, and the state directories. To purge a state directory,
-    the steps first install its unit again if the unit is missing.
+    state directory. A changed file stays unless `force` or `purge` is set. If `File.kept` is true
+    for a changed file, only `purge` removes it. Only `purge` removes the `others` and the state
+    directories. To purge a state directory, the steps first install its unit again if the unit is
+    missing.
     """
     wanted, stateful = list(wanted), list(stateful)
     # systemd knows the real path of a state directory, but only while the unit is installed. An
@@ -369,9 +376,9 @@ def uninstalling(
         if found[file.path] == file.content or purge:
             continue
         if file.kept:
-            why[file.path] = "your configuration; --purge removes it"
+            why[file.path] = "it is your configuration; --purge removes it"
         elif not force:
-            why[file.path] = "it has been edited; --force removes it"
+            why[file.path] = "somebody has edited this file; --force removes it"
     if any(path.name == UNIT for path in why):
         # The daemon's unit stays and may start again. Then it needs `acsard-stop`, which sends
         # zeros after the daemon's end.
@@ -410,7 +417,10 @@ def source() -> Path:
         return inside
     clone = package.parent / "deploy"
     if not clone.is_dir():
-        raise MendableError(f"neither {inside} nor {clone} exists; install acsard again")
+        raise MendableError(
+            f"the installation of acsard is incomplete: neither {inside} nor {clone} exists; "
+            "install acsard again"
+        )
     return clone
 
 

@@ -1,8 +1,8 @@
-"""Writes a file or a directory atomically, and protects recordings against an overwrite.
+"""Writes a file or a directory atomically, and protects recordings from being overwritten.
 
-The target is complete or absent, because it is renamed at the end. With `force` an existing target
-is replaced, but only if it is a regular file or a ROS bag. A recording is replaced only by another
-recording that contains all of it.
+The target is complete or absent, because it gets its name by a rename at the end. With `force` an
+existing target is replaced, but only if it is a regular file or a ROS bag. A recording is replaced
+only by another recording that contains all of it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ BAG_SUFFIXES = (".mcap", ".db3")
 
 
 def never(recording: Recording) -> bool:
-    """Return False for every recording, so that `replacing` replaces none by default."""
+    """Return False for every recording, so that by default `replacing` replaces no recording."""
     return False
 
 
@@ -84,27 +84,31 @@ def _require_free(new: Path, force: bool, may_replace: Callable[[Recording], boo
     if new.is_dir():
         _require_bag(new)
     elif new.exists() and not new.is_file():
-        raise FileExistsError(EEXIST, "it is a device or a pipe, not a file; name a file")
+        raise FileExistsError(EEXIST, "this path is a device or a pipe, not a file; name a file")
     elif new.is_file() and (recording := _recording(new)) and not may_replace(recording):
-        raise FileExistsError(EEXIST, "it is a recording; name another file")
+        raise FileExistsError(EEXIST, "this file is a recording of acsard; name another file")
     if not force:
-        raise FileExistsError(EEXIST, "it exists; --force overwrites it")
+        raise FileExistsError(EEXIST, "this path exists already; --force overwrites it")
 
 
 def _require_bag(directory: Path) -> None:
     if not (directory / METADATA).is_file():
-        raise FileExistsError(EEXIST, "it is a directory, but not a ROS bag; name another path")
+        raise FileExistsError(
+            EEXIST, "this path is a directory, but not a ROS bag; name another path"
+        )
     for path in sorted(directory.iterdir()):
         of_bag = path.name == METADATA or path.suffix in BAG_SUFFIXES
         if path.is_symlink() or not path.is_file() or not of_bag:
             raise FileExistsError(
                 EEXIST,
-                f"it is a directory that contains {path.name}, which is not a part of a ROS "
-                "bag; name another directory",
+                f"this directory contains {path.name}, which is not a part of a ROS bag; name "
+                "another directory",
             )
         if path.suffix == ".mcap" and _recording(path):
             raise FileExistsError(
-                EEXIST, f"it contains a recording, {path.name}; name another directory"
+                EEXIST,
+                f"this directory contains {path.name}, which is a recording of acsard; name "
+                "another directory",
             )
 
 

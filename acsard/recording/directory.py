@@ -6,7 +6,7 @@
     000012-20261121T070027Z.kept.mcap   finished, and an incident happened in it
 
 An incident is a crash of the daemon, or one of the `INCIDENTS` in step_writer.py, such as a fault.
-The number gives the order of the files, even if the wall clock was adjusted in between.
+The number gives the order of the files, even if the wall clock was adjusted between two files.
 `retention.py` decides which files are deleted.
 """
 
@@ -44,10 +44,11 @@ from acsard.recording.retention import (
 DIRECTORY_MODE = 0o750
 
 OPEN_DIRECTORY_MODE, OPEN_MODE = 0o755, 0o644
-"""Modes of the directory and its files when the daemon records as a systemd service. Every user may
-read them, but only root can enter the parent directory. The robot's web page gets the directory as
-a read-only mount of its unit. Group permissions cannot give the page access: a dynamic group has no
-name, and systemd 257 makes the user nobody the owner of state directories."""
+"""Modes of the directory (0o755) and its files (0o644) when the daemon records as a systemd
+service. Every user may read them, but only root can enter the parent directory. The robot's web
+page gets the directory as a read-only mount of its unit. Group permissions cannot give the page
+access: a dynamic group has no name, and systemd 257 makes the user `nobody` the owner of state
+directories."""
 
 PRIVATE = Path("/var/lib/private")
 """Parent of the state directories of services with a dynamic user. Only root can enter it."""
@@ -77,7 +78,7 @@ STAMP = "%Y%m%dT%H%M%SZ"
 
 
 def listed(directory: Path) -> list[Path]:
-    """Return the recordings in a directory, oldest first."""
+    """Return the recordings in a directory, the oldest first."""
     found = [
         path
         for path in directory.iterdir()
@@ -108,8 +109,9 @@ def _stem(path: Path) -> str:
 def mark_cut(part: Path, kind: Kind, cut: Literal["late", "disk"]) -> None:
     """Create a marker file for a `.part` file whose end could not be written, or raise `OSError`.
 
-    Without the marker, the next start would treat the file as cut off by a crash. It is an empty
-    file with `kind` and `cut` in its name, because even a full disk usually accepts a new name.
+    Without the marker, the next start would treat the `.part` file as cut off by a crash. The
+    marker is an empty file with `kind` and `cut` in its name, because even a full disk usually
+    accepts a new name.
     """
     part.with_name(f".{part.name}.{kind}.{cut}{MARKER}").touch()
 
@@ -131,8 +133,8 @@ class Run(Struct):
     numbers: set[int] = field(default_factory=set)
     """The numbers in the names of the files that ended in this run of the daemon."""
     cut: dict[str, Kind] = field(default_factory=dict)
-    """Retention class of each file that a disk error cut off in this run, by the file's name. Other
-    `.part` files without a marker were cut off by a crash before this run."""
+    """Retention class of each file that a disk error cut off in this run, by the file's name. Any
+    other `.part` file without a marker was cut off by a crash before this run."""
     freed: int = 0
     """Number of bytes deleted because the disk refuses to write; 0 after a successful write."""
     clock: ClockWatch = field(default_factory=ClockWatch)
@@ -174,7 +176,8 @@ class Ring:
         except OSError as error:
             os.close(self._lock)
             raise OSError(
-                error.errno, "another daemon records there: set another record.directory"
+                error.errno,
+                "another daemon records into this directory: set record.directory to another one",
             ) from None
         try:
             for copy in self._directory.glob(f".*{PART}.new"):
@@ -229,7 +232,7 @@ class Ring:
                     self.retain(path)
 
     def _open_files(self) -> None:
-        """Let every user read the directory and its files, also those of an earlier version."""
+        """Let every user read the directory and all its files, also those of an earlier acsard."""
         for path in (self._directory, *listed(self._directory)):
             mode = OPEN_DIRECTORY_MODE if path == self._directory else OPEN_MODE
             # The file may belong to another user. Recording goes on in any case.
@@ -265,14 +268,17 @@ class Ring:
         return path
 
     def just_ended(self, now: Instant) -> Iterator[tuple[Path, Kind, int]]:
-        """Yield path, class and monotonic end, ns, of files that ended less than a minute ago."""
+        """Yield each file that ended less than a minute ago.
+
+        An item is the path, the retention class and the monotonic time of the end, ns.
+        """
         for file in self._ended():
             ago_ns = now.wall_ns - int(file.at_s * NS_PER_S)
             if 0 <= ago_ns < AROUND_NS:
                 yield self._directory / file.name, file.kind, now.mono_ns - ago_ns
 
     def retain(self, path: Path) -> None:
-        """Rename a finished plain file to `near`, because an incident happened close to it."""
+        """Give a finished file the retention class `near`, because an incident was close to it."""
         if path.name.endswith(WHOLE) and _kind(path) == "plain":
             # Another process may have removed the file.
             with suppress(FileNotFoundError):

@@ -21,17 +21,18 @@ END = "acsard end"
 """Name of the MCAP metadata record that holds the `EndRecord`."""
 
 TAIL_BYTES = 1 << 16
-"""Number of bytes at the end of a file in which the end record is searched for. It typically begins
-1960 bytes before the end of the file."""
+"""Number of bytes at the end of a file in which `read_end` searches for the end record. This record
+typically begins 1960 bytes before the end of the file."""
 
 _NAMED = struct.pack("<I", len(END)) + END.encode()
-"""The end record's name after its length. In the file, the record's head precedes these bytes."""
+"""The end record's name, preceded by the length of the name. In the file, the header of the MCAP
+record comes before these bytes."""
 
 _FOOTER = HEAD.pack(Opcode.FOOTER, 20)
-"""Head of the MCAP footer, which has 20 bytes."""
+"""Header of the MCAP footer record, whose content has 20 bytes."""
 
 _DATA_END = HEAD.pack(Opcode.DATA_END, 4)
-"""Head of the record that follows the end record."""
+"""Header of the MCAP record that follows the end record."""
 
 Ns = Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)]
 """Time in ns that fits in a signed 64-bit integer."""
@@ -41,19 +42,21 @@ CUTS = {
     "crash": "cut: the daemon or the computer ended without notice",
     "disk": "cut: the disk accepted no more data",
     "late": "cut: the daemon was asked to end, and the disk was too slow to write the last steps",
-    "open": "cut, or still being recorded, when it was recovered",
+    "open": "cut off, or still being recorded, when `acsard recording recover` read it",
 }
-"""Maps each cause that cuts off a recording to its description. For the cause `bug`, the failing
-daemon itself finishes the file. For every other cause, the file is finished later."""
+"""Maps each cause that cuts off a recording to its description. After the cause `bug`, the failing
+daemon itself still finishes the file. After any other cause, the file is finished later, when it is
+recovered."""
 
 
 class EndRecord(Struct, frozen=True):
-    """The end record of a recording. A list of recordings needs only this record of each file."""
+    """The end record of a recording. To list recordings, only this record of each is read."""
 
     wall_ns: Ns
     """Wall-clock time at which the recording began, ns since 1970."""
     last_ns: Ns
-    """Wall-clock time of the last message (for steps, of their first step), ns since 1970."""
+    """Latest wall-clock time of a message, ns since 1970. A message with several steps has the time
+    of its first step."""
     said: str
     """Summary of the events in a few words, from `timeline.summary`."""
     cut: str = ""
@@ -66,13 +69,14 @@ class EndRecord(Struct, frozen=True):
 
 
 CRASHES = frozenset({"bug", "crash"})
-"""The keys of `CUTS` for failures that left the robot without its daemon."""
+"""The keys of `CUTS` for failures after which the robot had no daemon."""
 
 
 def how_it_ends(cut: str, why: str = "") -> str:
     """Describe how a recording was cut off, from the fields of its end record.
 
-    Returns "" if the daemon ended in the ordinary way, and "cut" for a cause of a later version.
+    Returns "" if the daemon ended in the ordinary way. Returns "cut" if this version of acsard does
+    not know the cause.
     """
     if not cut:
         return ""
@@ -115,7 +119,7 @@ def end_in(data: bytes) -> EndRecord | None:
 
 
 def _last(tail: bytes) -> dict[str, str] | None:
-    """Return the metadata of the end record in `tail`, or None if the file is not finished."""
+    """Return the metadata of the end record in `tail`; None if the file is not finished."""
     footer_at = len(tail) - len(MAGIC) - 20 - HEAD.size
     if footer_at < 0 or not (tail.startswith(_FOOTER, footer_at) and tail.endswith(MAGIC)):
         return None

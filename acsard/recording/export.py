@@ -2,7 +2,7 @@
 
 In the CSV table each feedback line and each gyro sample has its own row. The columns for `acsard
 calibrate` come first. Calibration must not use the columns `odom_...` as a measured position,
-because odometry is computed from the wheels that it calibrates.
+because odometry is computed with the dimensions that calibration is to find.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def offered_qos(qos: Qos) -> str:
 
 
 def bag_metadata(file: str, topics: Sequence[BagTopic], first_ns: int, last_ns: int) -> str:
-    """Return the `metadata.yaml` that makes a ROS bag of a directory with the MCAP file `file`.
+    """Return the `metadata.yaml` that turns a directory with the MCAP file `file` into a ROS bag.
 
     Every ROS 2 release since Humble reads format version 5 with numeric QoS policies. The MCAP file
     has the same QoS text in the metadata of each channel, where `ros2 bag play FILE` reads it.
@@ -164,8 +164,8 @@ def wheel_columns(estimate: Estimate) -> str:
 def gyro_columns(sample: GyroSample, now: Instant) -> str:
     """Return the columns of `MEASURED` for a gyro sample. The wheel speeds are empty.
 
-    Without a stamp, the time is the arrival, converted to wall-clock time with the offset in
-    `now`.
+    The time is the stamp of the sample. If the sample has no stamp, it is the time of arrival,
+    converted to wall-clock time with the clocks in `now`.
     """
     arrived_ns = sample.at_ns + now.wall_ns - now.mono_ns
     at_ns = arrived_ns if sample.stamp_ns is None else sample.stamp_ns
@@ -186,7 +186,7 @@ class ExportResult(Struct, frozen=True):
     count: int
     """Number of messages, or of rows of a CSV table."""
     gaps: list[Gap]
-    """Gaps of the recording that overlap the exported time span. Their steps are missing."""
+    """Gaps of the recording that overlap the exported time span. The steps in a gap are missing."""
 
 
 class _Writer:
@@ -202,7 +202,7 @@ class _Writer:
         """Process a step that is not exported. If it is `inside` the span, export its log lines."""
 
     def end(self, ending: str = "") -> None:
-        """Write the log lines after the last step; `ending` says how a recording was cut off."""
+        """Write the log lines after the last step; `ending` says how the recording was cut off."""
 
     def finish(self) -> None:
         """Write the end of the file."""
@@ -222,7 +222,7 @@ class _MessageWriter(_Writer):
         self._topics: dict[int, tuple[str, Channel]] = {}
         self._counts: dict[int, int] = {}
         self.times: tuple[int, int] = (0, 0)
-        """Earliest and latest wall-clock time of a message, ns since 1970."""
+        """Earliest and latest wall-clock time of a written message, ns since 1970."""
 
     def step(self, step: Step, outputs: Outputs) -> None:
         self._publisher.robot = self._run.robot
@@ -347,7 +347,7 @@ def _write_steps(
     began_ns, over = recording.about.mono_ns, False
 
     def is_inside(step: Step) -> bool:
-        """Return whether a step is in the span. The first step after the span ends the output."""
+        """Return whether a step is in the time span. The first step after it ends the output."""
         nonlocal over
         seconds = (step.inputs.now.mono_ns - began_ns) / NS_PER_S
         if seconds > span.end and not over:

@@ -55,13 +55,13 @@ from acsard.recording.timeline import INCIDENTS, TimelineEntry, summary
 
 CHUNK_NS = 10 * NS_PER_S
 """Longest time that an MCAP chunk covers, ns. Longer chunks would save little space, and damage to
-a chunk would destroy more data."""
+a single chunk would destroy more data."""
 
 CHUNK_BYTES = 1 << 20
 """Uncompressed size at which a chunk ends, bytes. Ten seconds of driving take 160 000 bytes."""
 
 MODE = 0o640
-"""File mode of a recording. The group of the daemon's service may read the file."""
+"""File mode of a recording: 0o640. The group of the daemon's service may read the file."""
 
 Topic = Literal["steps", "events", "state", "unfinished"]
 
@@ -97,7 +97,7 @@ CONTENTS: dict[Topic, str] = {
 }
 """For each channel, the text in its metadata that describes its messages."""
 
-UNFINISHED = "no end: cut off, or still being recorded"
+UNFINISHED = "the file has no end: it was cut off, or is still being recorded"
 """Text that describes the ending of an unfinished file."""
 
 EVENTS_SCHEMA = 1
@@ -212,7 +212,7 @@ class Writing:
         self._index = Index()
         self._chunk: GrowingChunk | None = None
         self._chunk_at: int | None = None
-        """Offset of the chunk's head in the file; None if the head is not written yet."""
+        """Offset of the present chunk's header in the file; None if it is not written yet."""
         self._file = os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb")
         try:
             self._open(about)
@@ -274,7 +274,7 @@ class Writing:
             raise FileNotFoundError(errno.ENOENT, f"{self.path.name} has been removed")
 
     def _put(self, data: bytes) -> None:
-        """Write compressed bytes of the chunk. Write its head first if it is not written yet."""
+        """Write compressed bytes of the chunk. Write the chunk's header first if it is missing."""
         if self._chunk_at is None:
             self._chunk_at = self._file.tell()
             self._file.write(GROWING_HEAD)
@@ -369,11 +369,11 @@ class Recording:
             ) from None
         self.ended = False
         """True if the file is finished (known only after `messages` has ended). A finished file may
-        be damaged just before its end, which `damaged` counts too."""
+        be damaged just before its end. `damaged` counts this place too."""
         self.damaged = 0
-        """Number of damaged places, mostly MCAP chunks, that have readable data after them."""
+        """Number of damaged places, mostly MCAP chunks, that are followed by readable data."""
         self.cut = ""
-        """Key of `CUTS` if the daemon did not end in the ordinary way, else ""."""
+        """Cause that cut off the recording, a key of `CUTS`; "" if the daemon ended normally."""
         self.why = ""
         """For the cause `bug`, the step in which the daemon failed and the exception, else ""."""
         self.unfinished: bytes | None = None
@@ -387,20 +387,20 @@ class Recording:
 
     @property
     def ending(self) -> str:
-        """How the recording ended, or "" if normally (known only after `messages` has ended)."""
+        """How the recording ended; "" for a normal end (known only after `messages` has ended)."""
         if not self.ended:
             return UNFINISHED
         return how_it_ends(self.cut, self.why)
 
     @property
     def missing(self) -> str:
-        """Damaged places and ending in words, or "" (known only after `messages` has ended)."""
+        """Damage and abnormal ending in words, or "" (known only after `messages` has ended)."""
         places = many(self.damaged, "damaged place is", "damaged places are")
         damaged = f"{places} left out" if self.damaged else ""
         return "; ".join(filter(None, [damaged, self.ending]))
 
     def compute_end_record(self) -> EndRecord:
-        """Build an end record from all messages of the recording, with "" as its cause `cut`."""
+        """Build an end record from all messages of the recording. Its field `cut` is ""."""
         builder = EndRecordBuilder(self.about)
         for topic, wall_ns, data in self.messages():
             builder.message(topic, wall_ns, data)
@@ -456,7 +456,7 @@ class Recording:
         try:
             if config is None:
                 raise ValueError(
-                    "its beginning is missing, or another program wrote this MCAP file"
+                    "the beginning of the file is missing, or another program wrote this MCAP file"
                 )
             about = msgspec.convert({**metadata, "config": config}, About, strict=False)
         except (ValueError, msgspec.ValidationError) as error:
@@ -472,9 +472,9 @@ class Recording:
 def rewrite(recording: Recording, path: Path, cut: str = "open") -> int:
     """Write all readable messages to a new, finished file at `path`, and return their number.
 
-    If the recording has no end, the new file says that it was cut off for the cause `cut`, a key of
-    `CUTS`. Raises `OSError`, or `RecordingError` if an event cannot be decoded; then no file is
-    left at `path`.
+    If the recording is not finished, the new file says that it was cut off for the cause `cut`, a
+    key of `CUTS`. Raises `OSError`, or `RecordingError` if an event cannot be decoded; then no file
+    is left at `path`.
     """
     writing = Writing(path, recording.about)
     try:

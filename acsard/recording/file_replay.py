@@ -1,4 +1,4 @@
-"""Replays a recording file. After damage, it goes on at the next state of the robot in the file."""
+"""Replays a recording file, and resumes after a damaged place at the next recorded robot state."""
 
 from __future__ import annotations
 
@@ -46,18 +46,22 @@ INCOMPLETE_STATE_ERRORS = (
 
 
 class Gap(Struct):
-    """A part that is not replayed: from unreadable steps to the next state of the robot."""
+    """Part of a recording that is not replayed.
+
+    A gap begins with unreadable steps and ends at the next recorded state of the robot.
+    """
 
     begin_ns: int
     """Monotonic time of the last replayed step before the gap, ns."""
     end_ns: int
     """Monotonic time of the first replayed step after the gap, or of the recording's end, ns."""
     unreadable: int = 0
-    """Number of steps that cannot be read, as far as the step numbers show it."""
+    """Number of unreadable steps, computed from the numbers of the readable steps around them."""
     skipped: int = 0
-    """Number of readable steps before the next state of the robot, which are not replayed."""
+    """Number of readable steps that are not replayed, because the next recorded robot state comes
+    later."""
     lines: int = 0
-    """Number of lines to the board in the skipped steps."""
+    """Number of skipped steps in which the robot decided to send a line to the board."""
     end_lost: bool = False
     """True if the last steps of the recording cannot be read."""
 
@@ -65,16 +69,17 @@ class Gap(Struct):
 class ReplayResult(NamedTuple):
     comparison: Comparison
     gaps: list[Gap]
-    """The parts of the file that are not compared."""
+    """The parts of the recording that were not replayed, so their outputs were not compared."""
     failed_step: str = ""
-    """Sentence that says whether this version fails in the same step as the recorded daemon; "" if
-    the daemon did not fail."""
+    """Sentence that says whether the step that ended the recorded daemon also ends this version. It
+    is "" if the daemon did not fail."""
     event_copies: str = ""
-    """Sentence about the first event that differs from its copy in the channel `events`, or ""."""
+    """Sentence about the first event that differs from its copy in the channel `events`. It is ""
+    if every event equals its copy."""
 
     @property
     def same(self) -> bool:
-        """True if the replayed outputs equal the recorded ones, and all copies of events agree."""
+        """True if the replayed outputs equal the recorded ones, and every event equals its copy."""
         return self.comparison.same and not self.event_copies
 
 
@@ -84,13 +89,14 @@ def config_of(recording: Recording) -> Config:
         return parse(recording.about.config.encode())
     except ConfigError as error:
         raise RecordingError(
-            f"this version cannot use the configuration in {recording.path}: {error}; acsard "
-            f"{recording.about.version}, which recorded it, can"
+            "this version of acsard cannot use the configuration in the recording "
+            f"{recording.path}: {error}; acsard {recording.about.version}, which made the "
+            "recording, can use the configuration"
         ) from None
 
 
 def steps(recording: Recording) -> Iterator[Step]:
-    """Yield every step that can be read, in order. The numbers of the steps show the gaps."""
+    """Yield every readable step in order. A jump in `Step.number` means that steps are missing."""
     for item in _items(recording):
         if not isinstance(item, Checkpoint):
             yield from item
@@ -99,7 +105,7 @@ def steps(recording: Recording) -> Iterator[Step]:
 def _items(
     recording: Recording, copies: EventCopies | None = None
 ) -> Iterator[list[Step] | Checkpoint]:
-    """Yield the batches of steps and the states of the robot. Pass steps and events to `copies`."""
+    """Yield the readable batches of steps and the checkpoints. `copies` gets steps and events."""
     for topic, _, data in recording.messages():
         if topic == "events" and copies is not None:
             copies.copy(data)
@@ -116,20 +122,21 @@ def _items(
 
 
 MAX_STATE_BYTES = 8
-"""Total size of the states that may be decoded after gaps, in bytes per byte of the file.
+"""Number of bytes of robot states that may be decoded after gaps, for each byte of the file.
 `MAX_BYTES` are allowed in addition. A genuine file stays below this limit. Without the limit, the
 replay of a forged file of 5 kB took 4 s."""
 
 
 class _Source:
-    """A recording that is replayed, and the last robot that was decoded from it."""
+    """Base class of the replays, with the recording and the robot state last decoded from it."""
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
         self._state: State | None = None
-        """The last robot that was decoded from the file; None if the replay uses a new one."""
+        """Robot state that was last decoded from the file; None while the replay uses a new
+        robot."""
         self._left = MAX_BYTES
-        """Total size of the states that may still be decoded after gaps, bytes."""
+        """Number of bytes of robot states that may still be decoded after gaps."""
         for path in recording.paths:
             # The reader of the steps reports a missing file later.
             with suppress(OSError):
@@ -137,10 +144,11 @@ class _Source:
 
     @contextmanager
     def state_errors(self) -> Iterator[None]:
-        """Raise `RecordingError` if the block fails because the recorded state is incomplete.
+        """Raise `RecordingError` if the `with` block fails because the state is incomplete.
 
-        Wrap every use of the robot in this context, because a forged state may lack any part. If
-        the robot is not from the file, an error of the block is a defect and is raised as it is.
+        Use this context around every use of the robot, because a forged recorded state may lack any
+        part. If the robot is not from the file, an error in the block is a defect and is raised
+        unchanged.
         """
         try:
             yield
@@ -149,7 +157,10 @@ class _Source:
         except INCOMPLETE_STATE_ERRORS as error:
             if self._state is None:
                 raise
-            reason = f"this version cannot read the state at its start: {short(error)}"
+            reason = (
+                "this version of acsard cannot read the robot state at the start of the recording: "
+                f"{short(error)}"
+            )
             raise _foreign(self._recording, reason) from error
 
     def _resumed(
@@ -160,9 +171,9 @@ class _Source:
     ) -> State | None:
         """Decode the robot in `saved` if it was saved just before the step `number`.
 
-        Return None if it was not, if this version cannot read the robot, or if the states decoded
-        after gaps exceed their limit in size. `tried` takes the configuration of the decoded robot,
-        and returns the configuration that replaces it.
+        Return None if `saved` belongs to another step, if this version cannot read the robot, or if
+        the decoded states exceed `MAX_STATE_BYTES`. `tried` takes the configuration of the decoded
+        robot, and returns the configuration that replaces it.
         """
         if saved is None or saved.number != number:
             return None
@@ -180,13 +191,13 @@ class _Source:
 
 
 class RecordedRun(_Source):
-    """The steps of a recording that can be replayed, and the robot as it was before each of them.
+    """The steps of a recording that can be replayed, and the robot as it was before each step.
 
-    If steps are missing, the run goes on with the next state of the robot in the file.
+    After missing steps, the run resumes at the next robot state in the file.
     """
 
     def __init__(self, recording: Recording, other: Config | None = None) -> None:
-        """Use the configuration `other`, or the recording's own if `other` is None.
+        """Use the configuration `other`, or the recorded configuration if `other` is None.
 
         Raises `RecordingError` if this version cannot read the recorded configuration or state.
         """
@@ -197,20 +208,22 @@ class RecordedRun(_Source):
         self.gaps: list[Gap] = []
         """The gaps that were found so far."""
         self.number: int | None = None
-        """Number of the last step that `steps` yielded; None before the first."""
+        """Number of the last step that `steps()` yielded; None before the first step."""
         self.skipped: Callable[[Step], None] = lambda step: None
-        """Called with each step that can be read but not replayed."""
+        """Callback that is called with each step that can be read but not replayed."""
         self.copies = EventCopies(recording)
         self._next, self._state = _first_state(recording)
-        """Number of the step that `robot` can replay next; recorded robot, None for a new robot."""
+        """`_next` is the number of the step that `robot` can replay next. `_state` is the recorded
+        state with which `robot` was made, or None for a new robot."""
         self.robot, self.memory = self._state or (Robot(self.config), Memory())
-        """The robot with which to replay, and its guard's memory. Both are replaced after a gap."""
+        """`robot` replays the steps, and `memory` is the memory of its guard. After a gap, both
+        come from the next robot state in the file."""
         if self._state is not None:
             with self.state_errors():
                 adopt(self.robot, Robot(self._recorded), Robot(self.config))
 
     def steps(self) -> Iterator[Step]:
-        """Yield the steps that can be replayed; raise `RecordingError` if there is none."""
+        """Yield the steps that can be replayed; raise `RecordingError` if no step can be."""
         recording = self._recording
         replayed_ns = recording.about.mono_ns
         read, damaged = self._next, 0
@@ -265,7 +278,7 @@ class RecordedRun(_Source):
         return gap
 
     def _resume(self, saved: Checkpoint | None, number: int) -> bool:
-        """Continue with the robot in `saved` before the step `number`; return False if it fails."""
+        """Continue at the step `number` with the robot in `saved`. Return False if that fails."""
         other = self._other
         tried = None if other is None else partial(_with_changes, other, self._recorded)
         state = self._resumed(saved, number, tried)
@@ -277,9 +290,10 @@ class RecordedRun(_Source):
 
 
 def _with_changes(other: Config, recorded: Config, present: Config) -> Config:
-    """Return `other` with the settings that changed from `recorded` to `present`.
+    """Return `other` with the settings that the robot changed while it ran.
 
-    If `other` forbids these changes, return `other`, because its robot would have refused them.
+    These are the settings in which `present` differs from `recorded`. If their values are invalid
+    in `other`, return `other` unchanged, because its robot would have refused them.
     """
     before = dict(flat(effective(recorded)))
     changes = {k: v for k, v in flat(effective(present)) if before.get(k) != v}
@@ -292,9 +306,10 @@ def _with_changes(other: Config, recorded: Config, present: Config) -> Config:
 def replay_file(
     recording: Recording, other: Config | None = None, progress: Progress = no_progress
 ) -> ReplayResult:
-    """Replay a recording with the configuration `other`, or with its own if `other` is None.
+    """Replay a recording with the configuration `other`, or the recorded one if `other` is None.
 
-    Calls `progress` every `PROGRESS_STEPS` steps. Raises `RecordingError` if the replay fails.
+    Calls `progress` every `PROGRESS_STEPS` steps. Raises `RecordingError` if the recording cannot
+    be replayed.
     """
     run = RecordedRun(recording, other)
     with run.state_errors():
@@ -310,9 +325,10 @@ def replay_file(
 
 
 def _failed_step(recording: Recording, robot: Robot, last: int | None) -> str:
-    """Run the step in which the daemon failed; return `ReplayResult.failed_step`.
+    """Replay the step in which the daemon failed; return the text of `ReplayResult.failed_step`.
 
-    `robot` is the robot after the step with the number `last`. The failed step must be the next.
+    `robot` is the robot after the step with the number `last`. The failed step is replayed only if
+    it directly follows that step.
     """
     if recording.unfinished is None:
         return ""
@@ -320,20 +336,23 @@ def _failed_step(recording: Recording, robot: Robot, last: int | None) -> str:
         step = unfinished(recording.unfinished)
     except UnfinishedError as error:
         return str(error)
-    name = f"step {step.number}, which ended the daemon,"
+    name = f"step {step.number}, in which the recorded daemon failed,"
     if last is None or step.number != last + 1:
         return f"{name} was not replayed, because the step before it is missing"
     try:
         robot.step(step.inputs)
     except Exception as error:  # noqa: BLE001 - the failure may be any exception
-        return f"{name} ends this version too, with {type(error).__name__}: {short(error)}"
-    return f"{name} does not end this version"
+        return (
+            f"{name} also fails in this version of acsard, with {type(error).__name__}: "
+            f"{short(error)}"
+        )
+    return f"{name} does not fail in this version of acsard"
 
 
 class DisplayReplay(_Source):
-    """Replay of a recording for display.
+    """Replay of a recording for display, which replays every readable step.
 
-    After missing steps, the replayed robot may be wrong until the next state in the file.
+    After missing steps, the replayed robot may be wrong until the next robot state in the file.
     """
 
     def __init__(self, recording: Recording) -> None:
@@ -343,7 +362,7 @@ class DisplayReplay(_Source):
         """Notes for the user about how this replay may differ from the recorded drive."""
         self.config = config_of(recording)
         self._in_gap = False
-        """True from a missing step to the next state of the robot."""
+        """True from a missing step to the next robot state in the file."""
         try:
             _, self._state = _first_state(recording)
             with self.state_errors():
@@ -354,7 +373,7 @@ class DisplayReplay(_Source):
             self._state, self.replay = None, Replay(self.config)
             self.notes.append(
                 "the replay begins with a robot that has just started, which may differ from the "
-                f"recorded robot: {error}"
+                f"recorded robot, because the recorded state cannot be used: {error}"
             )
 
     def steps(self) -> Iterator[tuple[Step, Outputs, Robot]]:
@@ -370,7 +389,9 @@ class DisplayReplay(_Source):
                 continue
             for step in item:
                 if number is None and self._state is None and step.number > 0 and not self.notes:
-                    note = "its first steps are missing: the replay begins without them"
+                    note = (
+                        "the first steps of the recording are missing: the replay begins after them"
+                    )
                     self.notes.append(note)
                 if number is not None and step.number != number + 1:
                     self._in_gap = True
@@ -404,17 +425,17 @@ def _first_state(recording: Recording) -> tuple[int, State | None]:
 
 def _foreign(recording: Recording, reason: str) -> RecordingError:
     return RecordingError(
-        f"{recording.path}: {reason}; it was recorded by acsard {recording.about.version}, whose "
-        "replay can read it"
+        f"{recording.path}: {reason}; the recording was made by acsard {recording.about.version}, "
+        "whose replay can read it"
     )
 
 
 class EventCopies:
-    """Finds the first copy of an event that differs from the event of its step.
+    """Finds the first event in a recording that differs from its copy.
 
-    A file has each event twice: in its step, and as a message of the channel `events`. Call `batch`
-    for each batch of steps and `copy` for each of these messages, in the order of the file, and
-    `end` after the last message.
+    A file has each event twice: in its step, and as a message of the channel `events`. In the order
+    of the file, call `batch()` for each batch of steps, and `copy()` for each message of that
+    channel. Call `end()` after the last message.
     """
 
     def __init__(self, recording: Recording) -> None:
@@ -424,12 +445,12 @@ class EventCopies:
         self._events: list[TimelineEntry] = []
         self._copies: list[TimelineEntry] = []
         self._number: int | None = None
-        """Number of the step that follows the last batch."""
+        """Number that the first step of the next batch must have; None before the first batch."""
         self._damaged = 0
-        """Number of damaged places before the last batch."""
+        """Number of damaged places that were found up to the last batch."""
 
     def batch(self, steps: list[Step]) -> None:
-        """Compare the copies of the previous batch, and store the events of a new batch."""
+        """Compare the previous batch with its copies, and store the events of the new batch."""
         self._compare(last=False, follows=self._number in (None, steps[0].number))
         self._number, self._damaged = steps[-1].number + 1, self._recording.damaged
         self._events = [
@@ -440,14 +461,17 @@ class EventCopies:
         self._copies = []
 
     def copy(self, data: bytes) -> None:
-        """Add a message of the channel `events`, the copy of an event in the last batch."""
+        """Store a message of the channel `events`: the copy of an event in the last batch."""
         try:
             self._copies.append(event_of(self._recording, data))
         except RecordingError as error:
             self._differs(str(error))
 
     def end(self) -> None:
-        """Compare the copies of the last batch, and in a whole file the summary at its end."""
+        """Compare the events of the last batch with their copies.
+
+        In a complete file, also compare the summary in the end record with the events.
+        """
         recording = self._recording
         self._compare(last=True)
         if self.difference or not recording.whole:
@@ -455,10 +479,13 @@ class EventCopies:
         end = read_end(recording.path)
         said = recording.compute_end_record().said
         if end is not None and end.said != said:
-            self._differs(f'the end of the file says "{end.said}", and its events say "{said}"')
+            self._differs(
+                f'the summary at the end of the file is "{end.said}", but the events in the file '
+                f'give the summary "{said}"'
+            )
 
     def _compare(self, last: bool, follows: bool = True) -> None:
-        """Compare the copies with the events of their batch, unless damage may have mixed them up.
+        """Compare the events of the batch with their copies, unless damage makes this unreliable.
 
         `last` is true for the last batch, whose copies may be missing if the file was cut off.
         `follows` is true if no step is missing before the next batch.

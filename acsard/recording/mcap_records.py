@@ -1,16 +1,16 @@
 """Writes MCAP chunks second by second, and reads MCAP records of files that may be damaged.
 
-The head of an MCAP chunk holds the chunk's length and checksum. Most programs therefore write a
+The header of an MCAP chunk holds the chunk's length and checksum. Most programs therefore write a
 chunk only when it is complete, and a power cut costs the whole chunk. A recording writes its chunk
 while it grows:
 
-1. First it writes a head whose length field is larger than any file.
+1. First it writes a header whose length field is larger than any file.
 2. Once a second it appends a zstd block with the new messages.
-3. When the chunk is complete, it replaces this head by the true head.
+3. When the chunk is complete, it replaces this header by the true header.
 
-The reader does not need the head. Each zstd block holds its own length, and the sequence number of
-each message is the message's checksum. After a damaged chunk or a record whose length is wrong, the
-reader searches for the next complete chunk.
+The reader does not need the header. Each zstd block holds its own length, and the field for the
+sequence number of each message holds the message's checksum. After a damaged chunk or a record
+whose length is wrong, the reader searches for the next complete chunk.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ from mcap.records import Attachment, DataEnd, Footer, Header, McapRecord, Metada
 from zstandard import COMPRESSOBJ_FLUSH_BLOCK, ZstdCompressionParameters
 
 LEVEL = 9
-"""zstd level. Ten seconds of steps take 2 to 8 ms, and are 13 to 16 % smaller than at level 3."""
+"""Compression level of zstd. Ten seconds of steps take 2 to 8 ms to compress, and become 13 to 16 %
+smaller than at level 3."""
 
 PARAMETERS = ZstdCompressionParameters.from_level(
     LEVEL, source_size=1 << 18, write_content_size=False
@@ -41,49 +42,51 @@ LAST_BLOCK = b"\x01\0\0"
 """The empty zstd block that ends a chunk. It completes a chunk that was cut off after a block."""
 
 MAX_CHUNK_BYTES = 1 << 23
-"""Largest uncompressed chunk that is read, bytes. Recorders write up to 1 MiB and a message."""
+"""Largest uncompressed chunk that is read, bytes. Recorders write up to 1 MiB plus one message."""
 
 MAX_MESSAGE_BYTES = 1 << 22
 """Largest message that is read, bytes. One second of steps and 20 commands take 16 000 bytes."""
 
 _HEAD = struct.Struct("<BQQQQII4sQ")
-"""Head of a chunk's record: opcode, length, first and last time, size and CRC-32 of the
-uncompressed data, length of the compression's name, this name, compressed size.
-"""
+"""Header of a chunk record: opcode, length, first and last time, size and CRC-32 of the
+uncompressed data, length of the name of the compression, this name, compressed size."""
 
 _AFTER_LENGTH = _HEAD.size - 9
-"""Size of a chunk's head after its length field, bytes. The length field includes this size."""
+"""Number of bytes in a chunk's header after the length field. The value of that field includes
+these bytes."""
 
 _NAME_AT = 37
-"""Offset of `ZSTD` in the head of a chunk, bytes."""
+"""Offset of `ZSTD` from the beginning of a chunk's header, bytes."""
 
 ZSTD = struct.pack("<I4s", 4, b"zstd")
-"""Name of the compression, after the length of the name. Every chunk's head has these bytes."""
+"""Length and name of the compression. Every chunk's header contains these bytes."""
 
 _ENDLESS = (1 << 63) - 1
-"""Value of the length in the head of a chunk that is still growing. No file is that long."""
+"""Value of the length field in the header of a growing chunk. No file is that long."""
 
 _MESSAGE = struct.Struct("<BQHIQQ")
-"""Head of a message's record: opcode, length, channel, sequence number, and the time twice."""
+"""Header of a message record: opcode, length, channel, sequence number, and the time twice."""
 
 MAX_DATA_BYTES = MAX_MESSAGE_BYTES - _MESSAGE.size
 
 _CHECKED = struct.Struct("<HQ")
-"""Layout of a message's channel and time. The checksum covers these bytes, and then the data."""
+"""Layout of a message's channel and time, which the checksum covers together with the data."""
 
 _BESIDE_DATA = _MESSAGE.size - 9
-"""Size of a message's head after its length field, bytes. The length field includes this size."""
+"""Number of bytes in a message's header after the length field. The value of that field includes
+these bytes."""
 
 _LONGEST_FRAME_HEAD = 18
 
 _BLOCK_BYTES = 1 << 17
-"""Largest size of a zstd block, compressed and uncompressed."""
+"""Largest size of a zstd block, compressed or uncompressed, bytes."""
 
 _BLOCK_EFFORT = 1 << 10
-"""Fixed work per block, in unpacked bytes. An empty block takes about as long as 1 KiB of data."""
+"""Work that each block costs in addition to its unpacked bytes. Even an empty block takes about as
+long as 1 KiB of data."""
 
 _REPEATED = 1
-"""Type of a zstd block that holds one byte, which is repeated."""
+"""Type of a zstd block that holds a single byte and says how often to repeat this byte."""
 
 
 class Message(NamedTuple):
@@ -115,7 +118,7 @@ class GrowingChunk:
         """Uncompressed size of the messages so far, in bytes."""
         self._crc = self._length = 0
         self.first_ns, self._last_ns = _ENDLESS, 0
-        """Earliest and latest wall-clock time of a message, ns since 1970."""
+        """Earliest and latest wall-clock time of the messages so far, ns since 1970."""
         self._out: list[bytes] = []
 
     @property
@@ -139,7 +142,7 @@ class GrowingChunk:
         return self._taken()
 
     def end(self) -> tuple[bytes, bytes]:
-        """End the chunk. Return its last bytes, and the true head that replaces `GROWING_HEAD`."""
+        """End the chunk. Return its last bytes, and the header that must replace `GROWING_HEAD`."""
         self._out.append(self._compressor.flush())
         last = self._taken()
         return last, _head(self.first_ns, self._last_ns, self.size, self._crc, self._length)
@@ -155,19 +158,19 @@ class ReadChunk(NamedTuple):
     """The readable part of a chunk."""
 
     begin: int
-    """Offset of the chunk's head in the file."""
+    """Offset of the chunk's header in the file."""
     end: int
-    """Offset after the last block that ends with a complete message."""
+    """Offset in the file after the last block that ends with a complete message."""
     messages: list[Message]
     complete: bool
     effort: int = 0
     """Work of reading the chunk: its unpacked bytes, plus `_BLOCK_EFFORT` for each block."""
 
     def head(self, data: bytes) -> bytes:
-        """Return a head whose lengths and checksum are those of the readable part of the chunk.
+        """Return a header with the lengths and the checksum of the readable part of the chunk.
 
         `data` is the whole file. If `complete` is false, the caller must also write `LAST_BLOCK` at
-        the offset `self.end`. The length in the head includes this block.
+        the offset `self.end`. The length in the header includes this block.
         """
         times = [message.wall_ns for message in self.messages]
         blocks = _blocks(data[: self.end], self.begin + _HEAD.size)
@@ -187,7 +190,7 @@ def chunk_places(data: bytes, begin: int) -> Iterator[int]:
 
 
 def read_chunk(data: bytes, begin: int) -> ReadChunk | None:
-    """Read the chunk whose head begins at the offset `begin`. Returns None if there is none."""
+    """Read the chunk whose header begins at offset `begin`. Returns None if there is no chunk."""
     at = begin + _HEAD.size
     named = data.startswith(ZSTD, begin + _NAME_AT)
     if at > len(data) or not (named or data[begin] == Opcode.CHUNK):
@@ -222,7 +225,7 @@ def read_chunk(data: bytes, begin: int) -> ReadChunk | None:
 
 
 def _blocks(data: bytes, at: int) -> Iterator[tuple[int, bytes, bool]]:
-    """Yield the end offset and the data of each zstd block, and whether it is the last block.
+    """Yield the end offset and the data of each zstd block, and whether this block is the last one.
 
     Raises `ZstdError` for a damaged block.
     """
@@ -245,8 +248,8 @@ def _blocks(data: bytes, at: int) -> Iterator[tuple[int, bytes, bool]]:
 def _messages(data: bytearray) -> tuple[list[Message], int, int]:
     """Decode the complete messages at the beginning of the data.
 
-    Returns the messages, their size, and the size of the next message. The last number is greater
-    than `MAX_MESSAGE_BYTES` if the next message is damaged.
+    Returns the messages, their total size, and the number of bytes that the next message needs.
+    That number is greater than `MAX_MESSAGE_BYTES` if the next message is damaged.
     """
     messages: list[Message] = []
     at = 0
@@ -269,19 +272,19 @@ DAMAGE = (
     McapError, msgspec.MsgspecError, zstandard.ZstdError, struct.error,
     ValueError, OverflowError, EOFError, MemoryError,
 )  # fmt: skip
-"""Exceptions that the MCAP library raises for bytes that are not valid MCAP."""
+"""Exceptions that may occur when the bytes of a damaged file are decoded."""
 
 MAGIC = b"\x89MCAP0\r\n"
 
 MAX_EFFORT = 256
 """Limit on the work of unpacking damaged chunks, in unpacked bytes for each byte of the file.
 
-The chunks in the test recordings need 5 to 13. Damaged chunks may need more: each is read up to
-three times, and a damaged block counts as 128 KiB.
+The chunks in the test recordings unpack to 5 to 13 bytes for each byte. Damaged chunks may need
+more work, because a damaged chunk is read up to three times, and a damaged block counts as 128 KiB.
 """
 
 HEAD = struct.Struct("<BQ")
-"""Head of a record: its opcode and the number of bytes after the head."""
+"""Header of a record: its opcode, and the number of bytes that follow this header."""
 
 READ: dict[int, Callable[[ReadDataStream], McapRecord]] = {
     Opcode.ATTACHMENT: Attachment.read,
@@ -290,7 +293,8 @@ READ: dict[int, Callable[[ReadDataStream], McapRecord]] = {
     Opcode.HEADER: Header.read,
     Opcode.METADATA: Metadata.read,
 }
-"""Decoders of the records that a recording uses, besides chunks. All other records are skipped."""
+"""Maps the opcode of each kind of record in a recording, except chunks, to its decoder. The reader
+skips all other records."""
 
 OTHERS = frozenset(Opcode) - READ.keys() - {Opcode.CHUNK}
 
@@ -312,7 +316,8 @@ class Found(NamedTuple):
     end: int
     """Offset at which this item ends and the reader goes on, bytes."""
     damaged: bool = False
-    """True for a damaged place. False for the incomplete end of a file that was cut off."""
+    """True for a damaged place. If a file was cut off, its incomplete end does not count as
+    damaged."""
 
     @property
     def messages(self) -> list[Message]:
@@ -322,7 +327,8 @@ class Found(NamedTuple):
 def walk(data: bytes) -> Iterator[Found]:
     """Yield the records, chunks and damaged places of a file, up to its footer or its end.
 
-    If damaged chunks exceed `MAX_EFFORT`, the rest of the file is one damaged place.
+    If the work for damaged chunks exceeds `MAX_EFFORT`, the rest of the file counts as one damaged
+    place.
     """
     at, stream, chunks = len(MAGIC), io.BytesIO(data), _Chunks(data)
     # If the first bytes of a finished file are damaged, its last bytes still identify it.
@@ -355,7 +361,7 @@ def walk(data: bytes) -> Iterator[Found]:
 
 
 def _read(stream: io.BytesIO, at: int, opcode: int, claimed: int, size: int) -> Found | None:
-    """Decode the record that begins at the offset `at`, up to `claimed` according to its length.
+    """Decode the record at the offset `at`. Its length field says that it ends at `claimed`.
 
     Returns None if the record is not one of `READ`, is damaged or is cut off.
     """
@@ -374,7 +380,7 @@ def _read(stream: io.BytesIO, at: int, opcode: int, claimed: int, size: int) -> 
 
 
 def _is_intact(stream: io.BytesIO, at: int, end: int) -> bool:
-    """Return whether the checksum of the attachment between two offsets is correct or absent."""
+    """Return whether the attachment from `at` to `end` has a correct checksum or no checksum."""
     stream.seek(at)
     record = stream.read(end - at)
     crc = int.from_bytes(record[-4:], "little")
@@ -397,11 +403,11 @@ class _Chunks:
 
     @property
     def spent(self) -> bool:
-        """True if the work for incomplete chunks exceeds its limit, so that `later` gives up."""
+        """True if the work for incomplete chunks exceeds its limit, so that `later()` gives up."""
         return self._effort < 0
 
     def read(self, begin: int) -> ReadChunk | None:
-        """Read the chunk that begins at the offset `begin`. Returns None if there is none.
+        """Read the chunk that begins at the offset `begin`. Returns None if there is no chunk.
 
         The work for an incomplete or empty chunk counts towards the limit.
         """
@@ -413,7 +419,8 @@ class _Chunks:
     def later(self, begin: int) -> int | None:
         """Return the offset of the first complete chunk from the offset `begin` on.
 
-        Returns None if there is none within the limit of work. `begin` must never decrease.
+        Returns None if there is no complete chunk, or if the limit of work is reached. `begin` must
+        not be smaller than in the previous call.
         """
         if self._found is not None and self._found >= begin:
             return self._found

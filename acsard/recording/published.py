@@ -1,9 +1,9 @@
 """Rebuilds the messages that a robot published, while its recording is replayed.
 
-The daemon's `Report` builds them, as if a client had subscribed to every topic all the time. A
-recording does not hold the daemon's measurements of itself, so the rows of `diagnostics` with such
-measurements are omitted. The messages of `log` are the entries of `timeline.py`, which include
-entries that the robot does not publish, such as `drive` and `reason`.
+The daemon's class `Report` builds the messages, as if a client had subscribed to every topic all
+the time. A recording does not hold the daemon's measurements of itself, so the rows of
+`diagnostics` with such measurements are omitted. The messages of `log` are the entries of
+`timeline.py`, which include entries that the robot does not publish, such as `drive` and `reason`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ MEASURED = frozenset({"acsard: control loop", "acsard: certificate"})
 
 
 ROUNDED_NS = 1000
-"""Bound on the rounding error of `TimelineEntry.seconds`, ns. Steps are at least 1 us apart."""
+"""Limit of the rounding error of `TimelineEntry.seconds`, ns. Steps are at least this far apart."""
 
 
 class Published(NamedTuple):
@@ -51,7 +51,8 @@ class Publisher:
         Messages that never change have the stamp `started_ns`, the daemon's start in ns since 1970.
         """
         self.robot = robot
-        """The robot that replays the steps. After a gap it must be set to another one."""
+        """The robot that replays the steps. If the replay resumes with another robot, the caller
+        must set this attribute to it."""
         self._config = robot.config
         self._report = Report(robot.config, Instant(0, started_ns))
         self._wanted = self._wanted_keys()
@@ -86,7 +87,7 @@ class Publisher:
         yield from self.skip(step)
 
     def skip(self, step: Step) -> Iterator[Published]:
-        """Yield only the log lines of a step, which need not have been replayed."""
+        """Yield only the log lines of a step. This step need not have been replayed."""
         self._now = step.inputs.now
         yield from map(self._line, self._timeline.step(step))
 

@@ -48,13 +48,16 @@ class Taken(NamedTuple):
 
 
 class Start(NamedTuple):
-    """State of the robot before step `number`: the start of a new file, or a checkpoint in one."""
+    """State of the robot before step `number`.
+
+    A `Start` begins a new file, or becomes a checkpoint in a file.
+    """
 
     number: int
     state: bytes
     """The robot and its guard, encoded by `state.freeze`; empty for a new robot."""
     config: Config
-    """Configuration before step `number`, with the settings that have changed since the start."""
+    """Configuration before step `number`. It includes all changes since the daemon's start."""
 
 
 def runs(items: list[Taken | Start]) -> Iterator[tuple[Start | None, list[Taken]]]:
@@ -108,9 +111,11 @@ class RecordedOutputs(Struct, frozen=True):
     """One pose for each feedback line that odometry accepted."""
     events: tuple[Event, ...] = ()
     checksum: int | None = None
-    """CRC-32 of all exact poses and twists of the batch, in its last step; None in the others."""
+    """CRC-32 of all exact poses, twists and angles that the wheels rolled in the batch. Only the
+    last step of a batch has this checksum; it is None in the other steps."""
     names: int | None = None
-    """CRC-32 of the batch's `input_names` in its last step; None elsewhere and in old files."""
+    """CRC-32 of all `input_names()` of the batch; None in a file of an older version. Only the last
+    step of a batch has this checksum; it is None in the other steps."""
 
 
 class Step(Struct, frozen=True):
@@ -152,7 +157,7 @@ def unfinished(data: bytes) -> Unfinished:
 
 
 def checksum(estimates: Sequence[Estimate], before: int) -> int:
-    """Continue the CRC-32 `before` with the exact poses, twists and wheel angles of estimates.
+    """Extend the CRC-32 `before` by the exact poses, twists and angles that the wheels rolled.
 
     `before` is 0 at the beginning of a batch.
     """
@@ -164,7 +169,7 @@ def checksum(estimates: Sequence[Estimate], before: int) -> int:
 
 
 def input_names(inputs: Inputs, before: int) -> int:
-    """Continue the CRC-32 `before` with the names of sources, senders and clients in the inputs.
+    """Extend the CRC-32 `before` by the names of sources, senders and clients in the inputs.
 
     `before` is 0 at the beginning of a batch.
     """

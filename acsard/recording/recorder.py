@@ -28,22 +28,24 @@ MAX_QUEUED_STEPS = 4096
 SLOW_NS = 3 * NS_PER_S
 """Duration of a sync above which the log reports that the disk hangs, ns."""
 
-SLOW = "the disk has accepted nothing for 3 s"
+SLOW = "the disk has accepted no data for 3 s"
 
 PAUSE_NS = NS_PER_S // 4
-"""Longest time between two steps that counts as a wait for the disk, ns.
+"""Limit on the time between two steps that counts as a wait for the disk, ns.
 
-A longer interval counts only this much: the process was stopped, so the disk is not the cause.
+Only this part of a longer time counts. During the rest the process was stopped, so the disk is not
+the cause.
 """
 
 FLUSH_S = 0.98
 """Pause between two syncs, s. The pause and a sync together take about one second."""
 
 MAX_TEXT = 200
-"""Largest number of characters of an exception's text."""
+"""Number of characters to which the text of an exception is cut."""
 
 CLOSE_S, MARK_S = 0.5, 0.1
-"""Time limits of `close`, s: for the end of the file, and then for a marker if the disk is slow."""
+"""Time limits of `Recorder.close()`, s: `CLOSE_S` for the end of the file, and `MARK_S` for the
+marker that is written instead if the disk is too slow."""
 
 
 class Recorder:
@@ -54,9 +56,9 @@ class Recorder:
     ) -> None:
         """Start the thread.
 
-        Only `step` calls `report`, with the recorder's own events. `started_ns` is the wall-clock
-        time of the daemon's start, ns since 1970. An export uses it as the stamp of messages that
-        never change.
+        Only `step()` calls `report`, with events about the recorder itself. `started_ns` is the
+        wall-clock time of the daemon's start, ns since 1970. An export stamps the messages that
+        never change with this time.
         """
         self._queue: deque[Taken | Start] = deque()
         self._report = report
@@ -168,19 +170,20 @@ class Recorder:
     def status(self) -> Recording:
         trouble = self._writer.trouble or (SLOW if self._slow else "")
         if self._full:
-            trouble = "the disk is too slow"
+            trouble = "the disk is too slow, so steps of the recording are lost"
         if not self._thread.is_alive():
             trouble = (
-                "the recorder has ended because of an error of its own, which is in the log: "
-                "restart the daemon to record again"
+                "the recorder has ended because of an internal error, which is in the log: restart "
+                "the daemon to record again"
             )
         return Recording(self._writer.where, trouble, self._lost + self._writer.lost)
 
     def close(self, error: BaseException | None = None) -> None:
         """Write the last steps and the end of the file within `CLOSE_S`.
 
-        If the disk is too slow, write a marker that says so, unless the daemon failed with an
-        `Exception`. An `error` that is None or a `KeyboardInterrupt` is an ordinary end.
+        `error` is the exception that ends the daemon. An `Exception` is a failure of the daemon.
+        None, or any other exception such as `KeyboardInterrupt`, is an ordinary end. If the disk is
+        too slow after an ordinary end, write a marker that says so.
         """
         while isinstance(error, BaseExceptionGroup):
             error = error.exceptions[0]

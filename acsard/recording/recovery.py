@@ -1,7 +1,7 @@
 """Finishes a recording that was cut off: as a copy, or in place if the disk has no room for a copy.
 
 No readable data is thrown away. If this version cannot read a file, or the disk has no room even
-for the end of a file, the file is only renamed.
+for the end record of a file, the file is only renamed.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ A larger file has more than a header and one second of steps, so it is never del
 
 
 def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
-    """Make the finished file `whole` of the recording `part`, which was cut off.
+    """Make the finished file `whole` from the recording `part`, which was cut off.
 
     A file without data is deleted. A file that cannot be read is only renamed. Returns a message
     for the log, or "" if the recovery succeeded completely. Raises `OSError` if the disk refuses to
@@ -68,19 +68,22 @@ def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
             part.rename(whole)
     except RecordingError as error:
         part.rename(whole)
-        return f"a recording was cut off and cannot be finished; its file is {whole.name}: {error}"
+        return (
+            "acsard cannot finish a recording that was cut off, and only renamed its file to "
+            f"{whole.name}: {error}"
+        )
     # The file time must be the time of the recording's end, not of its recovery.
     os.utime(whole, ns=(before.st_atime_ns, before.st_mtime_ns))
     return message
 
 
 def _has_configuration(part: Path) -> bool:
-    """Return whether the file has a configuration, without which `Recording` refuses it."""
+    """Return whether the file has a configuration. `Recording` refuses a file without one."""
     return any(isinstance(place.record, Attachment) for place in walk(part.read_bytes()))
 
 
 def _has_chunks(part: Path) -> bool:
-    """Return whether the file has the head of a chunk, even if the chunk is unreadable."""
+    """Return whether the file has the header of a chunk, even if the chunk is unreadable."""
     return any(True for _ in chunk_places(part.read_bytes(), 0))
 
 
@@ -102,9 +105,9 @@ def _copy(recording: Recording, part: Path, whole: Path, cut: str) -> bool:
 def _finish_in_place(recording: Recording, part: Path, cut: str) -> bool:
     """Write the end of the file after its last readable second, over the incomplete data there.
 
-    Also write the true heads of chunks that still have a `GROWING_HEAD`. Returns False if the disk
-    has no room; the file is then unchanged. No recorded second is removed to gain room, because
-    some disks do not give the room back.
+    Also replace each `GROWING_HEAD` by the true header of its chunk. Returns False if the disk has
+    no room; the file is then unchanged. No recorded second is removed to gain room, because on some
+    disks this does not gain any room.
     """
     builder = EndRecordBuilder(recording.about)
     for topic, wall_ns, data in recording.messages():
@@ -133,9 +136,10 @@ def _finish_in_place(recording: Recording, part: Path, cut: str) -> bool:
 
 
 def _writes(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], int]:
-    """Return the writes (offset and bytes) that finish the file `before`, and its new size.
+    """Return the writes (offset and bytes) that finish a file, and its size after these writes.
 
-    The end of the file comes first, because the disk may have no room for it.
+    `before` is the content of the file. The end of the file is the first write, because the disk
+    may have no room for it.
     """
     heads: list[tuple[int, bytes]] = []
     chunk, index = None, Index()
@@ -166,7 +170,7 @@ def _writes(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], in
 
 
 def _put(stream: FileIO, at: int, data: bytes) -> None:
-    """Write `data` at the offset `at` and sync it. After an `OSError` a part may be written."""
+    """Write `data` at the offset `at` and sync it. If this fails, a part may be written."""
     stream.seek(at)
     while data:
         data = data[stream.write(data) :]
@@ -176,8 +180,8 @@ def _put(stream: FileIO, at: int, data: bytes) -> None:
 def _end(last: EndRecord, index: Index, at: int) -> bytes:
     """Return the end of an MCAP file, to be written at the offset `at`.
 
-    The summary section omits the copy of the schema and the channels, because the disk may be
-    nearly full. It has the statistics, because some readers treat a file without them as empty.
+    The summary section does not repeat the schema and the channels, because the disk may be nearly
+    full. It has the statistics, because some readers treat a file without statistics as empty.
     """
     record = Metadata(END, as_metadata(last))
     data = encoded(record)

@@ -68,11 +68,11 @@ class Difference(Struct, frozen=True):
     recorded: RecordedOutputs
     replayed: RecordedOutputs
     trip: str
-    """Why the guard replaced the replayed line; "" if it did not."""
+    """Why the guard replaced the replayed line; "" if the guard did not replace it."""
 
 
 class Comparison(Struct):
-    """Counts of all and of equal outputs in the replay so far, and the first differences."""
+    """Result of a replay so far: the numbers of compared and of equal outputs, and differences."""
 
     steps: int = 0
     lines: int = 0
@@ -85,7 +85,8 @@ class Comparison(Struct):
     links_same: int = 0
     sources_same: int = 0
     events: int = 0
-    """Number of compared events: for each step, the larger of the recorded and replayed numbers."""
+    """Number of compared events. Each step adds its number of recorded or of replayed events,
+    whichever is larger."""
     events_same: int = 0
     exact: bool = True
     """True if every checksum so far matches, so that all poses are equal to the last bit."""
@@ -97,13 +98,13 @@ class Comparison(Struct):
     apart: float = 0.0
     """Largest distance between the recorded and the replayed pose, m."""
     fastest: tuple[int, int] = (0, 0)
-    """Highest wheel speed in any line, recorded and replayed, in hundredths of rad/s."""
+    """Highest wheel speed in the recorded lines, and in the replayed lines, hundredths of rad/s."""
     end: tuple[Micropose, Micropose] | None = None
     """The last recorded pose, and the replayed pose at the same step; None before any pose."""
 
     @property
     def same(self) -> bool:
-        """True if every line, pose, mode, reason, link, source and event is equal."""
+        """True if every compared output is equal. Poses are compared to the um."""
         return self.first is None
 
     @property
@@ -134,7 +135,10 @@ class Replay:
     def __init__(
         self, config: Config, robot: Robot | None = None, memory: Memory | None = None
     ) -> None:
-        """Start with `robot` and its guard's `memory`. None means a new robot of `config`."""
+        """Start with `robot` and the `memory` of its guard.
+
+        If `robot` is None, start with a new robot that has the configuration `config`.
+        """
         self.outputs: Outputs | None = None
         """Outputs of the last replayed step; None before the first step."""
         self.comparison = Comparison()
@@ -149,7 +153,7 @@ class Replay:
         self._guard = Guard(robot.session.codec.stop, robot.config, memory)
 
     def step(self, step: Step) -> Difference | None:
-        """Replay a step. Return how the outputs differ from the recorded ones, or None."""
+        """Replay a step. Return how its outputs differ from the recorded ones, or None if equal."""
         if step.begins:
             self._checksum = self._names = 0
         outputs = self.outputs = replay_step(self.robot, step)

@@ -1,4 +1,4 @@
-"""Describes the result of a replay in lines for the command line."""
+"""Describes the result of a replay in lines of text, for `acsard recording`."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from acsard.recording.recorded_steps import MICRO, RecordedOutputs
 from acsard.recording.replay import Comparison, Difference, fastest
 
 HUNDREDTHS = 100.0
-"""Divisor of the wheel speeds of a line, which are in hundredths of rad/s."""
+"""Divisor that converts the wheel speeds in a line to rad/s."""
 
 LINE_SETTINGS = ("limits.", "drive.", "mcu.wheels.")
-"""Prefixes of the settings that change which line a command produces."""
+"""Prefixes of the settings that affect the line to the board for a given command."""
 
 MAX_KEYS = 8
 """Largest number of changed settings that a line of text names."""
@@ -46,19 +46,22 @@ def _share(same: int, total: int) -> str:
 
 
 def explain_verdict(other: bool) -> str:
-    """Explain the figures of `verdict`. `other`: the configuration is not the recorded one."""
-    computed = "with that configuration" if other else "by this version"
+    """Explain the figures of `verdict()`.
+
+    `other` is true if the replay used another configuration than the recorded one.
+    """
+    computed = "with the other configuration" if other else "with this version of acsard"
     return (
-        "(The replay computes its outputs "
+        "(The replay computes new outputs "
         f"{computed} from the recorded inputs, and compares them with the recorded outputs: each "
-        "line to the board; each pose by odometry, to the um; the mode, reason, link and source of "
-        "each step; and each event with its text and its client. A checksum verifies the names in "
-        "the inputs.)"
+        "line to the board; each odometry pose, rounded to 1 um; the mode, reason, link and source "
+        "of each step; and each event with its text and its client. A checksum verifies the names "
+        "in the inputs.)"
     )
 
 
 def describe_gaps(gaps: Sequence[Gap], how: str) -> str:
-    """Describe how much the gaps leave out, or return "" if there is no gap.
+    """Describe how many seconds and steps are in the gaps, or return "" if there is no gap.
 
     The sentence begins with `how`, for example "not compared".
     """
@@ -76,13 +79,13 @@ def describe_gaps(gaps: Sequence[Gap], how: str) -> str:
             "because the replay resumes only at the robot's next recorded state, which comes later"
         )
     if any(gap.end_lost for gap in gaps):
-        parts.append("the end of the recording cannot be read; more steps may be in it")
+        parts.append("the end of the recording, which may contain more steps, cannot be read")
     because = f" ({'; '.join(parts)})" if parts else ""
     return f"{how}: {seconds:.1f} s in {many(len(gaps), 'damaged place')}{because}"
 
 
 def describe_difference(difference: Difference, began_ns: int) -> list[str]:
-    """Return lines with the recorded and the replayed outputs of the first step that differs.
+    """Return lines of text with the recorded and the replayed outputs of the first different step.
 
     `began_ns` is the monotonic time at which the recording began, ns.
     """
@@ -90,7 +93,7 @@ def describe_difference(difference: Difference, began_ns: int) -> list[str]:
     what = ", ".join(difference.what)
     return [
         f"the first difference is in step {difference.number}, {seconds:.3f} s after the "
-        f"beginning: {what}",
+        f"beginning of the recording: {what}",
         *_side("recorded", difference.recorded),
         *_side("replayed", difference.replayed),
         *([f"            the guard: {difference.trip}"] if difference.trip else []),
@@ -130,24 +133,24 @@ def explain_settings(
         if first is not comparison.first:
             seconds = (first.at.mono_ns - began_ns) / 1e9
             rows.append(
-                f"the first line that differs is in step {first.number}, {seconds:.3f} s after the "
-                "beginning"
+                f"the first line to the board that differs is in step {first.number}, "
+                f"{seconds:.3f} s after the beginning of the recording"
             )
         speeds = _speeds(fastest(first.recorded.line), fastest(first.replayed.line))
         shaping = [key for key in keys if key.startswith(LINE_SETTINGS)]
         because = f", because of {', '.join(shaping[:MAX_KEYS])}" if shaping else ""
-        rows.append(f"the highest wheel speed in that line: {speeds}{because}")
+        rows.append(f"the highest wheel speed in the first line that differs: {speeds}{because}")
     if fault is not None:
         seconds = (fault.at.mono_ns - began_ns) / 1e9
         rows.append(
-            f"the replayed robot is in fault from {seconds:.3f} s on: "
+            f"the replayed robot is in the mode fault from {seconds:.3f} s after the beginning on: "
             f"{printable(fault.replayed.status[1])}"
         )
         if first is not None and first.number < fault.number:
             rows.append(
-                "  the recorded wheels obeyed the recorded commands, not those of this replay, so "
-                "a robot with this configuration might not have had that fault. Only the part "
-                "before the fault is reliable"
+                "  the recorded wheels obeyed the recorded commands, not the commands of this "
+                "replay, so a robot with this configuration might not have had that fault. Only "
+                "the part of the replay before the fault is reliable"
             )
     return rows
 
@@ -166,13 +169,14 @@ def describe_outcome(comparison: Comparison) -> list[str]:
         f"{comparison.lines - comparison.lines_same} of {comparison.lines} lines to the board "
         f"differ from the recorded ones, and {comparison.steps - comparison.modes_same} of "
         f"{comparison.steps} steps have a different mode",
-        f"the highest wheel speed in any line: {_speeds(*comparison.fastest)}",
+        f"the highest wheel speed in any line to the board: {_speeds(*comparison.fastest)}",
     ]
     if comparison.end is not None:
         (x, y, _), (new_x, new_y, _) = comparison.end
         rows.append(
-            f"the last pose by odometry: x {x / MICRO:.3f} y {y / MICRO:.3f} recorded, "
+            f"the last odometry pose: x {x / MICRO:.3f} y {y / MICRO:.3f} recorded, "
             f"x {new_x / MICRO:.3f} y {new_y / MICRO:.3f} replayed; "
-            f"at most {comparison.apart:.3f} m apart"
+            "the recorded and the replayed path are at most "
+            f"{comparison.apart:.3f} m apart"
         )
     return rows

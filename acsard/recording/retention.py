@@ -18,7 +18,8 @@ from acsard.core.values import NS_PER_S, Instant
 File = TypeVar("File")
 
 Kind = Literal["plain", "near", "kept"]
-"""Whether an incident is in the recording (`kept`), within a minute of it (`near`), or neither."""
+"""Retention class of a recording: an incident happened in it (`kept`), within a minute of it
+(`near`), or neither (`plain`)."""
 
 AROUND_NS = 60 * NS_PER_S
 """Time before and after an incident within which recordings are retained, ns."""
@@ -27,22 +28,25 @@ KEPT_FILES = 50
 """Largest number of `kept` recordings that are protected."""
 
 FILES = 100
-"""A file may have 1/`FILES` of the total size, so 50 protected files take about half of it."""
+"""Divisor of the limit of the total size. The quotient is the limit of one file, so that 50
+protected files take about half of the total size."""
 
 LEAST_BYTES = 100_000
 """Size up to which a recording file may grow even if the disk is nearly full, bytes."""
 
 SPARE = 0.05
-"""Fraction of the disk that is left to other programs, but at most `SPARE_BYTES`."""
+"""Fraction of the disk's size that the recordings leave to other programs. The reserve is at most
+`SPARE_BYTES`."""
 
 SPARE_BYTES = 1_000_000_000
-"""Largest number of bytes that is left to other programs."""
+"""Largest reserve for other programs, bytes. Only a disk of less than 20 GB has a smaller one."""
 
 NEEDED = 0.2
 """If less than this fraction of `Disk.spare` is free, protected recordings are deleted too."""
 
 JUMP_NS = 60 * NS_PER_S
-"""Change of the wall clock against the monotonic clock above which it counts as a jump, ns."""
+"""Limit between a small correction and a jump of the wall clock, ns. It applies to the change of
+the offset from the monotonic clock between two calls of `ClockWatch.jump_ns()`."""
 
 STEADY_NS = 600 * NS_PER_S
 """Time without a jump after which the wall clock is trusted for the age of a recording, ns."""
@@ -73,7 +77,7 @@ class Ended(NamedTuple):
     at_s: float
     """Wall-clock time at which the recording ended, s since 1970."""
     this_run: bool = False
-    """True if it ended in this run of the daemon. Such a recording never counts as too old."""
+    """True if the recording ended in this run of the daemon. Then it never counts as too old."""
 
 
 class Bounds(NamedTuple):
@@ -82,7 +86,8 @@ class Bounds(NamedTuple):
     size: int
     """Largest total size in bytes."""
     oldest_s: float
-    """Recordings that ended earlier are too old, s since 1970; -inf if the clock is not trusted."""
+    """Recordings that ended before this time are too old, s since 1970. It is -inf if the wall
+    clock is not trusted."""
 
 
 def share(bound: int, own: int, disk: Disk) -> int:
@@ -98,13 +103,13 @@ def to_delete(
 ) -> set[str]:
     """Return the names of the recordings to delete, so that one more file fits.
 
-    `ended` is in the order of its numbers. `freed` is None if the disk accepts data. Otherwise the
-    disk refuses to write, although it may report free space, and `freed` is the number of bytes
-    that were already deleted in vain:
+    `ended` must be sorted by `Ended.number`. `freed` is None if the disk accepts data. Otherwise
+    the disk refuses to write, although it may report free space. `freed` is then the number of
+    bytes that were already deleted without success:
 
     - 0: delete at least one recording, even a protected one.
     - less than `LEAST_BYTES`: delete one more recording, but not a protected one.
-    - more: delete nothing for this reason.
+    - at least `LEAST_BYTES`: the refusal is not a reason to delete a recording.
     """
     protected = _protected(ended)
     plain = [file for file in ended if file.name not in protected]
@@ -128,7 +133,10 @@ def to_delete(
 
 
 def _protected(ended: Sequence[Ended]) -> set[str]:
-    """Return the names of the newest `kept` recordings and of the `near` recordings around them."""
+    """Return the names of the protected recordings.
+
+    These are the `KEPT_FILES` newest `kept` recordings, and the `near` recordings around them.
+    """
     kept = {file.name for file in [file for file in ended if file.kind == "kept"][-KEPT_FILES:]}
     return {
         file.name
@@ -156,7 +164,8 @@ class ClockWatch(Struct):
     """Detects jumps of the wall clock. The clock is trusted `STEADY_NS` after the last jump."""
 
     _since_ns: int | None = None
-    """Monotonic time of the last jump or of the first call of `jump_ns`, ns; None before it."""
+    """Monotonic time of the last jump, or of the first call of `jump_ns()` if there was no jump,
+    ns. None before the first call."""
     _ahead_ns: int = 0
     """Offset of the wall clock from the monotonic clock at the last call of `jump_ns`, ns."""
 
@@ -213,5 +222,5 @@ class IncidentWindow(Generic[File]):
             self.earlier_happened(ended_ns)
 
     def earlier_happened(self, at_ns: int) -> None:
-        """Register an incident or crash of the previous run."""
+        """Register the time of an incident or a crash in the previous run of the daemon."""
         self._happened_ns = max(self._happened_ns, at_ns)

@@ -1,8 +1,8 @@
 """Encodes steps as rows, in batches of about one second, and decodes them.
 
-A row is one step. Its times and poses are differences from earlier ones. Similar steps therefore
-give equal bytes, which compress well. Each batch can be decoded alone. A file may come from a
-stranger, so `decode` refuses a batch with values that no daemon records.
+A row is one step. Its times and poses are stored as differences from earlier times and poses.
+Similar steps therefore give equal bytes, which compress well. Each batch can be decoded alone. A
+file may come from a stranger, so `decode` refuses a batch with values that no daemon records.
 
 If you change one of these structs, change `FORMAT` as well.
 """
@@ -47,13 +47,14 @@ MAX_ROWS = 4096
 """Largest number of rows in a batch. The recorder's queue never holds more steps."""
 
 MAX_TIME_NS = 1 << 61
-"""Bound on the age of a serial read and on a lateness, ns: 73 years.
+"""Limit on the age of a serial read and on `Rare.late_ns`, ns: 73 years.
 
 A monotonic time may be up to twice as large.
 """
 
 MAX_OFFSET_NS = 1 << 62
-"""Bound on the offset of the wall clock from the monotonic clock, ns. Clocks reach it in 2116.
+"""Limit on the offset of the wall clock from the monotonic clock, ns. Clocks reach this limit in
+the year 2116.
 
 The offset plus a monotonic time fits in 64 bits.
 """
@@ -105,7 +106,7 @@ class Row(Struct, frozen=True, array_like=True):
     shutting_down: bool
     superseded: bool
     now: int
-    """Time since the last earlier row with a `tick`, or since `Batch.mono_ns`."""
+    """Time since the last earlier row with a `tick`; without such a row, since `Batch.mono_ns`."""
     offset: int
     """Offset of the wall clock from the monotonic clock, minus `Batch.offset_ns`."""
     reads: tuple[Read, ...]
@@ -113,7 +114,8 @@ class Row(Struct, frozen=True, array_like=True):
     sent: bytes | bool
     """True if `line` was sent, False if no line was sent, or the bytes that were sent instead."""
     poses: tuple[Micropose, ...]
-    """Poses in um and urad, each minus the previous pose of the batch. The first is unchanged."""
+    """Poses in um and urad. Each is stored minus the previous pose of the batch, and the first pose
+    of the batch is stored as it is."""
     rare: Rare | None
 
 
@@ -130,7 +132,7 @@ class Batch(Struct, frozen=True, array_like=True):
     """Common divisor of all times, ns. It is at least 1000 if the clocks count in us."""
     rows: Annotated[tuple[Row, ...], Meta(min_length=1, max_length=MAX_ROWS)]
     checksum: int
-    """CRC-32 of all estimates (pose, twist and wheel angles) of the batch."""
+    """CRC-32 of all estimates (pose, twist and angles that the wheels rolled) of the batch."""
     names: int | None = None
     """CRC-32 of all `input_names` of the batch; None if an older version recorded it."""
 
@@ -251,7 +253,7 @@ def _steps(batch: Batch) -> Iterator[Step]:
         trouble = trouble if rare.trouble is None else rare.trouble
         status = rare.status or status
         if opened is None or trouble is None or status is None:
-            raise ValueError("its first step has no `opened`, `trouble` or `status`")
+            raise ValueError("the first step of the batch has no `opened`, `trouble` or `status`")
         now = _instant(batch, tick_ns + row.now * batch.unit, row.offset)
         received = []
         for read in row.reads:
@@ -304,7 +306,7 @@ def _sent(row: Row) -> bytes | None:
 
 
 def _instant(batch: Batch, mono_ns: int, offset: int) -> Instant:
-    """Return the instant at `mono_ns`. Raises `ValueError` if one of its times is out of range."""
+    """Return the instant at `mono_ns`. Raises `ValueError` if a time is out of range."""
     ahead_ns = batch.offset_ns + offset * batch.unit
     if abs(mono_ns) >= 2 * MAX_TIME_NS or abs(ahead_ns) >= MAX_OFFSET_NS:
         raise ValueError("a time is out of range")

@@ -33,17 +33,18 @@ GAP_S = 2.0
 
 
 class Series(Recording):
-    """Several files of one run of the daemon, read as one. No step is missing between them."""
+    """Several files of one run of the daemon, read as one. No step is missing between the files."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
-        """Read the first file; `messages` reads all. Raises the same errors as `Recording`."""
+        """Read the first file; `messages()` reads all files. Raises the errors of `Recording`."""
         super().__init__(_present(paths[0]))
         self.paths = list(paths)
 
     def messages(self) -> Iterator[tuple[Topic, int, bytes]]:
         """Yield the topic, wall-clock time (ns since 1970) and bytes of each message of all files.
 
-        `damaged` counts all files. `ended`, `cut`, `why` and `unfinished` describe the last file.
+        `damaged` counts the damaged places of all files. `ended`, `cut`, `why` and `unfinished`
+        describe the last file.
         """
         self.damaged, self.ended, self.cut, self.why = 0, False, "", ""
         self.unfinished = None
@@ -59,24 +60,27 @@ class Series(Recording):
 
 
 class Found(NamedTuple):
-    """A recording with steps in the range of time, and the part of it that lies in the range."""
+    """A recording with steps in the searched range of time, and its `part` in that range."""
 
     recording: Recording
     part: Span
 
 
 class Search(Struct):
-    """The recordings that have steps in a range of time, and the gaps between them."""
+    """The recordings that have steps in a range of time, and the times without a recording."""
 
     found: list[Found] = field(default_factory=list)
     unreadable: list[str] = field(default_factory=list)
     """A sentence for each file that cannot be read."""
     gaps: list[tuple[float, float]] = field(default_factory=list)
-    """Beginning and end of each time in the range without a recording, s since 1970."""
+    """Beginning and end of each gap (a part of the range without a recording), s since 1970."""
 
 
 class NothingRecordedError(AcsardError):
-    """No file has a step in the range of time. The text names the nearest recordings."""
+    """No file has a step in the searched range of time.
+
+    The message names the nearest recordings.
+    """
 
 
 class _Piece(NamedTuple):
@@ -90,8 +94,8 @@ class _Piece(NamedTuple):
 def search(files: Sequence[Path], first: float, last: float) -> Search:
     """Find the recordings that have steps between the times `first` and `last`, s since 1970.
 
-    `files` are sorted, oldest first. If a drive was under way at the beginning of a found file, the
-    files with its earlier part are read too. Raises `NothingRecordedError` if nothing is found.
+    `files` are sorted, oldest first. If a found file begins during a drive, the files with the
+    earlier part of this drive are read too. Raises `NothingRecordedError` if no recording is found.
     """
     result, pieces = Search(), list[_Piece]()
     chosen: dict[int, Contents] = {}
@@ -135,7 +139,7 @@ def _gaps(pieces: Sequence[_Piece], first: float, last: float) -> list[tuple[flo
 
 
 def _groups(files: Sequence[Path], chosen: dict[int, Contents]) -> list[list[int]]:
-    """Return the indices of the chosen files and their `_earlier` files, grouped into series."""
+    """Return the indices of the chosen and the `_earlier()` files, grouped into series."""
     groups: list[list[int]] = []
     for number, contents in sorted(chosen.items()):
         if groups and number - 1 in chosen and _continues(chosen[number - 1], contents):
@@ -146,7 +150,7 @@ def _groups(files: Sequence[Path], chosen: dict[int, Contents]) -> list[list[int
 
 
 def _earlier(files: Sequence[Path], number: int, contents: Contents) -> list[int]:
-    """Return the indices of earlier files with the drive that is under way as this file begins."""
+    """Return the indices of the earlier files of the drive during which file `number` begins."""
     found: list[int] = []
     while number > 0 and contents.first.recorded.status[0] == "driving":
         number -= 1
@@ -184,12 +188,12 @@ def _present(path: Path) -> Path:
 
 
 def _nearest(pieces: Sequence[_Piece], first: float, last: float) -> str:
-    """Return a sentence with the nearest recordings, which says that nothing was recorded."""
+    """Return a sentence that says that nothing was recorded and names the nearest recordings."""
     before = max([p for p in pieces if p.end < first], key=lambda p: p.end, default=None)
     after = min([p for p in pieces if p.begin > last], key=lambda p: p.begin, default=None)
     text = f"nothing was recorded {in_words(first, last)}"
-    ends = f"the last recording before it is {_described(before)}" if before else ""
-    begins = f"the first one after it is {_described(after)}" if after else ""
+    ends = f"the last recording before that time is {_described(before)}" if before else ""
+    begins = f"the first recording after that time is {_described(after)}" if after else ""
     return "; ".join(filter(None, [text, ends, begins]))
 
 
@@ -198,7 +202,7 @@ def _described(piece: _Piece) -> str:
 
 
 def in_words(first: float, last: float) -> str:
-    """Describe the range of time from `first` to `last`, s since 1970. Both may be infinite."""
+    """Describe the range of time from `first` to `last`, s since 1970. Each may be infinite."""
     parts = [
         f"{word} {clock(at, day=True)}"
         for word, at in (("from", first), ("to", last))

@@ -1,7 +1,7 @@
 """Encodes a `Robot` between two steps, decodes it, and applies another configuration to it.
 
-A file that begins during a drive begins with an encoded robot. In every file further ones follow
-about every 20 s, so that a replay can go on after a damaged place.
+Each file after the first one of a run of the daemon begins with an encoded robot. In every file,
+further encoded robots follow about every 20 s, so that a replay can go on after a damaged place.
 
 `freeze` uses pickle, which takes a fraction of a millisecond. `thaw` uses `unpickling.py` instead,
 because a forged file could run code through pickle.
@@ -30,24 +30,25 @@ PART_MODULES = (
     "acsard.core.values", "acsard.core.robot", "acsard.core.guard", "acsard.core.config.settings",
     "acsard.core.motion.", "acsard.core.link.",
 )  # fmt: skip
-"""Modules and packages (with a final dot) of robot parts. The constructors have no side effects."""
+"""Modules, and packages (names that end with a dot), whose classes may be parts of a robot. The
+constructors of these classes have no side effects."""
 
 OTHER_PARTS: dict[tuple[str, str], type] = {
     ("collections", "Counter"): Counter,
     ("collections", "deque"): deque,
 }
-"""Classes of other modules that a robot contains."""
+"""Maps (module, name) to each class of another module that may be a part of a robot."""
 
 PROTOCOL = 5
 """Version of the pickle format that `unpickling.py` reads."""
 
 MAX_TEXT = 200
-"""Largest number of characters of an error's text."""
+"""Number of characters to which the text of an error is cut."""
 
 TABLE = copyreg.dispatch_table | {
     Mode: lambda mode: (Mode, (mode.value,)),
 }
-"""How pickle encodes a mode: as a call of `Mode` with its value.
+"""Dispatch table with which pickle encodes a mode as a call of `Mode` with the mode's value.
 
 Python 3.11 before 3.11.4, as in Debian 12, would encode a call of `getattr`, which `unpickling.py`
 refuses.
@@ -59,7 +60,7 @@ class StateError(AcsardError):
 
 
 class State(NamedTuple):
-    """A robot and the memory of its guard, which determine how it reacts to the next inputs."""
+    """A robot and the memory of its guard. With the inputs they determine all further outputs."""
 
     robot: Robot
     memory: Memory
@@ -89,7 +90,8 @@ def checkpoint(data: bytes) -> Checkpoint:
         return _checkpoint.decode(data)
     except msgspec.MsgspecError as error:
         raise StateError(
-            f"this version cannot read the state at its start: {short(error)}"
+            "this version of acsard cannot read the robot state at the start of the recording: "
+            f"{short(error)}"
         ) from None
 
 
@@ -107,12 +109,15 @@ def thaw(data: bytes) -> State:
     try:
         made = unpickle(data, part_class)
     except ValueError as error:
-        text = f"this version cannot read the state at its start: {short(error)}"
+        text = (
+            "this version of acsard cannot read the robot state at the start of the recording: "
+            f"{short(error)}"
+        )
         raise StateError(text) from None
     match made:
         case (Robot() as robot, Memory() as memory):
             return State(robot, memory)
-    raise StateError("the state at its start is not valid")
+    raise StateError("the robot state at the start of the recording is not valid")
 
 
 def short(error: Exception) -> str:
@@ -143,8 +148,9 @@ PLAIN = (bool, int, float, str, bytes, type(None))
 def adopt(robot: Robot, begun: Robot, other: Robot) -> None:
     """Apply another configuration to the recorded robot `robot`, in place.
 
-    The three robots are compared attribute by attribute. An attribute of `robot` that equals that
-    of `begun` gets the value of `other`. An attribute that the drive has changed keeps its value.
+    The three robots are compared attribute by attribute. An attribute of `robot` that equals the
+    attribute of `begun` gets the value from `other`. An attribute that the recorded run has changed
+    keeps its value.
 
     Args:
         robot: the recorded robot.
@@ -155,11 +161,12 @@ def adopt(robot: Robot, begun: Robot, other: Robot) -> None:
 
 
 class _Walk:
-    """Walks through the objects of the three robots together, and visits each object once."""
+    """Walks through the objects of the three robots of `adopt()`, and visits each object once."""
 
     def __init__(self) -> None:
         self._visited: dict[int, Any] = {}
-        """Maps `id` to each visited object, and keeps it alive so that its `id` stays unique."""
+        """Maps the `id()` of each visited object to this object, which stays alive so that its
+        `id()` stays unique."""
 
     def into(self, now: Any, begun: Any, other: Any) -> None:
         """Merge the attributes of the object `now` of the recorded robot in place."""

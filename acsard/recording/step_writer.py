@@ -30,16 +30,18 @@ from acsard.recording.state import Checkpoint
 from acsard.recording.timeline import entry_of
 
 RETRY_ROUNDS = 5
-"""Number of calls of `write`, about one each second, for which the writer pauses after an error."""
+"""Number of calls of `StepWriter.write()` for which the writer pauses after an error of the disk.
+There is about one call each second."""
 
 BATCH = 256
-"""Largest number of steps in one message. A second has fewer, unless many commands arrive."""
+"""Largest number of steps in one message. A second has fewer steps, unless many commands arrive."""
 
 CHECKPOINT_NS = 18 * NS_PER_S + NS_PER_S // 2
-"""Time from a checkpoint, the robot's state in a file, to the request for the next one, ns.
+"""Time from one checkpoint (the robot's state in a file) to the request for the next one, ns.
 
 After damage to a chunk, a replay lacks at most 20 s. A checkpoint takes 0.6 ms of the control
-loop's step, after the loop has written its line. It has 6 kB at rest and 13 kB while driving.
+loop's step, after the loop has written its line. A checkpoint has 6 kB at rest and 13 kB while the
+robot drives.
 """
 
 MAX_FILE_NS = 3600 * NS_PER_S
@@ -91,7 +93,8 @@ class StepWriter:
         self._lost_before = 0
         """Value of `lost` before the present trouble began."""
         self._safe_ns: int | None = None
-        """Monotonic time of the last step that a sync has brought to the disk, ns, or None."""
+        """Monotonic time of the last step that a sync has brought to the disk, ns; None before a
+        sync."""
         self._config, self._report, self._request_state = config, report, request_state
         self._ring: Ring | None = None
         self._writing: Writing | None = None
@@ -142,7 +145,7 @@ class StepWriter:
             self._request_state()
 
     def mark_cut(self, cut: Literal["late", "disk"]) -> None:
-        """Mark the unfinished file with the cause `cut`, so that it does not count as a crash.
+        """Mark the unfinished file with the cause `cut`, so that its end does not count as a crash.
 
         Another thread may call this method while `write` waits for the disk.
         """
@@ -274,9 +277,13 @@ class StepWriter:
             else:
                 at_most = ""
             # The disk also refused the event with the reason, so repeat the reason here.
-            since = f" again; {missing} missing{at_most} ({self.trouble})" if self.trouble else ""
+            since = (
+                f" again; {missing} missing{at_most} (the error was: {self.trouble})"
+                if self.trouble
+                else ""
+            )
             self.trouble, self._reported = "", True
-            self._report(Event("recording", f"to {self.where}{since}"))
+            self._report(Event("recording", f"the daemon records to {self.where}{since}"))
         self._safe_ns = self._last.mono_ns
         if self._is_long_enough(ring) or self._last.mono_ns - self._state_ns > CHECKPOINT_NS:
             self._request_state()

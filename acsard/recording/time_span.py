@@ -1,7 +1,7 @@
-"""Reads the times that a person types, and finds the part of a recording between two of them.
+"""Reads times that a person types, and finds the part of a recording between two such times.
 
 A recording may cross midnight, and the wall clock may be set during the recording. A time is
-therefore looked up in every `Stretch`, a part of the recording in which the clock was not set.
+therefore looked up in every `Stretch` (a part of the recording in which the clock was not set).
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ MIDNIGHT = TimeOfDay(0, 0, 0.0)
 
 
 class Moment(NamedTuple):
-    """A moment, whose `begin` and `end` are equal, or a whole day. Times are s since 1970."""
+    """A moment (`begin` equals `end`) or a whole day. Times are s since 1970."""
 
     begin: float
     end: float
@@ -107,7 +107,7 @@ def _time_of_day(words: str, text: str) -> TimeOfDay:
 
 
 def _date(words: str, text: str, now_s: float) -> tuple[int, int, int]:
-    """Return the year, month and day that `words` mean. The day may be less than 1."""
+    """Return the year, month and day that `words` mean. For "yesterday" the day may be 0."""
     if words in _DAYS_AGO:
         today = time.localtime(now_s)
         return today.tm_year, today.tm_mon, today.tm_mday - _DAYS_AGO[words]
@@ -142,8 +142,8 @@ def resolve(begin: When | None, end: When | None, now_s: float) -> tuple[float, 
     - None, or an `Offset`, does not limit the range on its side.
     - A time of day in `begin` means its last occurrence before `end` if `end` is a `Moment`.
       Otherwise it means the last occurrence before the present time `now_s`, s since 1970.
-    - A time of day in `end` means its first occurrence after `begin`. If `begin` does not limit the
-      range, it means the last occurrence before `now_s`.
+    - A time of day in `end` means its first occurrence after `begin` if `begin` limits the range.
+      Otherwise it means the last occurrence before `now_s`.
 
     Raises `TimeError` if the range ends before it begins.
     """

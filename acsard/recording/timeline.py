@@ -1,8 +1,8 @@
 """Describes a recording as a timeline of short texts.
 
-The timeline has an entry for each event of the log, and further entries, such as one for each
-drive, a time in mode `driving`. The same entries are in the output of `acsard recording show` and
-`acsard recording report`, and in the exported `log`.
+The timeline has an entry for each event of the log. It has further entries, for example an entry
+for each drive (a period in the mode `driving`). `acsard recording show` and `acsard recording
+report` show the same entries, and an export has them in the channel `log`.
 """
 
 from __future__ import annotations
@@ -26,17 +26,19 @@ from acsard.core.values import NS_PER_S, Command, Event, Instant
 from acsard.recording.recorded_steps import MICRO, Step
 
 FURTHEST_S = 2**63 / 1e9
-"""Largest distance of an entry's time from 1970, s: 292 years, the limit of 64 bits for ns."""
+"""Largest distance of an entry's time from 1970, s. It is 292 years, because a time in ns must fit
+in 64 bits."""
 
 
 REASON_NS = NS_PER_S
-"""Shortest time between two entries about the mode's reason, waiting senders or the board, ns.
+"""Shortest time between two entries with the same name `reason`, `waits` or `board`, ns.
 
 Otherwise two sources that alternate in every step would fill the timeline.
 """
 
 POSE_NS = NS_PER_S
-"""Longest time for which `continues` waits for a pose, ns. Without a link there is no pose."""
+"""Longest time for which the entry `continues` is delayed until a pose is known, ns. Without a link
+there is no pose."""
 
 SET_NS = 5 * NS_PER_S
 """Smallest change of the wall clock against the monotonic clock that gives an entry `clock`, ns."""
@@ -44,7 +46,7 @@ SET_NS = 5 * NS_PER_S
 WAITS_NS = NS_PER_S
 """Time for which a sender sends speeds without effect before the timeline mentions it, ns.
 
-When an operator changes senders, both may send for a moment that is shorter than this.
+When an operator changes from one sender to another, both senders may send, but for less time.
 """
 
 SILENT_NS = NS_PER_S
@@ -57,7 +59,8 @@ MAX_WAITING = 16
 """Largest number of waiting senders that are watched. A stranger may send under many names."""
 
 NUMBER = re.compile(r"\b\d+(\.\d+)?\b")
-"""Matches a number, but not a digit in a name. Reasons that differ only in numbers are equal."""
+"""Matches a number, but not a digit in a name. Reasons that differ only in numbers count as
+equal."""
 
 
 class TimelineEntry(Struct, frozen=True, omit_defaults=True):
@@ -121,18 +124,19 @@ class LinkLosses:
 
 
 class ReasonChanges:
-    """Detects a new reason for an unchanged mode, unless an event has the same reason."""
+    """Detects a new reason for an unchanged mode, unless an event reports this reason."""
 
     def __init__(self) -> None:
         self._mode = self._reason = ""
         """The last mode and reason that the timeline shows. The reason has `#` for each number."""
         self._reported_ns = -REASON_NS
-        """Monotonic time of the last entry, or of the last report that the robot waits, ns."""
+        """Monotonic time of the last entry or of the last report of the mode `waiting`, ns."""
         self._sender = ("", "")
-        """The last source that the robot followed, and the last sender on that source."""
+        """Source and sender of the last command that came from the source that the robot
+        followed."""
 
     def step(self, step: Step) -> Iterator[TimelineEntry]:
-        """Yield an entry if the reason changed, but neither the mode nor an event shows that.
+        """Yield an entry if the reason has changed, the mode has not, and no event has the reason.
 
         There is no entry while the robot drives, and at most one entry each second.
         """
@@ -162,8 +166,9 @@ _IDENTITY = re.compile(re.escape(IDENTITY) + rb"([^\r\n]*)[\r\n]")
 class BoardIdentity:
     """Detects the line with which a microcontroller names itself.
 
-    The board sends this line after its start, and when asked. The robot reports it as an event only
-    if the link was up. After a slow restart only this line explains why the board was silent.
+    The board sends this line after its start, and when asked. The robot reports the line as an
+    event only if the link was up. After a slow restart only this line explains why the board was
+    silent.
     """
 
     def __init__(self) -> None:
@@ -191,7 +196,10 @@ class BoardIdentity:
                 continue
             self._reported_ns = now.mono_ns
             words = printable_bytes(found[1], MAX_IDENTITY_BYTES)
-            text = f"the microcontroller sent its name, as after a start or a query: {words}"
+            text = (
+                "the microcontroller sent its name, which it sends after a start and when it is "
+                f"asked: {words}"
+            )
             yield TimelineEntry(now.wall_ns / 1e9, "board", text)
 
 
@@ -247,7 +255,7 @@ class WaitingSenders:
             return
         waiting.reported, self._reported_ns = True, now.mono_ns
         followed = self._commander if known else source
-        text = f"sends speeds and must wait: the robot follows {followed}, {why}"
+        text = f"this sender must wait: the robot follows the speeds of {followed}, {why}"
         yield TimelineEntry(now.wall_ns / 1e9, "waits", text, by=_named(*key))
 
     def _has_room(self, now: Instant) -> bool:
@@ -265,7 +273,8 @@ class WaitingSenders:
     def _why(self, waiting: str, followed: str) -> str:
         """Return why the robot follows the source `followed` and not `waiting`, or "" if unknown.
 
-        It is also "" if `waiting` has the higher priority, because the robot then refuses it.
+        Also return "" if `waiting` has the higher priority: the robot then refuses its commands, so
+        that the source does not wait.
         """
         one, other = self._priorities.get(waiting), self._priorities.get(followed)
         if one is None or other is None or one > other:
@@ -291,7 +300,8 @@ class TimelineWriter:
         self._sources: list[str] = []
         """The sources that commanded the present drive, in the order in which they began."""
         self._since = ""
-        """Words for the entry of a drive that began before this recording; "" for other drives."""
+        """Words that are added to the entry of a drive that began before this recording; "" for
+        others."""
         self._now: Instant | None = None
         self._shutting_down = False
         self._continued: Step | None = None
@@ -319,11 +329,14 @@ class TimelineWriter:
             return
         mode, reason, link, source = first.recorded.status
         does = mode if mode == "driving" else f"{mode} ({reason})"
-        at = "the pose is not known"
+        at = "the pose of the robot is not known"
         if self._pose is not None:
             x, y, yaw = [value / MICRO for value in self._pose]
             at = f"at x {x:.2f} m, y {y:.2f} m, yaw {math.degrees(yaw):.1f} deg"
-        text = f"this recording continues an earlier one: {does}, link {link}, {at}"
+        text = (
+            "this recording continues an earlier recording. The robot is now: "
+            f"{does}, link {link}, {at}"
+        )
         yield TimelineEntry(first.inputs.now.wall_ns / 1e9, "continues", text, by=source)
 
     def _entries(self, step: Step) -> Iterator[TimelineEntry]:
@@ -361,10 +374,11 @@ class TimelineWriter:
             return
         way = "forward" if ahead_ns > 0 else "back"
         # The monotonic clock does not advance while the computer is suspended.
-        slept = ", or this computer was suspended" if ahead_ns > 0 else ""
+        slept = ", or the computer was suspended" if ahead_ns > 0 else ""
         text = (
-            f"the clock of this computer was set {way} by {lasting(abs(ahead_ns) / NS_PER_S)}"
-            f"{slept}: the entries before this one have the time of the old clock"
+            f"the clock of the daemon's computer was set {way} by "
+            f"{lasting(abs(ahead_ns) / NS_PER_S)}{slept}: the earlier entries have times of the "
+            "clock before this change"
         )
         yield TimelineEntry(now.wall_ns / 1e9, "clock", text, "warning")
 
@@ -389,7 +403,11 @@ class TimelineWriter:
             self._began_ns = None
 
     def end(self, ending: str = "") -> Iterator[TimelineEntry]:
-        """Yield the entries after the last step: an unfinished drive, and `ending` if not ""."""
+        """Yield the entries after the last step.
+
+        These are the entry of an unfinished drive, and an entry `cut` with the text `ending` unless
+        `ending` is "".
+        """
         yield from self._continues()
         if self._now is None:
             return
@@ -420,7 +438,8 @@ INCIDENTS = {
     "wheel_fault": "wheel fault",
     "link_up": "",
 }
-"""Words for the events in a summary. `link_up` has none: it only separates losses of the link."""
+"""Words for the events in a summary. `link_up` has no word, because it only separates losses of the
+link."""
 
 
 SERIOUS = re.compile(r"(^|, )\d+ (emergency stop|bumper hit|battery stop|stop|fault)s?\b")

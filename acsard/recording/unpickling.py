@@ -39,7 +39,8 @@ MAX_PARTS = 1 << 19
 """Largest number of values in a robot. A value that occurs several times counts each time."""
 
 MAX_COPIED = 4 * MAX_PARTS
-"""Largest number of copied values. Otherwise a few bytes could copy a part again and again."""
+"""Largest number of values that constructors and attributes copy. Otherwise a few bytes could copy
+a part again and again."""
 
 MAX_KEY = 2**61 - 1
 """Bound on the absolute value of an integer that is used as a key.
@@ -75,10 +76,12 @@ CONTAINERS: dict[str, type] = {"EMPTY_LIST": list, "EMPTY_DICT": dict, "EMPTY_SE
 """Opcodes that push a new, empty container onto the stack, each with its type."""
 
 TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
-"""Opcodes that make a tuple of the top values, each with the number of these values."""
+"""Opcodes that make a tuple of the top values of the stack, each with the number of these
+values."""
 
 SIMPLE = (str, int, float, bool, bytes, type(None))
-"""Types of a key, or of the elements of a tuple that is a key. Enum members are allowed too."""
+"""Types of dict keys and set elements. A tuple of such values is allowed too, and so is a member of
+an Enum."""
 
 
 def unpickle(data: bytes, find: FindClass) -> object:
@@ -87,19 +90,25 @@ def unpickle(data: bytes, find: FindClass) -> object:
     Raises `ValueError` if the bytes are damaged or contain anything that a robot never contains.
     """
     if len(data) > MAX_BYTES:
-        raise ValueError(f"it has {len(data)} bytes, more than any robot")
+        raise ValueError(
+            f"the robot state has {len(data)} bytes, more than any real robot needs: the file is "
+            "damaged or forged"
+        )
     machine = _Machine(find)
     at = -1
     try:
         for count, (opcode, argument, place) in enumerate(pickletools.genops(data)):
             if count >= MAX_OPCODES:
-                raise ValueError("it has more parts than any robot")
+                raise ValueError(
+                    "the robot state consists of more instructions than that of any real robot: "
+                    "the file is damaged or forged"
+                )
             machine.do(opcode.name, argument)
             at = place or 0
     except (LookupError, TypeError, ArithmeticError, msgspec.MsgspecError) as error:
-        raise ValueError(f"it is damaged: {error}") from None
+        raise ValueError(f"the robot state is damaged: {error}") from None
     if at + 1 != len(data):
-        raise ValueError("there is data after its end")
+        raise ValueError("there is data after the end of the robot state")
     return machine.result()
 
 
@@ -121,16 +130,28 @@ class _Entry:
         Raises `ValueError` if a limit is exceeded, or if the value is closed.
         """
         if self.closed:
-            raise ValueError("a part of it contains itself, or grows while it is built")
+            raise ValueError(
+                "a part of the robot state contains itself, or grows after it was used: the file "
+                "is damaged or forged"
+            )
         for part in parts:
             if isinstance(part.value, type):
-                raise ValueError("it has a class where a value should be")
+                raise ValueError(
+                    "the robot state has a class where a value should be: the file is damaged or "
+                    "forged"
+                )
             self.depth = max(self.depth, 1 + part.depth)
             self.size += part.size
         if self.depth > MAX_DEPTH:
-            raise ValueError(f"its parts are nested deeper than {MAX_DEPTH}")
+            raise ValueError(
+                "the file is damaged or forged: the robot state has values that are nested deeper "
+                f"than {MAX_DEPTH}"
+            )
         if self.size > MAX_PARTS:
-            raise ValueError("it has more parts than any robot")
+            raise ValueError(
+                "the robot state has more values than that of any real robot: the file is damaged "
+                "or forged"
+            )
 
 
 class _Machine:
@@ -147,7 +168,7 @@ class _Machine:
     def result(self) -> object:
         """Return the only value on the stack; raise `ValueError` if there is not exactly one."""
         if len(self._stack) != 1 or self._marks:
-            raise ValueError("it is damaged: it ends in the middle")
+            raise ValueError("the robot state is damaged: its data ends too early")
         return self._stack[0].value
 
     def do(self, name: str, argument: Any) -> None:
@@ -158,7 +179,8 @@ class _Machine:
         if name in ARGUMENTS:
             if type(argument) is int and argument.bit_length() > MAX_INT_BITS:
                 raise ValueError(
-                    f"it has a number of {argument.bit_length()} bits, too large for a robot"
+                    f"the robot state has a number of {argument.bit_length()} bits, too large for "
+                    "a real robot: the file is damaged or forged"
                 )
             self._push(argument)
         elif name in VALUES:
@@ -174,7 +196,10 @@ class _Machine:
             entry.closed = True
             self._stack.append(entry)
         else:
-            raise ValueError(f"it has the opcode {name}, which the state of a robot never contains")
+            raise ValueError(
+                f"the robot state has the pickle opcode {name}, which acsard never writes: the "
+                "file is damaged or forged"
+            )
 
     def _push(self, value: object) -> _Entry:
         entry = _Entry(value)
@@ -206,7 +231,10 @@ class _Machine:
         """Count the values of `entry` as copied. Raises `ValueError` above `MAX_COPIED`."""
         self._copied += entry.size
         if self._copied > MAX_COPIED:
-            raise ValueError("it has more parts than any robot")
+            raise ValueError(
+                "the robot state copies more values than that of any real robot: the file is "
+                "damaged or forged"
+            )
 
     # Each method below executes the opcodes that `OPCODES` assigns to it.
 
@@ -236,7 +264,7 @@ class _Machine:
     def _extend(self, parts: list[_Entry]) -> None:
         whole = self._stack[-1]
         if type(whole.value) not in (list, deque):
-            raise TypeError("it appends to an object that is not a list")
+            raise TypeError("an instruction appends to an object that is not a list")
         whole.holds(parts)
         whole.value.extend([part.value for part in parts])
 
@@ -249,7 +277,7 @@ class _Machine:
     def _update(self, parts: list[_Entry]) -> None:
         whole, keys, values = self._stack[-1], parts[::2], parts[1::2]
         if type(whole.value) is not dict:
-            raise TypeError("it sets keys of an object that is not a dict")
+            raise TypeError("an instruction sets keys of an object that is not a dict")
         _keys(keys)
         whole.holds(parts)
         pairs = zip(keys, values, strict=True)
@@ -259,7 +287,7 @@ class _Machine:
         parts = self._marked()
         whole = self._stack[-1]
         if not isinstance(whole.value, set):
-            raise TypeError("it adds elements to an object that is not a set")
+            raise TypeError("an instruction adds elements to an object that is not a set")
         _keys(parts)
         whole.holds(parts)
         whole.value.update([part.value for part in parts])
@@ -267,14 +295,14 @@ class _Machine:
     def find_class(self) -> None:
         module, name = [entry.value for entry in self._top(2)]
         if not isinstance(module, str) or not isinstance(name, str):
-            raise TypeError("the name of a class is not a text")
+            raise TypeError("an instruction names a class with a value that is not a text")
         self._push(self._find(module, name))
 
     def construct(self) -> None:
         """Make an object of a class from the arguments of its constructor."""
         kind, given = self._top(2)
         if not isinstance(kind.value, type) or not isinstance(given.value, tuple):
-            raise TypeError("it calls an object that is not a class")
+            raise TypeError("an instruction calls an object that is not a class")
         entry = _Entry(None)
         entry.holds([given])
         self._copies(given)
@@ -285,7 +313,10 @@ class _Machine:
         """Make an object without attributes, and without a call of its constructor."""
         kind, given = self._top(2)
         if not isinstance(kind.value, type) or given.value != ():
-            raise TypeError("it calls something that is not a class, or a class that needs values")
+            raise TypeError(
+                "an instruction makes an object of a value that is not a class, or of a class that "
+                "needs arguments"
+            )
         if not _is_part(kind.value):
             raise ValueError(f"{kind.value.__name__} cannot be constructed without values")
         self._push(object.__new__(kind.value))
@@ -296,13 +327,14 @@ class _Machine:
         whole, named = self._stack[-1], state.value
         if not _is_part(type(whole.value)) or not isinstance(named, dict):
             raise ValueError(
-                f"it sets attributes of a {type(whole.value).__name__}, which no recording of "
-                "acsard does"
+                f"the robot state sets attributes of a {type(whole.value).__name__}, which acsard "
+                "never writes: the file is damaged or forged"
             )
         for name in named:
             if not isinstance(name, str) or hasattr(type(whole.value), name):
                 raise ValueError(
-                    f"it replaces {name!r:.50} of the class {type(whole.value).__name__}"
+                    f"the robot state replaces the attribute {name!r:.50} of the class "
+                    f"{type(whole.value).__name__}"
                 )
         whole.holds([state])
         self._copies(state)
@@ -331,14 +363,19 @@ OPCODES: dict[str, Callable[[_Machine], None]] = {
 
 
 def _keys(entries: Sequence[_Entry]) -> None:
-    """Raise `ValueError` for keys that are slow to hash, or cannot be hashed."""
+    """Raise `ValueError` for dict keys and set elements that are slow or impossible to hash."""
     for entry in entries:
         value = entry.value
         parts = value if type(value) is tuple and len(value) <= MAX_KEY_PARTS else (value,)
         if not all(type(part) in SIMPLE or isinstance(part, Enum) for part in parts):
-            raise ValueError(f"it uses a {type(value).__name__} as a key")
+            raise ValueError(
+                f"the robot state uses a {type(value).__name__} as a key, which acsard never writes"
+            )
         if any(type(part) is int and abs(part) >= MAX_KEY for part in parts):
-            raise ValueError("it uses a number of more than 60 bits as a key")
+            raise ValueError(
+                "the robot state uses a number of more than 60 bits as a key, which acsard never "
+                "writes"
+            )
 
 
 def _is_part(kind: Any) -> bool:

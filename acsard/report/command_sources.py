@@ -17,7 +17,7 @@ STATES = ("refused", "waits", "sends", "drives")
 """States of a command source that is not silent.
 
 In the state `sends` the robot accepts the source's commands, but the source does not drive. If
-short spans of time are merged, the state that comes first here is kept.
+short spans of time are merged, the result has the state that comes first in this tuple.
 """
 
 MOVES = ("ready", "driving")
@@ -46,7 +46,7 @@ class CommandSources:
         self.bands = {name: Band(STATES) for name in (*self._timeouts, OTHERS)}
         """The states of each source over time. The source with the highest priority comes first."""
         self._newest: dict[tuple[str, str], Command] = {}
-        """The last command of each source and sender, the newest last."""
+        """The last command of each sender of each source. The newest command comes last."""
         self._counted: Counter[str] = Counter()
         """For each reason, the number of commands that the robot has refused so far."""
         self._refused: dict[str, tuple[float, str]] = {}

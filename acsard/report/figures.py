@@ -48,17 +48,20 @@ class Line(NamedTuple):
     width: float = 1.6
     """Line width, px."""
     values: Sequence[float] = ()
-    """Values that the page shows at the pointer. If it is (), the page shows those of `points`."""
+    """Values that the page shows at the pointer. If empty, the page shows the values of
+    `points`."""
 
 
 GAP_PX = 30
 """Height of the gap above each diagram of a picture, px. The gap holds the diagram's title."""
 
 LEAST_LINEAR, LEAST_ANGULAR = 0.1, 0.2
-"""Smallest span of the speed scales, m/s and rad/s, for a robot that never moves."""
+"""Smallest span of the scale of the forward speed, m/s, and of the turn rate, rad/s. Otherwise a
+robot that never moves would have an empty scale."""
 
 BENEATH = 3.4
-"""Width of a curve that another curve nearly covers, px. It stays visible on both sides."""
+"""Width of a curve that another curve nearly covers, px. The wide curve stays visible on both sides
+of the other one."""
 
 
 class Clip(NamedTuple):
@@ -67,13 +70,14 @@ class Clip(NamedTuple):
     t: float
     """Time at which the curve leaves the diagram, s."""
     edge: float
-    """Value of the edge at which the curve is drawn."""
+    """Value at the edge of the diagram, at which the curve is drawn."""
     value: float
     """The curve's furthest value beyond the edge."""
 
 
 MARKS_APART = 0.02
-"""Smallest distance between two marks of excursions, as a fraction of the diagram's width."""
+"""Smallest distance between the triangles of two excursions, as a fraction of the diagram's
+width."""
 
 HEADROOM = 0.5
 """Room for commanded speeds above and below the other speeds, as a fraction of their span.
@@ -90,7 +94,7 @@ def clipped(
 
     Args:
         points: the curve; NaN interrupts it.
-        others: the curves that determine the scale, with `HEADROOM` added.
+        others: the curves that determine the scale; `HEADROOM` is added to their span.
         least: smallest span of the scale.
         gap: longest time between excursions beyond the same edge that count as one, s.
     """
@@ -181,7 +185,8 @@ NOTED = {
     "link_stale": ("▲", "triangle-up", "#e0b400"),
     "link_late": ("⬟", "pentagon", "#8f4f22"),
 }
-"""Events that are drawn on the path, each with its symbol, plotly's name for it, and its colour."""
+"""Events that are drawn on the path, each with its symbol, plotly's name for this symbol, and its
+colour."""
 
 
 def path_figure(data: ReportData) -> Figure:
@@ -233,7 +238,7 @@ def _places(name: str, places: list[Place], mode: str, **look: object) -> Trace:
 
 
 def _with_gaps(places: list[Place]) -> list[Place]:
-    """Insert a gap before each place that does not continue the path."""
+    """Insert a gap before each place whose `Place.new` is true."""
     gap = Place(0.0, math.nan, math.nan, 0.0)
     found = [item for place in places for item in ((gap, place) if place.new else (place,))]
     return found[1:] if found and found[0] is gap else found
@@ -296,8 +301,8 @@ class TimeFigures:
             ]
             parts.append(Part(title, lines, clips))
         caption = (
-            "Commanded is the speed of the source that drives. Limited is the speed sent to the "
-            "wheels. Measured is the speed that the wheels reported. Left turns and forward "
+            "Commanded is the speed that the active source asks for. Limited is the speed sent to "
+            "the wheels. Measured is the speed that the wheels reported. Left turns and forward "
             "driving are above zero."
         )
         furthest = [
@@ -307,7 +312,8 @@ class TimeFigures:
         ]
         if furthest:
             caption += (
-                " A triangle marks a commanded speed outside of the picture; the furthest is "
+                " A triangle marks a commanded speed that is too large for the picture; the "
+                "largest of these is "
                 f"{' and '.join(furthest)}."
             )
         return self._stack("speeds", "Speed", caption, parts, 210)
@@ -351,8 +357,8 @@ class TimeFigures:
     def loop(self) -> Figure:
         late = Line("late", LIMITED, self._data.lateness.points(), "hv")
         caption = (
-            "Delay of each period's step after the time when the period was due, compared with "
-            "the smallest such delay."
+            "Each control step begins a little after it is due. This picture shows how much "
+            "longer each step was delayed than the step with the shortest delay."
         )
         return self._stack("loop", "The control loop", caption, [Part("late, ms", [late])], 200)
 
@@ -383,7 +389,7 @@ class TimeFigures:
             "priority sends."
         )
         if silent:
-            caption += f" Silent all the time: {', '.join(silent)}."
+            caption += f" These sources were silent all the time: {', '.join(silent)}."
         height = ROW_PX * len(rows) + AXIS_PX
         title = "Active source, and why others wait"
         return Figure("sources", title, caption, _keys(styles), height, traces, axes)
@@ -422,7 +428,7 @@ class TimeFigures:
             "yaxis": {"range": [-0.5, len(levels)], "visible": False, "fixedrange": True},
             "annotations": [note(level, 0, at + 0.42) for at, level in enumerate(levels)],
         }
-        caption = "Point at a mark to read it; the full list is at the end."
+        caption = "Point at a mark to read its event. The list of events is at the end of the page."
         keys = [Key("◆", COLOURS[level], level) for level in reversed(levels)]
         return Figure("events", "Events", caption, keys, 230, traces, axes)
 
@@ -455,7 +461,7 @@ class TimeFigures:
         return layout() | {"xaxis": axis, "margin": {"l": 44, "r": 12, "t": 8, "b": 44}}
 
     def _stack(self, name: str, title: str, caption: str, parts: list[Part], px: int) -> Figure:
-        """Draw the parts, each `px` high, below each other with one time axis and one legend."""
+        """Draw the parts below each other, each `px` high, with one time axis and one legend."""
         traces, notes = list[Trace](), list[dict[str, Any]]()
         axes = self._timed()
         axes["margin"] |= {"t": GAP_PX}
@@ -502,7 +508,7 @@ class TimeFigures:
 
 
 def _hover(name: str, values: Sequence[float]) -> dict[str, Any]:
-    """Return plotly's hover text: the curve's name, the time, and one of `values` or else y."""
+    """Return plotly's hover text: the curve's name, the time, and one of `values` (if empty: y)."""
     shown = "customdata" if values else "y"
     text = f"{name} %{{{shown}:.3~f}}<br>%{{x|%H:%M:%S.%L}}<extra></extra>"
     return {"hovertemplate": text} | ({"customdata": numbers(values)} if values else {})

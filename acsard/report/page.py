@@ -2,8 +2,8 @@
 
 No text of unknown origin can become code in the file. Each text passes `escaped`. The pictures are
 JSON without any `<`, in a block that browsers do not execute. As a second barrier, the file's
-content security policy allows only its two scripts, identified by their hashes, and forbids it to
-load anything.
+content security policy allows only the two scripts of the file, identified by their hashes, and
+forbids the page to load anything.
 """
 
 from __future__ import annotations
@@ -177,7 +177,7 @@ def page(
 def drawn(
     recording: Recording, library: str, span: Span = WHOLE, progress: Progress = no_progress
 ) -> tuple[str, list[str]]:
-    """Replay a part of a recording. Return the text of its report and the notes in it.
+    """Replay a part of a recording. Return the text of its report, and the notes in the report.
 
     `library` is the code of plotly. `progress` is called with the wall-clock time that the replay
     has reached, ns since 1970. Raises `RecordingError` if the part has no step.
@@ -202,9 +202,10 @@ def drawn(
     remarks = [*filter(None, [recording.missing]), *replayed.notes]
     comparison = replayed.replay.comparison
     if not (comparison.same or replayed.notes or data.missing):
-        what = "other words for reasons or events" if comparison.only_words else "other results"
+        what = "the texts of reasons or events" if comparison.only_words else "the results"
         remarks.append(
-            f"this version of acsard computes {what} than the recorded ones: {verdict(comparison)}"
+            f"when this version of acsard replays the recording, {what} differ from the recorded "
+            f"ones: {verdict(comparison)}"
         )
     names = ", ".join(path.name for path in recording.paths)
     origin = Origin(names, about.robot, about.version, about.python, tuple(remarks))
@@ -238,7 +239,9 @@ def _reasons(data: ReportData) -> str:
         (_cell(name, "name"), _cell(state, "time"), _cell(words), _cell(lasting(seconds), "time"))
         for name, state, words, seconds in reasons(data)
     ]
-    return _table(["source", "", "why it did not drive", "duration"], cells) if cells else ""
+    return (
+        _table(["source", "", "why the source did not drive", "duration"], cells) if cells else ""
+    )
 
 
 def _events(data: ReportData, clock: Clock) -> str:

@@ -1,8 +1,8 @@
 """Makes the elements of a report's pictures, in the format of the library plotly.
 
 The pictures are plain lists and dicts. Columns of numbers are doubles in base64, because plotly
-reads that and JSON cannot represent NaN. `page.py` sets the colours of paper, grid and text. The
-colours in this module suit a light and a dark background.
+reads this form and JSON cannot represent NaN. `page.py` sets the colours of background, grid and
+text. The colours in this module suit a light and a dark background.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ SOURCE_COLOURS = (
 """Colours of the command sources that drive. Neighbours in this list are easy to distinguish."""
 
 PATTERNS = ("", "/", "x", ".", "-")
-"""Fill patterns of the bands. When all colours are used, the colours repeat with a new pattern."""
+"""Fill patterns of the bands of sources. When all colours are used, the colours repeat with a new
+pattern."""
 
 
 def source_style(number: int) -> tuple[str, str]:
@@ -118,7 +119,7 @@ def layout() -> dict[str, Any]:
 
 
 def note(text: str, x: float, y: float) -> dict[str, Any]:
-    """Return a heading at `x`, a fraction of the picture's width, and at `y` on its y axis."""
+    """Return a title at `x`, a fraction of the picture's width, and at `y` on the y axis."""
     return {
         "text": label(text), "x": x, "y": y, "xref": "paper", "yref": "y", "xanchor": "left",
         "yanchor": "middle", "showarrow": False, "font": {"size": 13},

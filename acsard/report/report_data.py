@@ -29,13 +29,13 @@ MODES = ("fault", "stopped", "shutdown", "waiting", "inactive", "driving", "read
 """Modes of the robot. If short spans are merged, the mode that comes first here is kept."""
 
 LINKS = ("down", "stale", "booting", "up")
-"""States of the serial link. If short spans are merged, the state that comes first is kept."""
+"""States of the serial link. If short spans are merged, the state that comes first here is kept."""
 
 MAX_EVENT_TEXT = 1000
 """Largest number of characters that are kept of an event's text. The daemon's longest has 308."""
 
 FIRST, LAST = 30, 30
-"""Number of events of each name that are kept: the first ones, and the last ones."""
+"""Numbers of events of each name that are kept: `FIRST` from the beginning, `LAST` from the end."""
 
 
 class Mark(Struct, frozen=True):
@@ -49,7 +49,7 @@ class Mark(Struct, frozen=True):
     by: str
     """The client that caused the event, or the source that commanded a drive; "" if unknown."""
     count: int
-    """Number of equal events that this one stands for."""
+    """Number of equal events that this mark stands for."""
     place: Place | None
     """Place according to odometry; None before the first pose."""
     seconds: float
@@ -101,7 +101,8 @@ class Lateness:
     """Measures how late the daemon ran the step of each control period.
 
     The recording gives the number of missed periods, and so the number of each period. The times at
-    which periods were due are then known up to an offset, which makes the smallest delay 0.
+    which periods were due follow from these numbers, except for a constant offset. The offset is
+    chosen so that the smallest delay is 0.
     """
 
     def __init__(self, rate_hz: float) -> None:
@@ -112,7 +113,7 @@ class Lateness:
         """Number of lines that `at_once` has counted since the last period."""
         self._began_ns: int | None = None
         self._earliest = math.inf
-        """Smallest delay of a step so far, ns. The delay of the first step counts as 0."""
+        """Smallest delay of a step so far, relative to the delay of the first step, ns."""
         self.missed = 0
         """Number of periods without a step."""
 
@@ -121,10 +122,11 @@ class Lateness:
         self._ahead += 1
 
     def tick(self, t: float, now_ns: int, missed: int, known: bool) -> None:
-        """Process the step of a control period at `t`, s, and at the monotonic time `now_ns`, ns.
+        """Process the step of a control period; `t` is its time in the report, s.
 
-        `missed` is the number of periods without a step since the last tick. `known` is False if
-        the recording lacks steps before this one. Then the clock gives the number of the period.
+        `now_ns` is its monotonic time, ns. `missed` is the number of periods without a step since
+        the last tick. `known` is False if the recording lacks steps before this one. Then the
+        number of the period is computed from `now_ns`.
         """
         period_ns, began_ns = self._period_ns, self._began_ns
         if began_ns is None:
@@ -145,7 +147,7 @@ class Lateness:
         self._curve.add(t, (behind_ns + missed * period_ns) / NS_PER_MS)
 
     def points(self) -> list[Point]:
-        """Return the delay of each period in ms over the time in s. The smallest delay is 0."""
+        """Return the delay of each period, ms, at its time in s. The smallest delay is 0."""
         least = self._earliest / NS_PER_MS
         return [Point(t, value - least) for t, value in self._curve.points()]
 
@@ -155,7 +157,7 @@ class Lateness:
 
 
 class LineCount:
-    """Number of serial lines of one kind: for each second, and the total."""
+    """Number of serial lines of one kind: a curve of the number in each second, and the total."""
 
     def __init__(self) -> None:
         self.curve, self.total = Curve(), 0
@@ -174,20 +176,22 @@ class SerialCounts:
         self.dropped, self.unanswered = LineCount(), LineCount()
         self._second: int | None = None
         self._sent = 0
-        """Lines sent in this second."""
+        """Number of lines sent in the present second."""
         self._base = 0
-        """Lines received up to the first step of the report."""
+        """Number of lines received up to the first step of the report."""
         self._before = (0, 0)
-        """Good and dropped lines since the daemon's start, at the beginning of this second."""
+        """Numbers of good and of dropped lines from the daemon's start to the beginning of this
+        second."""
         self._now = (0, 0)
-        """Good and dropped lines since the daemon's start, at the last step."""
+        """Numbers of good and of dropped lines from the daemon's start to the last step."""
         self._outstanding: int | None = None
         """Smallest number of unanswered lines at any step of this second.
 
         At other steps the answer to the newest line may still be under way.
         """
         self._lost: int | None = None
-        """Largest `_outstanding` of the earlier seconds: the answers lost before this second."""
+        """Number of answers that were lost before this second, that is, the largest `_outstanding`
+        of the earlier seconds."""
 
     def step(self, t: float, sent: bool, counters: Mapping[str, int]) -> None:
         """Process a step at time `t`, s; `counters` are the robot's counters after the step."""
@@ -253,7 +257,8 @@ class ReportData:
         self.lateness = Lateness(config.rate_hz)
         self.marks = Marks()
         self.began: float | None = None
-        """Wall-clock time of the first collected step, s since 1970. All times `t` begin there."""
+        """Wall-clock time of the first collected step, s since 1970. All times `t` count from
+        it."""
         self.ended = 0.0
         """Wall-clock time of the last collected step, s since 1970."""
         self.seconds = self.metres = 0.0
@@ -263,12 +268,13 @@ class ReportData:
         self.fastest = Twist()
         """Largest absolute value of the measured speed of each axis, m/s and rad/s."""
         self.steps = self.missing = 0
-        """Number of collected steps, and of steps that are missing between them."""
+        """Number of collected steps, and number of steps that are missing between them."""
         self._timeline = TimelineWriter(config)
         self._mono_ns = self._wall_ns = 0
         """Monotonic and wall-clock time of the first step of the recording, ns."""
         self._wall = -math.inf
-        """Wall-clock time of the first step plus the monotonic time since then, s since 1970."""
+        """Time of the last step, s since 1970: the wall-clock time of the first step plus the
+        monotonic time since then."""
         self._number: int | None = None
         self._place: Place | None = None
         self._jumps = True
@@ -324,7 +330,7 @@ class ReportData:
     # Distance and speeds.
 
     def _drive(self, step: Step, t: float, inside: bool) -> None:
-        """Add the poses of a step to the path, and to the distance if `inside` is true."""
+        """Process the poses of a step; if `inside` is true, add them to path and distance."""
         mode, _, _, source = step.recorded.status
         driven = self._driven(source) if mode == "driving" and inside else None
         if driven is not None and t > self.seconds:
@@ -392,7 +398,7 @@ class ReportData:
             self.lateness.at_once()
 
     def _sample(self, step: Step, t: float, robot: Robot, refused: bool) -> None:
-        """Sample mode, link and sources after `SAMPLE_S`, or at once after a change."""
+        """Sample mode, link and sources if the last sample is `SAMPLE_S` old, or after a change."""
         mode, reason, link, _ = status = step.recorded.status
         if status == self._status and t - self._sampled < SAMPLE_S and not refused:
             return

@@ -1,4 +1,4 @@
-"""Describes a recording in words, for the summary of a report and the table below it."""
+"""Describes a recording in words, for the summary, the notes and the tables of a report."""
 
 from __future__ import annotations
 
@@ -28,10 +28,11 @@ MAX_REASONS = 8
 NUMBER = re.compile(r"\d+(\.\d+)?")
 
 FINE_S = 0.05
-"""If a point of a picture stands for more than this time, s, the report has a note about it."""
+"""Time for which a point of a picture may stand, s. If a point stands for more time, the report has
+a note."""
 
 MAX_NAMES = 5
-"""Largest number of names or texts in a list."""
+"""Largest number of names or texts that are listed in one sentence."""
 
 
 class Origin(Struct, frozen=True):
@@ -66,7 +67,7 @@ OF_THE_BOARD = {
 def differences(config: Config) -> list[Setting]:
     """Return the settings that differ from their defaults.
 
-    They include all keys of a command source that was added or removed.
+    The result includes all keys of a command source that was added or removed.
     """
     here, default = (dict(flat(effective(each))) for each in (config, Config()))
     return [
@@ -100,7 +101,7 @@ def summary(data: ReportData) -> str:
     for name, word in OF_THE_BOARD.items():
         by += f", {many(counts[name], word)}" if counts[name] else ""
     lost = counts["link_down"] + counts["link_stale"]
-    link = f", {many(lost, 'loss', 'losses')} of the link" if lost else ""
+    link = f", {many(lost, 'loss', 'losses')} of the link to the board" if lost else ""
     late = counts["link_late"]
     link += f", {many(late, 'stall')} of the robot's computer" if late else ""
     return f"{drive} There {_be(counts['fault'])} {faults}, {stops}{by}{link}."
@@ -165,16 +166,17 @@ def notes(data: ReportData, origin: Origin) -> list[str]:
         )
     if data.marks.counts["clock"]:
         found.append(
-            "The clock of the robot's computer was set during this time. The list of events shows "
-            "the time of the clock at each event. The time axes of the pictures ignore the change "
-            "and count on from the time at their beginning."
+            "The clock of the robot's computer was set during this recording. In the list of "
+            "events, each time is the clock's time at that event. The time axes of the pictures "
+            "begin with the clock's time and ignore the later change."
         )
     curves = [*data.linear.values(), *data.angular.values()]
     width = max(curve.width for curve in curves)
     if width > FINE_S:
         found.append(
-            f"A point of a picture stands for up to {width:.2g} s and shows the lowest and the "
-            "highest value of that time. --from and --to draw a shorter time in more detail."
+            f"Each point of a picture covers up to {width:.2g} s, and shows the lowest and the "
+            "highest value in that time. To see more detail, draw a shorter time with --from and "
+            "--to."
         )
     return found
 
@@ -203,7 +205,11 @@ def rows(data: ReportData, origin: Origin, clock: Clock) -> Iterator[tuple[str, 
     told = (
         f"{lines.sent.total} lines sent, {lines.good.total} answers, {lines.dropped.total} dropped"
     )
-    lost = "" if config.mcu.reply_period else f", {lines.unanswered.total} without an answer"
+    lost = (
+        ""
+        if config.mcu.reply_period
+        else f", {lines.unanswered.total} sent lines without an answer"
+    )
     yield "Serial line", told + lost
     lateness = data.lateness
     yield (

@@ -204,9 +204,11 @@ class JsonPrompt:
             file = writable(config)
             require_changeable(file, keys)
         except MendableError as error:
-            self.say(f"The tool cannot write the file: {error}")
+            self.say(f"acsard cannot write the configuration file: {error}")
             return False
-        wanted = self.ask(f"Write these lines into {file}? Its comments stay.", ("write", "leave"))
+        wanted = self.ask(
+            f"Write these lines into {file}? The comments in the file stay.", ("write", "leave")
+        )
         self._moves = False
         if wanted == "write":
             change(file, keys)
@@ -259,7 +261,7 @@ class JsonPrompt:
         try:
             self._end(self._heard_out())
         except BaseException as error:
-            self._end(f"the input cannot be read: {error}")
+            self._end(f"standard input cannot be read: {error}")
             raise
 
     def _heard_out(self) -> str:
@@ -270,12 +272,12 @@ class JsonPrompt:
                 read = os.read(self._input, 4096)
                 *whole, held = (held + read).split(b"\n")
                 if not read or len(held) > LINE_BYTES:
-                    return "the program that passes on the questions has ended"
+                    return "the program that shows the questions to the operator has ended"
                 for line in whole:
                     self._take(line)
                 heard_s = time.monotonic()
             elif self._moves and time.monotonic() - heard_s > HEARD_S and not self._readable(0.0):
-                return f"no sign of life from the operator arrived for {HEARD_S:g} s"
+                return f"the operator's page or program sent no sign of life for {HEARD_S:g} s"
         return ""
 
     def _readable(self, wait_s: float) -> bool:

@@ -30,7 +30,8 @@ def table(
 ) -> Table:
     """Return rows as a table in columns.
 
-    `right` are the numbers of the right-aligned columns, and `gap` is the space between columns.
+    `right` are the numbers of the right-aligned columns, counted from 0. `gap` is the number of
+    spaces between columns.
     """
     cells = list(rows)
     made = Table(

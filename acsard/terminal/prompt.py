@@ -45,15 +45,15 @@ class Ask(Struct, frozen=True):
         except ValueError:
             number = None
         if number is None or not self.least <= number <= self.most:
-            raise ValueError(f"type a number of {self.unit} from {self.least:g} to {self.most:g}")
+            raise ValueError(f"type a number in {self.unit}, from {self.least:g} to {self.most:g}")
         return number
 
 
 class Prompt(Protocol):
     """Interface through which a subcommand asks the person near the robot.
 
-    Every question raises `KeyboardInterrupt` if the person quits. A leg is one drive of a guided
-    calibration, which the person starts and any key stops.
+    Every method that asks raises `KeyboardInterrupt` if the person quits. A leg is one drive of a
+    guided calibration, which the person starts and any key stops.
     """
 
     def begin(self, subject: str, *, simulated: bool) -> None:
@@ -66,7 +66,7 @@ class Prompt(Protocol):
         """Show a text about the present activity, which replaces the text of the last call."""
 
     def progress(self, share: float) -> None:
-        """Show which share of the present drive or check is done, 0 to 1."""
+        """Show the completed share of the present drive or check, 0 to 1."""
 
     def found(self, finding: Finding) -> None:
         """Show a finding of a check, as soon as it is made."""
@@ -75,31 +75,39 @@ class Prompt(Protocol):
         """Show the result. From now on nothing moves."""
 
     def offer(self, config: str | None, keys: Mapping[str, object], trouble: str = "") -> bool:
-        """Offer to write these keys into the configuration file; return whether they were written.
+        """Offer to write the settings `keys` into the configuration file.
 
-        `config` is the file's path, or None to search for it. `trouble` is a reason not to write.
+        Return whether they were written. `config` is the file's path, or None to search for it.
+        `trouble` is a reason not to write, or "".
         """
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
         """Ask the question. Return one of `answers`, or None if no person watches the robot."""
 
     def start(self, text: str, by_key: bool = False) -> None:
-        """Show the text until the person starts a drive, which a key should end if `by_key`."""
+        """Show the text, and wait until the person starts a drive.
+
+        `by_key` is true if a key press is the intended end of this drive.
+        """
 
     def number(self, ask: Ask) -> float:
-        """Return the number that the person measured. Raises `NobodyError` without a person."""
+        """Return the number that the person measured, or without a person the default of `ask`.
+
+        Raises `NobodyError` if there is neither a person nor a default.
+        """
 
     def keys(self, wait_s: float) -> str:
-        """Return the keys that were pressed; wait up to `wait_s` s for the first one."""
+        """Return the pressed keys of the keyboard; wait up to `wait_s` s for the first key."""
 
 
 SIGNALS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP
-"""The signals that end a subcommand. Suspending it with Ctrl-Z would leave a wheel turning."""
+"""The signals that end a subcommand. The signal of Ctrl-Z is among them, because a suspended
+subcommand would leave a wheel turning."""
 
 
 @contextmanager
 def ended_by_signals(says: str = "", *, exits: bool = False) -> Iterator[None]:
-    """Raise `KeyboardInterrupt` in the block on any of `SIGNALS`, and ignore further signals.
+    """Raise `KeyboardInterrupt` in the `with` block on any of `SIGNALS`; ignore further signals.
 
     The cleanup of the block can then send zero speeds. `says` is printed when a signal arrives.
     With `exits`, a signal other than Ctrl-C raises `SystemExit` with the exit code of that signal.

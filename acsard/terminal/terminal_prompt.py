@@ -72,7 +72,7 @@ class Screen:
         print(text)
 
     def offer(self, config: str | None, keys: Mapping[str, object], trouble: str = "") -> bool:
-        """Return False without a question, because at a terminal `--write` changes the file."""
+        """Return False without a question: at a terminal the option `--write` changes the file."""
         return False
 
     def _clear(self) -> None:
@@ -99,7 +99,9 @@ class NoPrompt(Screen):
 
     def number(self, ask: Ask) -> float:
         if ask.usual is None:
-            raise NobodyError("this method needs a person who measures: leave --yes out")
+            raise NobodyError(
+                "this calibration method needs a person who measures: leave --yes out"
+            )
         return ask.usual
 
     def keys(self, wait_s: float) -> str:
@@ -113,7 +115,8 @@ class NoPrompt(Screen):
 class TerminalPrompt(Screen):
     """Prompt that asks a person on standard error and reads the answers from standard input.
 
-    It needs `host.terminal_modes.one_by_one` to start and stop the robot with a single key.
+    Use it in the context `host.terminal_modes.one_by_one`, so that a single key starts or stops the
+    robot.
     """
 
     def ask(self, question: str, answers: Sequence[str]) -> str:
@@ -138,7 +141,7 @@ class TerminalPrompt(Screen):
         # Keys that were pressed before the text appeared must not start anything.
         if sys.stdin.isatty():
             termios.tcflush(sys.stdin, termios.TCIFLUSH)
-        self.say("Enter starts it, then any key stops it; q quits.")
+        self.say("Enter starts this drive, then any key stops it; q quits.")
         while True:
             pressed = _read()
             if not pressed.strip("\r\n"):
@@ -187,7 +190,7 @@ def _read() -> str:
 
 @contextmanager
 def _lines() -> Iterator[None]:
-    """Read whole lines from the terminal, and echo them while they are typed."""
+    """Let the terminal deliver and echo whole lines of input in the `with` block."""
     before = termios.tcgetattr(sys.stdin)
     cooked = termios.tcgetattr(sys.stdin)
     cooked[3] |= termios.ICANON | termios.ECHO

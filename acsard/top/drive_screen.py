@@ -1,4 +1,4 @@
-"""The lines in which `acsard drive` shows the robot, for any width. This module is pure."""
+"""The lines of text in which `acsard drive` shows the robot, for any width. This module is pure."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Teleop(Struct, frozen=True):
     """Turn rate that a key sets, rad/s."""
     state: RobotState | None
     age: float
-    """Seconds since `state` arrived, or since the wait for the first one began."""
+    """Seconds since `state` arrived, or since the wait for the first state began."""
     objection: str = ""
     """Reason why the robot does not follow the keys, or ""."""
     silent: bool = False
@@ -42,7 +42,7 @@ class Teleop(Struct, frozen=True):
 
 
 def lines(seen: Teleop, width: int, height: int | None = None) -> list[Text]:
-    """Return the screen as at most `height` lines (None: no limit) of at most `width` cells."""
+    """Return the screen: at most `height` lines (None: no limit) of at most `width` characters."""
     width = max(20, width)
     head = printable(f"{seen.robot_id} as {seen.source}  {seen.endpoint}")
     shown = [Text(head, "bold")]
@@ -70,7 +70,7 @@ def lines(seen: Teleop, width: int, height: int | None = None) -> list[Text]:
 
 
 def news(seen: Teleop, width: int) -> list[str]:
-    """Return the lines of a report: the content of the screen, without the help."""
+    """Return the content of the screen, without the help, as lines for output without a screen."""
     told = [f"keys ask for {asked(seen)}"]
     if seen.state is None or seen.silent:
         return _words([silence(seen), *told], width)
@@ -81,7 +81,7 @@ def news(seen: Teleop, width: int) -> list[str]:
 
 
 def parting(seen: Teleop, width: int) -> list[str]:
-    """Return the lines of the last report: whether the robot moves, why, and its pose."""
+    """Return the lines printed as `acsard drive` ends: does the robot move, why, and its pose."""
     if seen.state is None or seen.silent:
         return _words([f"left: {silence(seen)}"], width)
     what = "still moves" if moves(seen.state) else "stands"
@@ -97,9 +97,9 @@ def moves(state: RobotState) -> bool:
 
 
 def silence(seen: Teleop) -> str:
-    """Return a sentence which says that nothing is received, and for how long."""
+    """Return a sentence which says that no state has arrived yet, or for how long none arrived."""
     if seen.state is None and not seen.silent:
-        return "waiting for the first state"
+        return "waiting for the first state message of the daemon"
     return f"nothing received from the daemon for {seen.age:.0f} s: does it run?"
 
 
@@ -109,7 +109,7 @@ def reason(state: RobotState) -> str:
 
 
 def refused(objection: str) -> str:
-    """Return why the robot does not follow the keys, and how to send a zero if it needs one."""
+    """Return why the robot does not follow the keys, and how the keys can send a required zero."""
     release = " (release the key, and press it again)" if "must send a zero" in objection else ""
     return f"your keys do not drive the robot: {printable(objection)}{release}"
 

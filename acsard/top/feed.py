@@ -33,8 +33,8 @@ class Feed:
         except DecodeError as error:
             self._watch.unreadable += 1
             raise ReplyError(
-                f"cannot read the state ({error}); does the daemon have another version? Use the "
-                "same version here"
+                f"cannot read the daemon's state ({error}); does the daemon run another version of "
+                "acsard? Use the same version here"
             ) from None
         # A state that arrived before the answer is usually older than the answer, but not always.
         self.poll()

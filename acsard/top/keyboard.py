@@ -2,7 +2,8 @@
 
 A terminal reports a key press but never its release. Each press therefore drives the robot for
 `HOLD_S`. Once the keyboard repeats a held key, each repeat drives the robot for `REPEAT_S` only.
-When this time is over, the tool sends three zero commands and then nothing.
+When the time of the last press or repeat is over, `acsard drive` sends three zero commands and then
+nothing.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ It must be longer than a keyboard's delay before the first repeat (0.25 to 0.5 s
 """
 
 REPEAT_S, REPEATS = 0.25, 3
-"""Time that each repeat of a held key drives, s, and repeats after which a key counts as held.
+"""Time for which each repeat of a held key drives the robot, s (`REPEAT_S`), and number of repeats
+after which a key counts as held (`REPEATS`).
 
 The repeats must be less than `REPEAT_S` apart. Keyboards repeat a key 10 to 30 times a second.
 """
@@ -30,8 +32,8 @@ The repeats must be less than `REPEAT_S` apart. Keyboards repeat a key 10 to 30 
 BURST = 8
 """Largest number of keys that count if they arrive together.
 
-More keys were delayed, usually by an SSH connection that stalled. The operator may have released
-the key long ago.
+If more keys arrive together, they were delayed, usually by an SSH connection that stalled. The
+operator may have released the key long ago.
 """
 
 BURST_S = 0.2
@@ -64,7 +66,7 @@ class Keyboard:
         self._zeros = ZEROS
 
     def take(self, text: str, now: float) -> None:
-        """Process one read from the terminal at `now` (monotonic clock, s).
+        """Process the keys of one read from the terminal at `now` (monotonic clock, s).
 
         A burst of keys stops the robot, because old keys do not show what the operator wants now.
         """

@@ -1,7 +1,7 @@
 """Builds the parts of the screen of `acsard top` for a narrow terminal. This module is pure.
 
-The figures are those of `wide_screen.py`. The figures since the start of the daemon come last, so a
-screen with few lines cuts them off first.
+The screen shows the same values as that of `wide_screen.py`. The values that count from the start
+of the daemon come last, so a screen with few lines cuts these off first.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from acsard.top.wide_screen import (
 )
 
 BELOW = 80
-"""Width of the terminal, in character cells, from which the wide layout is used."""
+"""Width of the terminal, in character cells, below which the narrow layout is used."""
 
 BAR = 4
 
@@ -80,7 +80,7 @@ def sources(state: RobotState, room: int, width: int) -> list[Text]:
 
 
 def link(seen: ScreenData, state: RobotState, width: int) -> list[Text]:
-    """Return the lines about the serial link and the commands, and about everything rejected."""
+    """Return the lines about the serial link and the commands, and about rejected inputs."""
     before = seen.before or state
     lines = [rule(width, [(0, title(seen, state))])]
     if state.certificate_expiry:
@@ -122,7 +122,10 @@ def timing(state: RobotState, width: int) -> list[Text]:
 
 
 def folded(text: str, width: int, inset: int) -> list[Text]:
-    """Wrap a sentence. Lines are indented by `inset` cells, but not a first line with a label."""
+    """Wrap a sentence, with lines indented by `inset` cells.
+
+    If the sentence begins with a label such as "gyro", its first line is not indented.
+    """
     first = "" if text.startswith(("gyro ", "track ", "board ", "last one ")) else " " * inset
     wide = max((cell_len(one) for one in text), default=1)  # a character may be two cells wide
     room, rest = max(inset + 1, width // max(1, wide)), " " * inset

@@ -21,7 +21,8 @@ ROOM = (32, 8, 6, 7, 7, 22, 21, 6)
 """Maximum widths, in characters, of all columns except the last, which gets the remaining width."""
 
 NAME, WHY = 12, 32
-"""Minimum widths of ROBOT and WHY, characters. ROBOT shrinks first to make room for WHY."""
+"""Minimum widths of the columns ROBOT and WHY, characters. ROBOT shrinks first to make room for
+WHY."""
 
 BATTERY = HEADS.index("BATTERY")
 """Column of the state of charge. The table shows it only if a robot reports a battery."""
@@ -29,7 +30,7 @@ BATTERY = HEADS.index("BATTERY")
 URGENT = ("fault", "stopped", "GONE", "SILENT")
 """Modes and kinds of absence that need attention. The table lists robots in this order.
 
-Robots with a warning come next.
+Other robots follow, first those with a warning.
 """
 
 
@@ -103,7 +104,10 @@ def told(row: Row) -> tuple[str, ...]:
 
 
 def _why(state: RobotState) -> str:
-    """Return brief warnings, the reason of the mode, and details. An urgent reason comes first."""
+    """Return brief warnings, the reason of the mode, and details.
+
+    If the mode is one of `URGENT`, its reason comes first.
+    """
     why = reason(state)
     found, parts = [one for one in warnings(state) if one.brief not in why], [why]
     if found:
@@ -174,16 +178,16 @@ class Roster(Fleet):
 
     @property
     def more(self) -> str:
-        """A sentence which says that some robots are left out, or "" if none is."""
+        """A sentence which says that some robots are left out, or "" if no robot is left out."""
         if not self.left_out:
             return ""
         return (
-            f"there are more than {self._most} robots, and the others are left out: name yours "
-            "with --id robot1,robot2"
+            f"there are more than {self._most} robots, and this list leaves out the others: name "
+            "the robots to list with --id robot1,robot2"
         )
 
     def hint(self) -> str:
         """Return a sentence that explains why there are no robots to show."""
         if ALL in self._ids:
             return nobody(self._robot.where.endpoint)
-        return "none of these robots is present: correct --id, or start their daemons"
+        return "no robot that you named with --id is present: correct --id, or start their daemons"

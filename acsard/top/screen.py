@@ -1,7 +1,8 @@
-"""One screen of `acsard top`: turns a robot's state into lines of coloured text.
+"""Builds one screen of `acsard top` from a robot's state, as lines of coloured text.
 
-This module is pure. Lines are cut to the size of the terminal, so no message can break the layout.
-If space is short, the screen first leaves out empty lines, and then command sources.
+This module is pure. Lines are cut to the width of the terminal, so no message can break the layout.
+If the terminal has too few lines, the screen leaves out the empty lines first, and then command
+sources.
 """
 
 from __future__ import annotations
@@ -24,7 +25,11 @@ MOST_SOURCES = 32
 
 
 def screen(seen: ScreenData, width: int, height: int | None = None) -> Group:
-    """Return the screen as at most `height` lines (None: no limit) of at most `width` cells."""
+    """Return the screen in at most `height` lines, or in any number if `height` is None.
+
+    A line has at most `width` character cells. A `width` below 20 counts as 20, and a `width` above
+    `WIDEST` counts as `WIDEST`.
+    """
     width = max(20, min(WIDEST, width))
     head = [_header(seen, width), *(_no_news(seen, width) if seen.silent else _mode(seen, width))]
     if seen.state is not None:
@@ -56,7 +61,7 @@ def screen(seen: ScreenData, width: int, height: int | None = None) -> Group:
 
 
 def _unmeasured(state: RobotState) -> RobotState:
-    """Return the state without speeds, which are outdated because the link is not up."""
+    """Return the state without speeds, which are outdated while the link to the board is not up."""
     return replace(state, linear=math.nan, angular=math.nan, wheels=[])
 
 
@@ -71,13 +76,14 @@ def _header(seen: ScreenData, width: int) -> Text:
 
 
 def _mode(seen: ScreenData, width: int) -> list[Text]:
-    """Return the mode as a badge with the reason next to it.
+    """Return the robot's mode as a coloured label, with its reason next to it or below it.
 
-    A wide screen always uses two lines, so that a long reason does not move the lines below.
+    A wide screen shows mode and reason on two lines even if one suffices, so that the lines below
+    do not move when the reason becomes long.
     """
     state = seen.state
     if state is None:
-        return [Text("waiting for the first state", "yellow")]
+        return [Text("waiting for the first state message of the daemon", "yellow")]
     badge = Text(f" {clean(state.mode).upper()[:12]} ", MODES.get(state.mode, "reverse"))
     words = clean(state.reason.removeprefix(f"{state.mode}: "))
     first, second = _split(words, width - badge.cell_len - 2)
@@ -88,9 +94,9 @@ def _mode(seen: ScreenData, width: int) -> list[Text]:
 
 
 def _warnings(state: RobotState, width: int) -> list[Text]:
-    """Return the lines with the warnings, one line on a wide screen; [] without a warning.
+    """Return the robot's warnings as text (one line on a wide screen), or [] if there is none.
 
-    A single warning is shown with its details.
+    A single warning is shown with its details. Several warnings are shown by name only.
     """
     found = warnings(state)
     words = clean(f"{WARNING}: {found[0]}" if len(found) == 1 else brief(found))
@@ -102,7 +108,7 @@ def _warnings(state: RobotState, width: int) -> list[Text]:
 
 
 def _split(words: str, room: int) -> tuple[str, str]:
-    """Split a text, between words if possible, after at most `room` characters."""
+    """Split a text into at most `room` characters and the rest, between two words if possible."""
     if len(words) <= room:
         return words, ""
     at = words.rfind(" ", 0, room + 1)

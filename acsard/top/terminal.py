@@ -1,6 +1,7 @@
-"""Shows the screens of `acsard top`, `fleet` and `drive`. A key or a signal ends a screen.
+"""Shows the screens of the commands `acsard top`, `acsard fleet` and `acsard drive`.
 
-If the terminal cannot show a screen, `drive` prints lines instead.
+A signal or the end of the input ends every screen. The letter `q` ends those of `top` and `fleet`.
+If the terminal cannot show a screen, `acsard drive` prints lines instead.
 """
 
 from __future__ import annotations
@@ -34,10 +35,11 @@ PERIOD_S = 0.25
 """Interval at which a screen is drawn, s."""
 
 KEYS_S = 0.05
-"""Interval at which the keys of a drive are read, s."""
+"""Longest time between two reads of the keyboard in `acsard drive`, s."""
 
 NEWS_S, SAME_S, QUIET_S = 0.5, 1.0, 10.0
-"""Shortest times between two reports in lines, s: after a change, while moving, and otherwise."""
+"""Shortest time between two printed reports of `acsard drive`, s. `NEWS_S`: if the content has
+changed. `SAME_S`: if it has not changed and the robot moves. `QUIET_S`: otherwise."""
 
 NO_END = 10**9
 
@@ -54,7 +56,7 @@ def once(feed: Feed) -> str:
 
 
 def live(feed: Feed) -> None:
-    """Show the screen and update it until `q` is typed, the input ends or a signal arrives."""
+    """Show the screen of `acsard top` until `q` is typed, the input ends or a signal arrives."""
     # A failed query does not matter, because the screen says that it waits for a state.
     with suppress(AcsardError):
         feed.ask()
@@ -68,7 +70,10 @@ def live(feed: Feed) -> None:
 
 
 def drive(ride: Ride) -> None:
-    """Drive with the typed keys, and show the robot, until the input ends or a signal arrives."""
+    """Drive the robot with the typed keys, and show its state.
+
+    This ends when the input ends or a signal arrives.
+    """
     if has_screen():
         console = Console()
         _hold(lambda suspend: _steer(ride, console, suspend))
@@ -77,9 +82,9 @@ def drive(ride: Ride) -> None:
 
 
 def part(ride: Ride) -> None:
-    """Wait until the robot has stopped, at most 2 s, and print a last report on a terminal.
+    """On a terminal, print a last report when the robot has stopped, or after 2 s at the latest.
 
-    Without the wait, this report would say that the robot still drives.
+    Without the wait, the report would say that the robot still moves.
     """
     left = time.monotonic()
     while os.isatty(0) and os.isatty(1):
@@ -94,7 +99,7 @@ def part(ride: Ride) -> None:
 
 
 def roster(fleet: Roster) -> None:
-    """Show a line for each robot until `q` is typed, the input ends or a signal arrives."""
+    """Show a table of robots until `q` is typed, the input ends or a signal arrives."""
     console = Console()
 
     def draw() -> RenderableType:
@@ -135,10 +140,11 @@ def _screen(console: Console) -> Live:
 
 
 def _hold(shows: Callable[[list[bool]], bool]) -> None:
-    """Show a screen until a signal arrives or `shows` returns False.
+    """Show a screen by calling `shows` until a signal arrives or `shows` returns False.
 
-    `shows` gets a list that becomes non-empty when the user presses Ctrl-Z. Then `shows` must leave
-    the screen and return True, and this function calls it again after `fg`.
+    The argument of `shows` is a list that becomes non-empty when the user presses Ctrl-Z. Then
+    `shows` must close the screen and return True. This function suspends the program, and calls
+    `shows` again when the user resumes the program with `fg`.
     """
     _be_lenient()
     suspend: list[bool] = []
@@ -150,7 +156,10 @@ def _hold(shows: Callable[[list[bool]], bool]) -> None:
 
 
 def _steer(ride: Ride, console: Console, suspend: list[bool]) -> bool:
-    """Drive and show the screen. Return True on Ctrl-Z, and False when the input ends."""
+    """Drive the robot with the typed keys, and show its state on the screen.
+
+    Return True on Ctrl-Z, and False when the input ends.
+    """
     with keys() as read, _screen(console) as shown:
         due = 0.0
         while not suspend:
@@ -167,16 +176,16 @@ def _steer(ride: Ride, console: Console, suspend: list[bool]) -> bool:
 
 
 def _be_lenient() -> None:
-    """Replace characters that the terminal's encoding lacks, instead of failing."""
+    """Make the output replace characters that its encoding lacks, instead of raising an error."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")
 
 
 @contextmanager
 def until_told() -> Iterator[None]:
-    """End the block at the first terminating signal, or when the terminal closes.
+    """End the `with` block at the first signal in `LEAVES`, or when the terminal closes.
 
-    Later signals are ignored during the cleanup: a terminal that closes under a shell sends two.
+    Further signals are ignored, because a terminal that closes under a shell causes two signals.
     """
 
     def deaf() -> None:
@@ -204,9 +213,10 @@ def until_told() -> Iterator[None]:
 
 @contextmanager
 def keys() -> Iterator[Callable[[float], str | None]]:
-    """Yield a function that waits for keys for a number of seconds, and returns them or "".
+    """Yield a function that waits at most a number of seconds for keyboard input, and returns it.
 
-    It returns None when the input has ended, and always "" if the input is not a terminal.
+    The function returns "" if nothing was typed in this time, and None when the input has ended. If
+    the input is not a terminal, the function always waits and returns "".
     """
 
     def read(seconds: float) -> str | None:
@@ -230,7 +240,10 @@ def keys() -> Iterator[Callable[[float], str | None]]:
 
 
 def _drive_in_lines(ride: Ride) -> None:
-    """Drive until the input ends or a signal arrives; print a report when one is due."""
+    """Drive the robot with the typed keys, and print reports about the robot.
+
+    This ends when the input ends or a signal arrives.
+    """
     due, page = News(), Page()
     with until_told(), keys() as read:
         while (typed := read(KEYS_S)) is not None:
@@ -242,20 +255,26 @@ def _drive_in_lines(ride: Ride) -> None:
 
 
 def output_size() -> os.terminal_size:
-    """Return the size of the terminal. A file or a pipe is unlimited."""
+    """Return the size of the terminal that shows the output.
+
+    For an output to a file or a pipe, the size is practically unlimited.
+    """
     unlimited = os.terminal_size((NO_END, NO_END))
     return shutil.get_terminal_size() if sys.stdout.isatty() else unlimited
 
 
 class News:
-    """Decides when a report of a drive is due on a terminal that cannot show a screen."""
+    """Decides when `acsard drive` prints a report on a terminal that cannot show a screen."""
 
     def __init__(self) -> None:
         self._shown: tuple[object, ...] = ()
         self._at = -QUIET_S
 
     def tell(self, seen: Teleop, now: float) -> bool:
-        """Return whether a report is due at `now`, s; if it is, remember it as printed."""
+        """Return whether the caller must print a report now. If so, count the report as printed.
+
+        `now` is the time on a monotonic clock, s.
+        """
         state = seen.state
         words = ("", "") if state is None else (state.mode, state.reason)
         what = (*words, seen.objection, seen.linear, seen.angular, seen.silent)
@@ -268,14 +287,18 @@ class News:
 
 
 class Page:
-    """Repeats the help about the keys whenever reports would scroll it out of sight."""
+    """Repeats the help about the keyboard between the reports, before it scrolls out of sight."""
 
     def __init__(self) -> None:
         self._shown = NO_END
-        """Number of lines printed since the last help, including it; `NO_END` before the first."""
+        """Number of lines printed since the last help, including those of the help; `NO_END` before
+        the first help."""
 
     def with_help(self, told: list[str], height: int) -> list[str]:
-        """Return the lines `told`, after the help if `height` lines would no longer show it."""
+        """Return the lines `told`, after the help if the last help would scroll out of sight.
+
+        `height` is the number of lines of the terminal.
+        """
         self._shown += len(told)
         if self._shown < height:
             return told

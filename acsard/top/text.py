@@ -29,24 +29,27 @@ MODES = {
 
 
 class ScreenData(Struct, frozen=True):
-    """Everything that the screen shows. Rates are computed from the earlier state `before`."""
+    """The data that the screen of `acsard top` shows.
+
+    Rates are computed from the counters in `state` and in the earlier state `before`.
+    """
 
     robot_id: str
     endpoint: str
     state: RobotState | None
     before: RobotState | None = None
     age: float = 0.0
-    """Seconds since `state` arrived, or since the wait for the first one began."""
+    """Seconds since `state` arrived, or since the wait for the first state began."""
     info: Info | None = None
     undecodable: int = 0
-    """Number of consecutive messages on the state's key that could not be decoded."""
+    """Number of consecutive messages with a state of the robot that could not be decoded."""
     hint: str = ""
     silent: bool = False
-    """True if the robot is silent, so the shown data is old."""
+    """True if no state has arrived for too long, so the shown data is old."""
     passed: float = 0.0
     """Seconds between the arrivals of `before` and `state`, on the local clock.
 
-    If the stamps of the two states disagree with this time, the robot's clock was set.
+    If the stamps of these states are a different time apart, the robot's clock was adjusted.
     """
 
 
@@ -54,20 +57,23 @@ _EIGHTHS = " ▏▎▍▌▋▊▉█"
 
 
 def clean(text: str) -> str:
-    """Return the text with control, invisible and zero-width characters replaced."""
+    """Return the text with control, invisible and zero-width characters replaced by visible ones.
+
+    The text is cut after 256 characters.
+    """
     # No screen shows more than 256 characters of a text.
     return "".join(c if cell_len(c) else "\ufffd" for c in printable(text[:256]))
 
 
 def count(number: int) -> str:
-    """Format an integer with thousands separators."""
+    """Format an integer with thousands separators, or with an exponent from 10^10 on."""
     if abs(number) < 10**10:
         return f"{number:,}"
     return f"{float(max(-(10**300), min(10**300, number))):.1e}"
 
 
 def rate(later: int, earlier: int, seconds: float) -> str:
-    """Format the rate of a counter in 7 characters, or "-/s" if it is unknown."""
+    """Return the increase of a counter per second in 7 characters, or "-/s" if it is unknown."""
     # After a clock change or a restart of the daemon, a wrong rate must not be shown.
     if not 0.05 <= seconds <= 60.0 or not 0 <= later - earlier < 10**6:
         return "-/s".rjust(7)
@@ -76,7 +82,7 @@ def rate(later: int, earlier: int, seconds: float) -> str:
 
 
 def bar(value: float, scale: float, cells: int) -> str:
-    """Return a bar for the magnitude of `value`: at most `cells` characters, full at `scale`."""
+    """Return a bar for the magnitude of `value`. It has `cells` characters at `scale` or more."""
     if not math.isfinite(value):
         return ""
     eighths = round(min(1.0, abs(value) / scale) * cells * 8)
@@ -91,7 +97,10 @@ def row(label: str, told: str, style: str = "") -> Text:
 
 
 def ends(left: Text, right: Text, width: int) -> Text:
-    """Join a text at the left end of a line and a text at the right end."""
+    """Return a line of `width` cells with one text at its left end and another at its right end.
+
+    If both do not fit, the left text is cut.
+    """
     left.truncate(max(0, width - right.cell_len - 2), overflow="ellipsis")
     return left.append(" " * (width - left.cell_len - right.cell_len)).append_text(right)
 
@@ -107,7 +116,10 @@ def rule(width: int, titles: Sequence[tuple[int, str | Text]]) -> Text:
 
 
 def flow(parts: Sequence[Text], width: int, inset: int = 0) -> list[Text]:
-    """Put as many parts in a line as fit. Lines after the first begin with `inset` blanks."""
+    """Arrange the parts in lines of at most `width` cells, with as many parts in a line as fit.
+
+    Lines after the first begin with `inset` blanks.
+    """
     lines: list[Text] = []
     for part in parts:
         if lines and lines[-1].cell_len + 2 + part.cell_len <= width:

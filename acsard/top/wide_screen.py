@@ -1,4 +1,7 @@
-"""Builds the screen of `acsard top` below the robot's mode, for a wide terminal. Pure."""
+"""Builds the lines of `acsard top` that follow the robot's mode, for a wide terminal.
+
+This module is pure.
+"""
 
 from __future__ import annotations
 
@@ -26,15 +29,24 @@ MOST_REASONS, MOST_PORT = 16, 34
 LINKS = {"up": "green", "booting": "yellow"}
 
 FIGURES = {
-    "period_lateness": ("period due → step", "from the due time (first missed one) to the step"),
+    "period_lateness": (
+        "period due → step",
+        "from when a step (or a missed one) was due to its start",
+    ),
     "step_time": ("work of one step", "from the start of a step to the end of its work"),
     "command_age": ("arrival → each line", "from a command's arrival to each line that follows it"),
-    "command_to_wire": ("arrival → first line", "from a command to the first line it causes"),
+    "command_to_wire": (
+        "arrival → first line",
+        "from a command's arrival to the first line it causes",
+    ),
     "feedback_to_bus": (
         "line read → published",
         "from reading a line to publishing its messages",
     ),
-    "mcu_round_trip": ("line out → answer in", "from a line to its answer; checked link"),
+    "mcu_round_trip": (
+        "line out → answer in",
+        "from a line to its answer (only on a checked link)",
+    ),
 }
 """Short and long explanation of each latency. `a → b` means the time from event a to event b."""
 
@@ -58,14 +70,17 @@ def motion(state: RobotState, width: int) -> list[Text]:
 
 
 def speeds(state: RobotState) -> tuple[tuple[float, ...], float]:
-    """Return the four wheel speeds (NaN if unknown) and the speed at which a bar is full, rad/s."""
+    """Return the four wheel speeds (NaN if unknown) and the speed that fills a bar, in rad/s."""
     wheels = (*state.wheels[:4], *[math.nan] * (4 - len(state.wheels)))
     top = max((abs(speed) for speed in wheels if math.isfinite(speed)), default=0.0)
     return wheels, next((s for s in (20.0, 40.0, 80.0) if top <= s), 100.0)
 
 
 def wheel(speed: float, scale: float, cells: int) -> Text:
-    """Return the direction, the speed (rad/s) and a bar of `cells` cells, full at `scale` rad/s."""
+    """Return a wheel's direction of rotation as a symbol, its speed in rad/s, and a bar.
+
+    The bar has `cells` cells if the speed is `scale` rad/s or more.
+    """
     if speed == 0.0 or not math.isfinite(speed):
         sign, style = "·", "dim"
     else:
@@ -77,7 +92,10 @@ def wheel(speed: float, scale: float, cells: int) -> Text:
 
 
 def sources(state: RobotState, room: int, width: int) -> list[Text]:
-    """Return a heading and at most `room` lines, one per source. The last line names the rest."""
+    """Return a heading, and at most `room` lines with one command source each.
+
+    If there are more sources than lines, the last line names all remaining sources.
+    """
     room_name = 13 + max(0, width - 80) // 2
     start = room_name + 3
     at = ((0, "sources"), (start, "priority"), (start + 10, "seen"), (start + 17, "waits for"))
@@ -90,7 +108,7 @@ def sources(state: RobotState, room: int, width: int) -> list[Text]:
 
 
 def hidden(left: Sequence[SourceState]) -> str:
-    """Return a line that counts and names the sources that do not fit on the screen."""
+    """Return a line that counts and names the command sources that do not fit on the screen."""
     names = ", ".join(clean(source.name) for source in left[:MOST_REASONS])
     return f"  and {count(len(left))} more: {names}"
 
@@ -100,7 +118,10 @@ def drives(source: SourceState, state: RobotState) -> bool:
 
 
 def waits(source: SourceState, state: RobotState) -> str:
-    """Return in words what a source waits for, which may be nothing."""
+    """Return in words what a command source waits for before the robot follows it.
+
+    A source may also wait for nothing.
+    """
     if source.waits_for:
         return clean(source.waits_for)
     if drives(source, state):
@@ -119,7 +140,10 @@ def _source(source: SourceState, state: RobotState, room: int) -> Text:
 
 
 def link(seen: ScreenData, state: RobotState, width: int) -> list[Text]:
-    """Return the part about the serial link, commands, gyro, track, board and rejected input."""
+    """Return the lines about the serial link, the commands and the rejected input.
+
+    If they exist, also return lines about the gyro, the effective track and the board's inputs.
+    """
     before = seen.before or state
     head = title(seen, state)
     titles: list[tuple[int, str | Text]] = [(0, head)]
@@ -150,7 +174,7 @@ def link(seen: ScreenData, state: RobotState, width: int) -> list[Text]:
 
 
 def title(seen: ScreenData, state: RobotState) -> Text:
-    """Return the heading of the link's part of the screen: the state of the link and its port."""
+    """Return the heading of the lines about the serial link: the link's state and its port."""
     told = Text.assemble("link ", (clean(state.link), f"bold {LINKS.get(state.link, 'red')}"))
     if seen.info is not None:
         sim = seen.info.simulated
@@ -164,7 +188,7 @@ def certificate(state: RobotState) -> Text:
 
 
 def rates(seen: ScreenData, state: RobotState, before: RobotState) -> Callable[[str], str]:
-    """Return a function that formats the rate and the total of the counter with a given name."""
+    """Return a function that takes a counter's name and returns its rate and total as text."""
     # The stamps of the states give the exact time between them. If that time differs from the local
     # one by more than a network's delay, the robot's clock was set, so use the local time.
     seconds = (state.stamp.to_ns() - before.stamp.to_ns()) / NS_PER_S
@@ -179,7 +203,7 @@ def rates(seen: ScreenData, state: RobotState, before: RobotState) -> Callable[[
 
 
 def board(state: RobotState) -> str:
-    """Return the inputs that the board reports, in words; "" if it reports none."""
+    """Return the reported emergency stop, bumpers and battery in words; "" if none is reported."""
     told = [f"emergency stop {clean(state.emergency_stop)}"] if state.emergency_stop else []
     if state.bumpers is not None:
         told.append(f"bumpers {''.join('X' if one else '.' for one in state.bumpers)}")
@@ -189,7 +213,10 @@ def board(state: RobotState) -> str:
 
 
 def overrun(state: RobotState) -> Text:
-    """Return the number of samples that the bus dropped, or an empty text if it dropped none."""
+    """Return the number of messages on the bus that the daemon dropped because too many arrived.
+
+    Return an empty text if the daemon dropped none.
+    """
     lost = state.counters.get("bus_overrun", 0)
     return Text(f"bus overrun {count(lost)}" if lost else "", "yellow")
 
@@ -206,7 +233,10 @@ def _port(info: Info) -> str:
 
 
 def missed(state: RobotState, before: RobotState) -> Text:
-    """Return the number of missed periods, in yellow if it is larger than in `before`."""
+    """Return the number of control periods that the daemon missed.
+
+    The text is yellow if the number is larger than in the earlier state `before`.
+    """
     missed = state.counters.get("missed_periods", 0)
     grows = missed > before.counters.get("missed_periods", 0)
     return Text(f"missed periods {count(missed)}", "yellow" if grows else "")
@@ -223,7 +253,10 @@ def _refusals(state: RobotState, before: RobotState) -> list[Text]:
 
 
 def refused(state: RobotState, before: RobotState) -> list[tuple[str, list[Text]]]:
-    """Return rejections by kind and reason. A number that has grown since `before` is yellow."""
+    """Return the numbers of rejected lines, commands and gyro messages, by kind and by reason.
+
+    A number is yellow if it is larger than in the earlier state `before`.
+    """
     kinds = []
     for kind, prefix in (("lines", "line_"), ("commands", "command_"), ("gyro", "imu_")):
         found = [(n, c) for n, c in state.counters.items() if n.startswith(prefix) and c]

@@ -1,1 +1,1 @@
-"""`acsard web`: a process that serves the robot's web page, and is a client of the bus."""
+"""`acsard web`: a process that serves the robot's web page. It is a client of the Zenoh bus."""

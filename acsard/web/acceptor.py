@@ -2,9 +2,10 @@
 
 A connection goes through these states:
 
-1. silent: it costs only a file descriptor and a place in `Sockets`, because TLS starts with the
-   first byte;
-2. waiting for its TLS handshake, if too many are running or its network has begun too many;
+1. silent: no byte has arrived yet. The connection costs only a file descriptor and a place in
+   `Sockets`, because TLS starts with the first byte;
+2. waiting for its TLS handshake, if too many handshakes are running or the client's network has
+   begun too many;
 3. starting: in the TLS handshake;
 4. open: aiohttp reads its requests.
 """
@@ -37,11 +38,12 @@ HANDSHAKE_S, HANDSHAKES_AT_ONCE = 3.0, 32
 """Time limit for a TLS handshake, s; maximum number of handshakes at once."""
 
 HURRIED_S = 0.3
-"""Age, s, from which a TLS handshake may be cut if `HANDSHAKES_AT_ONCE` run and others wait.
-Otherwise, clients that fall silent in their handshakes would delay a phone by `HANDSHAKE_S`."""
+"""Age, s, from which a TLS handshake may be cut off if `HANDSHAKES_AT_ONCE` handshakes run and
+others wait. Without this rule, clients that fall silent in their handshakes would delay a phone by
+`HANDSHAKE_S`."""
 
 REQUEST_S = 10.0
-"""Time limit, s, from accepting a connection to the head of its first request."""
+"""Time limit, s, from accepting a connection to the end of the headers of its first request."""
 
 UNREAD_S = 5.0
 """Time, s, after which the kernel ends a connection whose client acknowledges no data or keeps its
@@ -57,9 +59,10 @@ Factory = Callable[[], "Reader"]
 
 
 class Acceptor:
-    """Accepts TCP connections at the listening addresses, and closes those beyond a limit.
+    """Accepts TCP connections at the listening addresses, and closes the connections over a limit.
 
-    The robot itself has its own limit, so network clients cannot lock out a browser on it.
+    Connections from the robot itself have a separate limit, so clients on other machines cannot
+    lock out a browser on the robot.
     """
 
     def __init__(self, counts: Counts) -> None:
@@ -69,14 +72,16 @@ class Acceptor:
         self._away = Sockets["_Connection"](sockets_for(files))
         self._listeners: list[socket.socket] = []
         self._waiting: dict[str, dict[_Connection, None]] = {}
-        """Connections that wait for their handshake, by network. The one served last is last."""
+        """Connections that wait for their TLS handshake, by network. When a handshake of a network
+        starts, the network moves to the end."""
         self._handshakes = Buckets(HANDSHAKES)
         self._starting: dict[_Connection, float] = {}
         """Start time of each running TLS handshake, s on the event loop's clock; oldest first."""
         self._again: asyncio.TimerHandle | None = None
         """Timer of the next call of `_next`, or None if no call is scheduled."""
         self._ended: set[_Connection] = set()
-        """The connections whose token was no longer valid at the last call of `tidy`."""
+        """The connections whose token was not in the `valid` tokens at the last call of
+        `tidy()`."""
 
     def listen(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
         """Accept connections at the listening socket `opened`; `secure` is None for plain HTTP."""
@@ -88,7 +93,7 @@ class Acceptor:
         self._resume(opened, secure, make)
 
     def close(self) -> None:
-        """Stop accepting connections, and cut the open ones whose client is not identified."""
+        """Stop accepting connections, and cut those whose client has not been identified."""
         loop = asyncio.get_running_loop()
         for opened in self._listeners:
             loop.remove_reader(opened)
@@ -99,19 +104,23 @@ class Acceptor:
                 one.cut()
 
     def spoke(self, transport: asyncio.BaseTransport | None, body: StreamReader) -> None:
-        """Record that a request has begun, so the limit `REQUEST_S` no longer applies."""
+        """Record that the headers of a request have arrived, so the limit `REQUEST_S` ends."""
         if (one := _connection(transport)) is not None:
             one.spoke(body)
 
     def admitted(self, transport: asyncio.BaseTransport | None, who: Who) -> None:
-        """Record the client's identity. Connections without one are the first to be closed."""
+        """Record the identity of the client of a connection.
+
+        If connections must be closed to make room, those without an identity are closed first.
+        """
         if (one := _connection(transport)) is not None:
             one.pool.prove(one, who.token)
 
     def tidy(self, valid: Collection[str]) -> None:
-        """Cut the connections whose token was missing in `valid` at two calls in a row.
+        """Cut the connections whose token is not in `valid`, now and at the previous call.
 
-        Call this once a second. The delay lets a WebSocket client receive the reason first.
+        Call this once a second. The delay of one call lets a WebSocket client receive the reason
+        first.
         """
         before = self._ended
         self._ended = {one for pool in (self._here, self._away) for one in pool.ended(valid)}
@@ -140,7 +149,10 @@ class Acceptor:
             _Connection(self, pool, accepted, peer, secure, make).enter()
 
     def _no_file(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
-        """Close a connection to free its file descriptor, and accept again after `PAUSE_S`."""
+        """Close an old connection because the process has no free file descriptor.
+
+        New connections are accepted again after `PAUSE_S`.
+        """
         loop = asyncio.get_running_loop()
         loop.remove_reader(opened)
         loop.call_later(PAUSE_S, self._resume, opened, secure, make)
@@ -150,7 +162,11 @@ class Acceptor:
     # The connections call the methods below.
 
     def crowded(self, one: _Connection) -> None:
-        """Cut a connection that has no place or sends too long a header, and count the refusal."""
+        """Cut a connection and count the refusal as `crowded`.
+
+        The reason is that there is no place for it, or that the headers of its request are too
+        long.
+        """
         self._counts.refuse("crowded", one.peer)
         one.cut()
 
@@ -173,13 +189,13 @@ class Acceptor:
             self._waiting.pop(one.network, None)
 
     def started(self, one: _Connection) -> None:
-        """Record that a TLS handshake has ended, and let the next one start."""
+        """Record that a connection's TLS handshake is over, and start a waiting one if possible."""
         self._starting.pop(one, None)
         if self._again is None:
             self._next()
 
     def _next(self) -> None:
-        """Start one waiting handshake if the limits allow it, and schedule the next call."""
+        """Start one waiting TLS handshake if the limits allow it, and schedule the next call."""
         loop, self._again = asyncio.get_running_loop(), None
         if not self._waiting:
             return
@@ -200,7 +216,10 @@ class Acceptor:
         self._again = loop.call_later(0.005, self._next)
 
     def _has_room(self, now: float) -> bool:
-        """Return whether a handshake may start. If too many run, cut one older than `HURRIED_S`."""
+        """Return whether a TLS handshake may start.
+
+        If too many run, cut a running one that is older than `HURRIED_S`, if there is one.
+        """
         if len(self._starting) < HANDSHAKES_AT_ONCE:
             return True
         # The most crowded network loses a handshake, so a slow client of another network keeps
@@ -218,7 +237,7 @@ class Acceptor:
 
 
 class _Connection(asyncio.Protocol):
-    """One TCP connection. Once it is open, it passes its data to a `Reader`."""
+    """One TCP connection. Once it is open, this object passes received data to a `Reader`."""
 
     def __init__(
         self,
@@ -241,7 +260,10 @@ class _Connection(asyncio.Protocol):
         self._inner: Reader | None = None
 
     def enter(self) -> None:
-        """Acquire a place and wait for the first byte. Cut the connection if it gets no place."""
+        """Acquire a place in `Sockets`, and wait for the client's first byte.
+
+        Cut the connection if there is no place for it.
+        """
         gone = self.pool.enter(self.network, self)
         if gone is self:
             self._acceptor.crowded(self)
@@ -310,7 +332,7 @@ class _Connection(asyncio.Protocol):
                 self._socket.shutdown(socket.SHUT_RDWR)
 
     def spoke(self, body: StreamReader) -> None:
-        """Record that the head of a request has arrived, so the limits on its time and size end."""
+        """Record that the head of a request has arrived, so the limits on the head end."""
         self._head, self._body = 0, body
         self._cancel_timer()
 
@@ -369,16 +391,19 @@ def _connection(transport: asyncio.BaseTransport | None) -> _Connection | None:
 
 
 class Reader(RequestHandler):
-    """aiohttp's handler of one connection, with another answer to invalid requests."""
+    """aiohttp's handler of one connection, but it answers an invalid request with a JSON error."""
 
     def __init__(self, counts: Counts, server: Any) -> None:
-        """Create a handler for `server`, which is the server of the application's runner."""
+        """Create a handler. `server` is the attribute `server` of aiohttp's `AppRunner`."""
         super().__init__(server, loop=server._loop, **server._kwargs)
         self._counted = counts
 
     @property
     def reads_head(self) -> bool:
-        """Whether the next bytes are a request's head. False for a WebSocket or queued requests."""
+        """Whether the next received bytes belong to the head of a request.
+
+        False on a WebSocket, and while received requests wait for their turn.
+        """
         return not self._upgraded and not self._messages
 
     def handle_error(
@@ -388,7 +413,10 @@ class Reader(RequestHandler):
         exc: BaseException | None = None,
         message: str | None = None,
     ) -> web.StreamResponse:
-        """Answer bytes that are not an HTTP request. aiohttp alone would log a traceback."""
+        """Return the answer to bytes that are not an HTTP request.
+
+        Without this method, aiohttp would log a traceback.
+        """
         if status >= 500:
             return super().handle_error(request, status, exc, message)
         nameless = (message or "").startswith("Missing 'Host'")
@@ -398,7 +426,7 @@ class Reader(RequestHandler):
             status,
             "the request has no `Host` header, which must name the robot"
             if nameless
-            else "that is not an HTTP request",
+            else "the server received bytes that are not an HTTP request",
         )
         response.headers.update(HEADERS)
         response.force_close()

@@ -46,7 +46,8 @@ HOST = re.compile(r"([A-Za-z0-9.-]{1,253}|\[[0-9A-Fa-f:.]{2,45}\])(:[0-9]{1,5})?
 """Pattern of a valid `Host` header. It is strict, because the value is copied into an answer."""
 
 REASONS: dict[int, Reason] = {404: "path", 405: "path", 413: "too_big"}
-"""Reason under which an error of aiohttp is counted, by HTTP status; `malformed` for all others."""
+"""Maps the HTTP status of an error of aiohttp to the reason under which the error is counted. Any
+other status is counted as `malformed`."""
 
 WORDS = {
     404: "this address does not exist; GET /api lists all addresses",
@@ -54,13 +55,14 @@ WORDS = {
 }
 
 WHO: web.RequestKey[Who] = web.RequestKey("who", Who)
-"""Key of the client's identity in a request. It is missing if a path is open to every client."""
+"""Key under which a request object holds the client's identity. The identity is missing if the path
+is open to every client."""
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 READ_EVERY_S = 0.005
-"""Shortest interval between two reads of the token file, s. Each read starts a thread. A flood of
-requests with one thread each delayed a stop by 200 ms."""
+"""Shortest interval between two reads of the token file, s. Each read starts a thread. When each
+request of a flood started a thread, a stop was delayed by 200 ms."""
 
 
 class Lookups:
@@ -72,7 +74,10 @@ class Lookups:
         self._read_s = -READ_EVERY_S
 
     async def read(self) -> Sequence[Token]:
-        """Return the tokens from a read that starts after this call. Raises `TimeoutError`."""
+        """Return the robot's tokens, read from the file after this call.
+
+        Raises `TimeoutError` if the disk does not answer.
+        """
         if self._next is None:
             self._next = asyncio.create_task(self._later())
             self._next.add_done_callback(lambda done: done.cancelled() or done.exception())
@@ -87,7 +92,7 @@ class Lookups:
 
 
 class Admission:
-    """Finds the route of each HTTP request, and refuses the request or passes it to the handler."""
+    """Checks each HTTP request, and refuses it or passes it to the handler of its route."""
 
     def __init__(
         self,
@@ -98,7 +103,7 @@ class Admission:
         counts: Counts,
         rules: WebConfig,
     ) -> None:
-        """Store the rules. `names` are the robot's host names and addresses, in lower case."""
+        """Store the arguments. `names` are the robot's host names and addresses, in lower case."""
         self._local, self._origins = Who(rules.local, HERE), frozenset(rules.origins)
         self._robot, self._names, self._vault = robot, names, vault
         self._acceptor, self._counts = acceptor, counts
@@ -108,7 +113,10 @@ class Admission:
         self._rows: dict[web.AbstractRoute, Route] = {}
 
     def application(self, rows: Iterable[Route], page: object) -> web.Application:
-        """Return the application that serves the routes `rows`; each handler receives `page`."""
+        """Return the application that serves the routes `rows`.
+
+        Each route's handler gets `page` as its first argument.
+        """
         app = web.Application(middlewares=[self._serve], client_max_size=MAX_BYTES)
         app.on_response_prepare.append(secured)
         app.on_response_prepare.append(self._shared)
@@ -181,14 +189,17 @@ class Admission:
             return problem(error.status, WORDS.get(error.status, error.reason))
 
     async def _pace_stranger(self, request: web.Request) -> None:
-        """Delay a request without a valid token by `HOLD_S` if its network sends many of them."""
+        """Delay a request without a valid token by `HOLD_S` if it exceeds the rate `STRANGERS`.
+
+        The rate is for all such requests from the client's network.
+        """
         if not self._strangers.take(network_of(peer_of(request)), clock.mono_ns()):
             await asyncio.sleep(HOLD_S)
 
     async def _admit(self, request: web.Request, row: Route | None) -> bool:
-        """Store the client's identity in the request; return whether the client is too fast.
+        """Store the client's identity in the request; return whether it exceeds its rate limit.
 
-        Raises `RefusedError` if the client may not use the path. An unknown path has no `row`.
+        `row` is None for an unknown path. Raises `RefusedError` if the client may not use the path.
         """
         said = asked_of(request)
         here = place(said, self._names | {own_address(request)}) == "here"
@@ -215,7 +226,7 @@ class Admission:
         self._acceptor.admitted(request.transport, who)
         fast = self._too_fast(who, row)
         if fast and not (row and row.waits):
-            text = f"more than {REQUESTS.hz:g} requests a second: use /ws, which sends each change"
+            text = f"you sent more than {REQUESTS.hz:g} requests a second: use the WebSocket /ws"
             raise RefusedError("too_fast", text)
         if row is not None and row.least is not None:
             who.require(row.least, f"{row.method} {row.path}")
@@ -232,7 +243,7 @@ class Admission:
         return by_listed_page(asked_of(request), self._origins)
 
     def _preflight(self, request: web.Request) -> web.Response:
-        """Return the CORS answer that lets a page in `web.origins` send its request."""
+        """Return the answer to a CORS preflight, so a page in `web.origins` may send requests."""
         place(asked_of(request), self._names | {own_address(request)})
         return web.Response(
             status=204,
@@ -244,7 +255,7 @@ class Admission:
         )
 
     async def _shared(self, request: web.Request, response: web.StreamResponse) -> None:
-        """Add the CORS headers that let a page in `web.origins` read the answer."""
+        """Add the CORS headers with which a page in `web.origins` may read the answer."""
         if self._origins:
             vary = response.headers.get("Vary", "")
             response.headers["Vary"] = f"{vary}, Origin" if vary else "Origin"
@@ -275,7 +286,7 @@ def peer_of(request: web.Request) -> str:
 
 
 def own_address(request: web.Request) -> str:
-    """Return the address of this machine to which the client connected. It cannot be forged."""
+    """Return the address of this machine that the client connected to. A client cannot forge it."""
     return unmapped(_reached(request)[0].lower())
 
 
@@ -285,12 +296,12 @@ def own_port(request: web.Request) -> int:
 
 
 def tokens_shown(request: web.Request, robot: str) -> list[str]:
-    """Return the tokens in a request's headers, or else in its cookies for the robot's id."""
+    """Return the tokens from `tokens_sent()`, or else those in the cookies for the robot's id."""
     return tokens_sent(request) or tokens_in(request.cookies, robot, own_port(request))
 
 
 def tokens_sent(request: web.Request) -> list[str]:
-    """Return the token in `Authorization`, or else those that a WebSocket client offers."""
+    """Return the token in the header `Authorization`, or else those in `Sec-WebSocket-Protocol`."""
     kind, _, text = request.headers.get("Authorization", "").partition(" ")
     if kind.lower() == "bearer":
         return [text.strip()]

@@ -1,7 +1,7 @@
-"""The answers of the page's server: JSON, files, problems, and the headers of all of them.
+"""The HTTP answers of the page's server: JSON, files, problems, and the headers of all answers.
 
-`index.html` is sent with the script of the STOP button and the style sheet inside it, so STOP works
-even if another file is late or never arrives.
+The script of the STOP button and the style sheet are sent inside `index.html`, so STOP works even
+if another file is late or never arrives.
 """
 
 from __future__ import annotations
@@ -53,7 +53,8 @@ POLICY = (
     "form-action 'self'"
 )
 """Content security policy of every answer except a report. `{connect}` stands for the page's
-WebSocket URLs. It is empty in a refusal, so that a foreign `Host` is not sent back."""
+WebSocket URLs. In an error answer, these URLs are left out, so that a forged `Host` header is not
+copied into the answer."""
 
 
 class TroubleError(AcsardError):
@@ -65,7 +66,7 @@ class TroubleError(AcsardError):
 
 
 def reply(body: object, status: int = 200) -> web.Response:
-    """Return an answer in JSON."""
+    """Return an HTTP answer with `body` as JSON."""
     return web.Response(body=msgspec.json.encode(body), content_type=JSON, status=status)
 
 
@@ -74,7 +75,10 @@ def problem(status: int, text: str) -> web.Response:
 
 
 def sent(request: web.Request, file: File) -> web.Response:
-    """Return a file, compressed if the client accepts gzip, or a 304 if the client has it."""
+    """Return the answer that contains a file, compressed if the client accepts gzip.
+
+    If the client has the file already, return an answer with the status 304 instead.
+    """
     headers = {"ETag": file.tag, "Cache-Control": "no-cache", "Vary": "Accept-Encoding"}
     # A 304 has the policy too, because the browser then replaces the one stored with the file.
     headers["Content-Security-Policy"] = _policy(request, file.policy)
@@ -89,7 +93,10 @@ def sent(request: web.Request, file: File) -> web.Response:
 async def sent_in_pieces(
     request: web.Request, body: bytes, headers: Mapping[str, str], within: float
 ) -> web.StreamResponse:
-    """Send a large body without copying it; cut the connection if that takes over `within` s."""
+    """Send a large body without copying it.
+
+    If sending takes longer than `within` s, cut the connection.
+    """
     if request.method == "HEAD":
         return web.Response(body=body, headers=headers)
     answer = web.StreamResponse(headers=headers)
@@ -112,7 +119,10 @@ def takes_gzip(request: web.Request) -> bool:
 
 
 async def secured(request: web.Request, response: web.StreamResponse) -> None:
-    """Add the security headers to an answer. A file or a report keeps its own policy."""
+    """Add the security headers to an answer.
+
+    An answer that has a content security policy already, such as a file or a report, keeps it.
+    """
     response.headers.update(HEADERS)
     policy = _policy(request) if response.status < 400 else POLICY.format(connect="")
     response.headers.setdefault("Content-Security-Policy", policy)
@@ -144,9 +154,9 @@ INLINED = {
         "style.css": (b'<link rel="stylesheet" href="page/style.css">', "style"),
     }
 }
-"""Maps a file to the files that are sent inside it. Each inner file has two values: the element
-that would load it, and the name of the element that is sent instead, with the inner file as its
-text."""
+"""Maps a file to the files that are sent inside it. Each inner file has two values: the element of
+the outer file that would load the inner file, and the name of the element that replaces it and
+contains the inner file's text."""
 
 
 class File(Struct, frozen=True):
@@ -158,9 +168,11 @@ class File(Struct, frozen=True):
     """The gzip form of the body, or None if it is not shorter."""
     tag: str
     policy: str
-    """Directives of the content security policy that allow the files inside this one."""
+    """Directives of the content security policy that allow the files that are sent inside this
+    one."""
     stamp: tuple[tuple[int, int], ...]
-    """Modification time, ns, and size, bytes, of this file and of the files inside it."""
+    """Modification time, ns, and size, bytes: first of this file, then of each file that is sent
+    inside it."""
 
 
 class Files:
@@ -171,7 +183,10 @@ class Files:
         self._files: dict[str, File] = {}
 
     def get(self, name: str) -> File | None:
-        """Return the file, or None if it does not exist or the name is not a plain file name."""
+        """Return the file `name`, or None if it does not exist or may not be served.
+
+        A file may be served if its suffix is in `TYPES` and `name` contains no directory.
+        """
         kind = TYPES.get(Path(name).suffix)
         if kind is None or "/" in name or name.startswith("."):
             return None
@@ -190,7 +205,7 @@ class Files:
 
 
 def _read(paths: Sequence[Path], kind: str, stamp: tuple[tuple[int, int], ...]) -> File:
-    """Read the first of `paths`, and put the other files into it as `INLINED` says."""
+    """Read the file `paths[0]`, and put the other files into it as `INLINED` says."""
     whole, *parts = paths
     body, policy = whole.read_bytes(), ""
     for part in parts:

@@ -53,10 +53,10 @@ from acsard.web.tokens import Vault
 from acsard.web.viewer import HEARTBEAT_S, Parts, Viewer
 
 BODY_S = 5.0
-"""Time limit for the body of a request, s. A body has a few hundred bytes."""
+"""Time limit for receiving the body of a request, s. A usual body has a few hundred bytes."""
 
 DRAWN: dict[State, int] = {"drawing": 202, "busy": 202, "ready": 200, "failed": 503}
-"""HTTP status for each state of a report."""
+"""HTTP status of the answer for each state of the report of a recording."""
 
 DEFAULT = WebConfig()
 
@@ -76,7 +76,7 @@ class Caller(Struct, frozen=True):
 
     role: Role
     name: str
-    full: Annotated[str, Meta(description='reason to refuse another WebSocket, or ""')]
+    full: Annotated[str, Meta(description='why the caller may open no other WebSocket, or ""')]
 
 
 class Setting(Struct, frozen=True, omit_defaults=True):
@@ -109,22 +109,27 @@ class Page:
         self._seats, self._camera = Seats(), Camera(rules.camera)
         self._has_camera = bool(rules.camera)
         self._sent: dict[str, tuple[File, float]] = {}
-        """The page's files by name, each with the time of its last check, s on the loop's clock."""
+        """The page's files by name, each with the time at which the disk was last checked for a
+        change, s on the event loop's clock."""
         self._viewers: set[Viewer] = set()
         self._admission = Admission(parts.robots.id, names, vault, acceptor, parts.counts, rules)
         self.app = self._admission.application(ROUTES, self)
 
     def end_all(self, why: str) -> None:
-        """End the report, the camera and every WebSocket; send `why`, at most 120 characters."""
+        """Drop the report, close the camera, and end every WebSocket with the reason `why`.
+
+        `why` has at most 120 characters.
+        """
         self._reports.end()
         self._camera.close()
         for viewer in list(self._viewers):
             viewer.end(why)
 
     async def tidy(self) -> None:
-        """Close the connections whose token is not valid any more, and drop unwanted reports.
+        """Close the connections whose token is not valid any more, and drop an unwanted report.
 
-        Call this once a second. If the disk does not answer in time, no token counts as valid.
+        Call this once a second. If the disk does not answer in time, no token counts as valid. A
+        report is unwanted if no client has asked for it for some time.
         """
         self._reports.tidy()
         try:
@@ -167,7 +172,7 @@ class Page:
         """Check a posted token, and put the token into a cookie that no script can read."""
         form = await _token_posted(request)
         if not request.secure:
-            raise RefusedError("plain", "this robot uses no tokens: connect without one")
+            raise RefusedError("plain", "over plain http, no token is needed: connect without one")
         who = await self._admission.owner(peer_of(request), [form.token])
         cookie = cookie_name(self._robots.id, own_port(request))
         shown = "" if form.replace else request.cookies.get(cookie, "")
@@ -175,8 +180,8 @@ class Page:
         if present is not None and not who.may(present.role):
             raise TroubleError(
                 409,
-                f"this browser is {present.name} ({present.role}) already; the link would "
-                f"make it {who.name} ({who.role}), which has fewer permissions",
+                f"this browser is already signed in as {present.name} ({present.role}); the link "
+                f"would sign it in as {who.name} ({who.role}), with fewer permissions",
             )
         left_s = await in_thread(lambda: self._vault.left_s(who.token), READ_S)
         response = web.Response(status=303, headers={"Location": "/"})
@@ -192,7 +197,8 @@ class Page:
         if tokens_offered(offered) and PROTOCOL not in map(str.strip, offered.split(",")):
             # If aiohttp knew none of the offered names, it would log all of them with the token.
             raise RefusedError(
-                "malformed", f"offer the subprotocol {PROTOCOL} as well as the token"
+                "malformed",
+                f"the WebSocket must offer the subprotocol {PROTOCOL} besides the token",
             )
         if full := self._seats.enter(peer, who.token):
             raise RefusedError("too_many", full)
@@ -246,7 +252,10 @@ class Page:
         return reply(await self._parts.guide.choices(simulated=self._robots.about.simulated))
 
     async def service(self, request: web.Request) -> web.StreamResponse:
-        """Call a service with the fields of a JSON object as its arguments."""
+        """Call the robot's service that the path names.
+
+        The arguments of the service are the fields of the JSON object in the request's body.
+        """
         body = await _body_of(request)
         try:
             given = msgspec.json.decode(body, type=dict[str, Any]) if body.strip() else {}
@@ -255,8 +264,8 @@ class Page:
         robot = given.pop("robot", "")
         if not isinstance(robot, str):
             text = (
-                "robot must be the id of a robot, as text; for another robot, this page accepts "
-                "only stop"
+                "`robot` must be the id of a robot, as text; for robots other than its own, this "
+                "page accepts only the call stop"
             )
             raise RefusedError("malformed", text)
         verb = request.path.removeprefix("/api/srv/")
@@ -264,7 +273,10 @@ class Page:
         return reply(told, 200 if told.success else 409)
 
     async def picture(self, request: web.Request) -> web.StreamResponse:
-        """Wait for a camera picture that the client has not seen; answer 304 if none comes."""
+        """Wait for a camera picture that the client has not seen, and return it.
+
+        If none arrives in time, return an answer with the status 304.
+        """
         seen = request.headers.get("If-None-Match", "").strip('"')
         begun_ns = clock.mono_ns()
         number = int(seen) if seen.isdecimal() and len(seen) < 16 else 0
@@ -317,7 +329,9 @@ class Page:
         except NoAnswerError as error:
             raise TroubleError(504, str(error)) from None
         except (MendableError, DecodeError, TimeoutError) as error:
-            raise TroubleError(503, str(error) or "no answer in time: try again") from None
+            raise TroubleError(
+                503, str(error) or "the robot did not answer in time: try again"
+            ) from None
 
 
 def settings_in(config: Mapping[str, Any]) -> list[Setting]:
@@ -378,11 +392,11 @@ ROUTES: tuple[Route, ...] = (
     Route("POST", "/token", None, Page.token,
         "exchanges a token for a cookie that no script can read; only over HTTPS",
         takes=TokenForm, forms=(JSON, FORM),
-        gives={303: Body("The token is valid. `Location` is the page.", media=""),
-               409: Body("The browser's cookie has more permissions; `replace` overwrites it.",
+        gives={303: Body("The token is valid. The header `Location` leads to the page.", media=""),
+               409: Body("The browser has a cookie with more permissions; `replace` overwrites it.",
                          Problem)}),
     Route("GET", "/ws", "viewer", Page.socket,
-        "a WebSocket that carries JSON text both ways, to follow keys, to drive and to stop",
+        "a WebSocket that carries JSON text both ways, to follow Zenoh keys, to drive and to stop",
         gives={101: Body("It is open.", media="")}, rate=OPENINGS, waits=True),
     Route("GET", "/api", "viewer", Page.api, "this document", gives={200: Body("OpenAPI 3.1.")}),
     Route("GET", "/api/whoami", "viewer", Page.whoami, "the caller's role and name",
@@ -391,7 +405,7 @@ ROUTES: tuple[Route, ...] = (
         "the settings that srv/set accepts, with values, ranges, and when each may change",
         gives={200: Body("A list.", list[Setting])}),
     Route("GET", "/api/guide", Begin.least, Page.guide,
-        "the values that `begin` on the WebSocket accepts: methods of calibration, ports to check",
+        "the values that the WebSocket message `begin` accepts: calibration methods, serial ports",
         gives={200: Body("The choices.", Choices)}),
     Route("GET", "/api/camera", "viewer", Page.picture,
         "the newest picture of the camera; the headers give its age (`Age-Ms`) and how long the "
@@ -407,7 +421,8 @@ ROUTES: tuple[Route, ...] = (
         "one recording as a file",
         gives={200: Body("MCAP.", media="application/octet-stream")}),
     Route("POST", "/api/recordings/{name}/report", RECORDINGS, Page.draw,
-        "draws the report of a recording, or returns the progress; ask until the status is 200",
+        "starts to draw the report of a recording, or returns the progress; repeat the request "
+        "until its status is 200",
         gives={200: Body("The report is drawn; get it at `href`.", ReportState),
                202: Body("This report or another one is being drawn.", ReportState),
                503: Body("The report cannot be drawn; the reason is in the answer.", ReportState)}),

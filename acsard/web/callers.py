@@ -1,13 +1,13 @@
-"""Identifies the client of a request from its address and headers, and checks its role. Pure.
+"""Identifies the client of a request from its address and headers, and checks its role.
 
-A client on the robot itself needs no token and has the role in `web.local`. However, any web page
-in a browser on the robot may open `ws://localhost`, or may let its own host name point to
-127.0.0.1. So the header `Host` must be a loopback name, and a header `Origin` must be that of the
-robot's own page or one in `web.origins`. A client on another machine must use HTTPS, a host name of
-the robot, and a token.
+This module is pure. A client on the robot itself needs no token and has the role in `web.local`.
+However, any web page in a browser on the robot may open `ws://localhost`, or may let its own host
+name point to 127.0.0.1. So the header `Host` must be a loopback name, and a header `Origin` must be
+that of the robot's own page or one in `web.origins`. A client on another machine must use HTTPS, a
+name or address of the robot, and a token.
 
-A request through a proxy is refused, because a proxy on the robot that rewrites `Host` would make
-all of its clients look local.
+A request through a proxy is refused. A proxy on the robot that rewrites `Host` would make all of
+its clients look local.
 """
 
 from __future__ import annotations
@@ -25,21 +25,22 @@ Reason = Literal[
     "host", "origin", "no_token", "bad_token", "plain", "role", "too_many", "too_fast",
     "too_big", "malformed", "path", "replayed", "crowded", "slow", "proxy", "stuck",
 ]  # fmt: skip
-"""Reason for a refusal, under which refusals are counted."""
+"""Reason for a refusal. Refusals are counted by reason."""
 
 Place = Literal["here", "away"]
 
 HERE = "here"
-"""Name of every client on the robot itself. Such a client has no token with a name."""
+"""Name that stands for every client on the robot itself, because it has no token with a name."""
 
 COOKIE = "__Host-acsard"
-"""Prefix of the cookie names. For `__Host-`, browsers require Secure, Path=/ and no Domain."""
+"""Prefix of the cookie names. Browsers accept a cookie with the prefix `__Host-` only with Secure,
+with Path=/ and without Domain."""
 
 PROTOCOL, TOKEN = "acsard", "acsard.token."
 """The WebSocket's subprotocol, and the prefix of a subprotocol name that carries a token."""
 
 MOST_TOKENS = 8
-"""Maximum number of tokens in one request that are compared with all valid tokens."""
+"""Maximum number of tokens in one request that are checked. Further tokens are ignored."""
 
 
 class RefusedError(AcsardError):
@@ -78,12 +79,15 @@ class Who(Struct, frozen=True):
 
 
 class Asked(Struct, frozen=True):
-    """The facts of a request that decide about its admission. The client may forge all headers."""
+    """The properties of a request that decide whether it is admitted.
+
+    The client may forge all headers.
+    """
 
     peer: str
-    """Source address of the connection."""
+    """Source IP address of the connection."""
     secure: bool
-    """True for TLS."""
+    """True if the connection uses TLS."""
     host: str
     """Value of the `Host` header, "" if it is missing or malformed."""
     origin: str | None = None
@@ -97,14 +101,15 @@ class Asked(Struct, frozen=True):
 def place(asked: Asked, names: Collection[str]) -> Place:
     """Return "here" if the client is on the robot and asks for a loopback name, otherwise "away".
 
-    Raises `RefusedError` for a request through a proxy. If "away", also for plain HTTP, and for a
-    host that is not in `names`, the robot's names and addresses in lower case.
+    `names` are the robot's names and addresses, in lower case. Raises `RefusedError` for a request
+    through a proxy. A request from "away" is also refused if it uses plain HTTP, or if its host is
+    not in `names`.
     """
     if asked.proxied:
         raise RefusedError(
             "proxy",
-            "the request came through a proxy, which hides the browser's machine: open this page "
-            "without a proxy; from another machine, use https",
+            "the request came through a proxy, which hides the machine of the browser: open this "
+            "page without a proxy, and with https if the browser runs on another machine",
         )
     host = host_name(asked.host)
     if is_loopback(asked.peer) and (host == "localhost" or is_loopback(host)):
@@ -113,7 +118,7 @@ def place(asked: Asked, names: Collection[str]) -> Place:
         raise RefusedError(
             "plain" if not is_loopback(asked.peer) else "host",
             f"the request is for {host or 'no host'!r}, but plain http is only for localhost: use "
-            "http://localhost here, and https from another machine",
+            "http://localhost on the machine of the page's server, and https from another machine",
         )
     if host not in names:
         raise RefusedError(
@@ -138,7 +143,8 @@ def require_own_origin(asked: Asked) -> None:
 def by_listed_page(asked: Asked, origins: Collection[str]) -> bool:
     """Return whether a web page of an origin in `web.origins` made the browser send this request.
 
-    The robot's own page never counts as listed, because a listed page's cookies are ignored.
+    The result is always False for the robot's own page, because the cookies of a page in
+    `web.origins` are ignored.
     """
     if asked.origin is None or asked.origin.lower() == _own_origin(asked):
         return False
@@ -150,7 +156,10 @@ def _own_origin(asked: Asked) -> str:
 
 
 def tokens_offered(protocols: str) -> list[str]:
-    """Return the tokens in `Sec-WebSocket-Protocol`, the only header a page's script can set."""
+    """Return the tokens in the header `Sec-WebSocket-Protocol`.
+
+    It is the only header of a WebSocket's request that a script in a browser can set.
+    """
     offered = (one.strip() for one in protocols.split(","))
     return [one.removeprefix(TOKEN) for one in offered if one.startswith(TOKEN)][:MOST_TOKENS]
 
@@ -178,12 +187,18 @@ def host_name(host: str) -> str:
 
 
 def unmapped(address: str) -> str:
-    """Return an address without `::ffff:`, the prefix of IPv4 clients at a dual-stack socket."""
+    """Return an address without the prefix `::ffff:`.
+
+    A dual-stack socket puts this prefix before the address of an IPv4 client.
+    """
     return address.removeprefix("::ffff:") if "." in address else address
 
 
 def network_of(address: str) -> str:
-    """Return the IPv4 address, or the IPv6 /64 network, because one machine may use all of it."""
+    """Return an IPv4 address unchanged, and an IPv6 address as its /64 network.
+
+    One machine may use all addresses of a /64 network.
+    """
     if ":" not in address:
         return address
     try:

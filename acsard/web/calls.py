@@ -1,7 +1,8 @@
 """Service calls and queries to the robot.
 
-Each call blocks a thread of its own. Stops have their own limits, so a stop never waits for other
-calls. Several stops may share one that is sent after all of them have arrived.
+Each call blocks a thread of its own. Calls of the service `stop` ("stops") have their own limits,
+so a stop never waits for other calls. If several stops are requested at once, the server may send
+one stop for all of them, after the last request has arrived.
 """
 
 from __future__ import annotations
@@ -27,11 +28,12 @@ from acsard.web.limits import STOPS_ELSEWHERE
 from acsard.web.robots import Robots
 
 AT_ONCE, STOPS_AT_ONCE = 16, 32
-"""Maximum number of concurrent requests; maximum number of concurrent stops of the page's own
-robot, which do not count as requests."""
+"""Maximum number of service calls and queries at the same time; maximum number of stops of the
+page's own robot at the same time, which are counted separately."""
 
 ELSEWHERE_AT_ONCE = 8
-"""Maximum number of stops of other robots that wait for a reply. Others are only sent."""
+"""Maximum number of stops of other robots that wait for a reply. Beyond it, a stop is sent without
+waiting for the reply."""
 
 MERGE_S = 0.02
 """Shortest interval between two stops that are sent for one client to one robot, s."""
@@ -62,12 +64,15 @@ class Calls:
         ends: Callable[[], Awaitable[Ending]],
         sees: Callable[[str], bool],
     ) -> None:
-        """Store the arguments. `ends` ends a running check; `sees` tells if a robot is known."""
+        """Store the arguments.
+
+        `ends` interrupts a running check or calibration, and `sees(id)` tells if a robot is known.
+        """
         self._robots, self._ends, self._sees = robots, ends, sees
         self._stops, self._merged = Stops(), Merged()
         self._unknown = Buckets(STOPS_ELSEWHERE)
         self._answered: set[str] = set()
-        """Ids of the other robots that have answered a stop, which proves that they exist."""
+        """Ids of other robots that have answered a stop, and therefore exist."""
         self._asks = Places(AT_ONCE, AT_ONCE)
         self._elsewhere = Places(ELSEWHERE_AT_ONCE, ELSEWHERE_AT_ONCE)
 
@@ -76,8 +81,8 @@ class Calls:
     ) -> ServiceReply:
         """Call the service `verb` for the client `who` and return the reply.
 
-        `robot` is the id of another robot, on which only `stop` may be called, or "" for the page's
-        own robot. Raises `RefusedError`.
+        `robot` is the id of the robot, or "" for the page's own robot. On another robot, only
+        `stop` may be called. Raises `RefusedError`.
         """
         require(who, verb)
         other = "" if robot == self._robots.id else robot
@@ -115,7 +120,7 @@ class Calls:
             else:
                 reply = await self._ask(request)
         except (MendableError, DecodeError, TimeoutError) as error:
-            return ServiceReply(False, str(error) or "no answer in time: try again")
+            return ServiceReply(False, str(error) or "the robot did not answer in time: try again")
         if verb == "set" and reply.success:
             self._robots.ask_anew()
         return reply
@@ -123,7 +128,8 @@ class Calls:
     async def get(self, robot: str, name: str) -> tuple[str, bytes]:
         """Query the last value of a robot's key as JSON; return its encoding and its payload.
 
-        Raises `MendableError` without a connection or an answer, and beyond `AT_ONCE` requests.
+        Raises `MendableError` if there is no connection, if no answer arrives, or if `AT_ONCE`
+        requests are running already.
         """
         client = self._robots.client
         if client is None:
@@ -135,7 +141,8 @@ class Calls:
     ) -> ServiceReply:
         """Stop another robot, and return its reply.
 
-        A robot that does not exist never replies, so at most `ELSEWHERE_AT_ONCE` stops wait.
+        A robot that does not exist never replies, so at most `ELSEWHERE_AT_ONCE` calls wait for a
+        reply. Further calls only send the stop.
         """
         with self._elsewhere.held() as free:
             if free:
@@ -151,12 +158,12 @@ class Calls:
         )
         return ServiceReply(
             False,
-            f"the stop was sent to {robot}, but too many queries are running to wait for its "
-            "answer: check that it stopped",
+            f"the stop was sent to {robot}, but the page's server cannot wait for the answer, "
+            "because too many queries are running: check that the robot has stopped",
         )
 
     def _require_few(self, who: Who) -> None:
-        """Raise `RefusedError` if the client too often stops robots that may not exist."""
+        """Raise `RefusedError` if a client sends too many stops to robots that may not exist."""
         if not self._unknown.take(who.token or who.name, clock.mono_ns()):
             rate = STOPS_ELSEWHERE
             raise RefusedError(
@@ -176,17 +183,22 @@ class Calls:
 class Merged:
     """Sends at most one stop per `MERGE_S` for each client and robot.
 
-    No stop is lost. The stops that arrive too soon after a stop was sent share the next one.
+    No stop is lost. The stops that are requested within `MERGE_S` after a stop was sent share the
+    next stop.
     """
 
     def __init__(self) -> None:
         self._rests: dict[Hashable, asyncio.Event] = {}
-        """Maps a client and robot to an event that is set `MERGE_S` after the last stop."""
+        """Maps (client, robot) to an event, which is set `MERGE_S` after the last stop was sent."""
         self._next: dict[Hashable, asyncio.Task[ServiceReply]] = {}
-        """Maps a client and robot to the task that waits for the event and then sends a stop."""
+        """Maps (client, robot) to the task that waits for the event in `_rests` and then sends a
+        stop."""
 
     async def ask(self, name: Hashable, stop: Stop) -> ServiceReply:
-        """Return the reply to a stop sent after this call; `name` identifies client and robot."""
+        """Send a stop, or share one that is not sent yet, and return its reply.
+
+        `name` identifies the client and the robot.
+        """
         if name in self._next:
             return await asyncio.shield(self._next[name])
         rest = self._rests.get(name)
@@ -210,14 +222,17 @@ class Merged:
 
 
 class Stops:
-    """Sends at most `STOPS_AT_ONCE` stops at a time. Further callers share one later stop."""
+    """Sends at most `STOPS_AT_ONCE` stops at a time.
+
+    Beyond this limit, all further callers share one stop, which is sent when the limit allows it.
+    """
 
     def __init__(self) -> None:
         self._room = asyncio.Semaphore(STOPS_AT_ONCE)
         self._next: asyncio.Task[ServiceReply] | None = None
 
     async def ask(self, call: Callable[[], ServiceReply]) -> ServiceReply:
-        """Send a stop with `call`, or share a later one, and return the robot's reply."""
+        """Send a stop with `call`, or share a stop that is not sent yet, and return the reply."""
         if not self._room.locked():
             async with self._room:
                 return await in_thread(call, ANSWER_S)
@@ -242,7 +257,7 @@ def require(who: Who, verb: str) -> None:
 
 
 def _require_stop(verb: str, robot: str) -> None:
-    """Raise `RefusedError` unless the robot id is valid and the service is `stop`."""
+    """Raise `RefusedError` unless `robot` is a valid robot id and `verb` is `stop`."""
     try:
         require_id(robot)
     except UsageError as error:
@@ -256,7 +271,10 @@ def _require_stop(verb: str, robot: str) -> None:
 
 
 def _named(client: Client, robot: str, who: Who) -> Client:
-    """Return a bus client that calls services of `robot`, and is logged under the name of `who`."""
+    """Return a bus client that calls services of `robot`.
+
+    The robot logs these calls under the name of `who`.
+    """
     other = client.like(robot)
     other.name = f"{who.name}@page"
     return other

@@ -1,9 +1,9 @@
 """The newest picture of a camera's MJPEG stream, for the clients of the page.
 
-Another program (ustreamer, go2rtc, mjpg-streamer) serves the stream. One connection reads it while
-clients ask for pictures. Only the newest picture is kept, so a client with a slow network gets
-fewer pictures, and no old ones. Some servers repeat the last picture when their camera is lost, so
-a picture that equals the one before byte for byte is not new.
+Another program (ustreamer, go2rtc, mjpg-streamer) serves the stream. One connection reads the
+stream while clients ask for pictures. Only the newest picture is kept, so a client with a slow
+network gets fewer pictures, and no old ones. Some servers repeat the last picture when their camera
+is lost, so a picture that has the same bytes as the previous one does not count as new.
 """
 
 from __future__ import annotations
@@ -23,16 +23,19 @@ from acsard.host.rate_limits import Places
 from acsard.web.answers import TroubleError
 
 WAIT_S = 1.0
-"""Time limit, s, for a new picture to arrive, and then for permission to send it (`SENDS`)."""
+"""Time limit, s, for each of two waits: for a new picture from the camera, and then for a place to
+send it (see `SENDS`)."""
 
 CONNECT_S, SILENT_S = 3.0, 3.0
 """Time limits for the connection to the camera's server, and for the next byte from it, s."""
 
 MAX_PICTURE, MAX_HEAD = 1_000_000, 4096
-"""Maximum size of a picture and of its header lines, bytes. A full HD picture has a few 100 kB."""
+"""Maximum size of a picture and of its header lines, bytes. A full HD picture has a few hundred
+kB."""
 
 SENDS, SENDS_OF_TOKEN = 8, 2
-"""Maximum number of pictures that are kept in memory for sending: in all, and to one token."""
+"""Maximum number of pictures that are being sent at the same time: in all, and to the clients with
+one token."""
 
 SEND_S = 5.0
 """Time limit for sending a picture, s. The page in the browser waits no longer than this."""
@@ -52,12 +55,16 @@ class Parts:
     """Cuts a `multipart/x-mixed-replace` stream into its parts, the pictures."""
 
     def __init__(self, boundary: str) -> None:
-        """Store `boundary` from the content type. Some servers include the two dashes before it."""
+        """Store the boundary from the content type of the stream.
+
+        Some servers write it with the two dashes that come before it in the stream. They are
+        removed.
+        """
         self._end = b"\r\n--" + boundary.strip('"').removeprefix("--").encode()
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> bytes | None:
-        """Add received bytes; return the newest picture that they complete, or None.
+        """Add received bytes; return the newest picture that is now complete, or None.
 
         Raises `ValueError` if a picture or its header lines are too long.
         """
@@ -102,13 +109,15 @@ class Camera:
         self._reading: asyncio.Task[None] | None = None
 
     async def after(self, number: int) -> Picture | None:
-        """Return the newest picture, or None if its number is still `number` after `WAIT_S`.
+        """Return the newest picture as soon as its number is not `number`.
 
-        Raises `TroubleError` if there is no camera or its stream cannot be read.
+        Return None if no such picture arrives within `WAIT_S`. Raises `TroubleError` if there is no
+        camera or its stream cannot be read.
         """
         if not self._url:
             raise TroubleError(
-                404, "this robot has no camera: to show one, set web.camera to its stream's address"
+                404,
+                "no camera is configured: to show one, set web.camera to the address of its stream",
             )
         self._asked_ns = clock.mono_ns()
         if self._reading is None or self._reading.done():
@@ -124,9 +133,10 @@ class Camera:
 
     @asynccontextmanager
     async def sending(self, token: str) -> AsyncIterator[None]:
-        """Hold one of the places for sending a picture; `token` is the client's token.
+        """Hold one of the `SENDS` places for sending a picture during the `with` block.
 
-        Raises `TroubleError` if no place becomes free within `WAIT_S`.
+        `token` is the client's token. Raises `TroubleError` if no place becomes free within
+        `WAIT_S`.
         """
         try:
             async with asyncio.timeout(WAIT_S):

@@ -1,4 +1,4 @@
-"""The robots on the bus, one row each, for viewers of the page that have subscribed to them."""
+"""The list of the robots on the bus, for viewers of the page that have subscribed to it."""
 
 from __future__ import annotations
 
@@ -19,22 +19,23 @@ from acsard.web.streams import DECLARE_S, STATE, UNREADY
 MOST = 200
 
 UNROUTED = (
-    "this page sees only robots that are connected to the daemon of {robot}, because daemons "
-    "forward no messages. To see all robots of a router, connect this page's server to the "
-    "router: acsard web --connect ROUTER --id {robot}"
+    "this page sees only robots that are connected directly to the daemon of {robot}, because "
+    "daemons forward no messages. To see all robots that are connected to a router, connect this "
+    "page's server to that router: acsard web --connect ROUTER --id {robot}"
 )
-"""Note for a server that is connected to a daemon instead of a router."""
+"""Note to the viewers if the page's server is connected to a daemon instead of a router."""
 
 BY_NAME = (
     "{endpoint} passes only exact keys, as every TLS endpoint does, so no other robot is "
     "visible. To see all robots of a router, run this page's server on the router's machine: "
     "acsard web --connect tcp/127.0.0.1:7447 --id {robot}"
 )
-"""Note for a server that is connected over TLS, which limits it to its own robot."""
+"""Note to the viewers if the page's server is connected over TLS, which lets the server reach only
+its own robot."""
 
 
 class Fleet:
-    """Tracks all robots on the bus while at least one viewer of the page has joined."""
+    """Tracks all robots on the bus while a viewer of the page is subscribed to the list of them."""
 
     def __init__(self, robots: Robots) -> None:
         self._robots = robots
@@ -59,7 +60,10 @@ class Fleet:
         return [_row(one) for one in sorted(rows, key=lambda one: one.robot_id)]
 
     def sees(self, robot: str) -> bool:
-        """Return whether the robot is known from its liveliness token or from a followed state."""
+        """Return whether the robot is known to this server.
+
+        It is known if it has a liveliness token, or if a state has arrived that a viewer follows.
+        """
         states = self._robots.streams.followed(robot, STATE)
         here = self._tracked is not None and self._tracked.here(robot)
         return here or bool(states and states.number)
@@ -113,10 +117,10 @@ def _row(one: fleet.Row) -> Row:
         return Row(one.robot_id, mode, reason, None, "", None, version)
     age = round(one.age, 3)
     if one.here is False:
-        was = f"its daemon has ended; it was {state.mode}"
+        was = f"its daemon has ended; the robot was {state.mode}"
         return Row(one.robot_id, "gone", was, None, "", age, version)
     if one.silent:
-        return Row(one.robot_id, None, f"it was {state.mode}", None, "", age, version)
+        return Row(one.robot_id, None, f"the robot was {state.mode}", None, "", age, version)
     return Row(
         one.robot_id, state.mode, state.reason, state.linear, state.link, age, version,
         [str(one) for one in warnings(state)], [state.x, state.y, state.yaw],

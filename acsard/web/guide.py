@@ -1,9 +1,9 @@
 """Runs a board check or a calibration for a browser, as a child process (`acsard` itself).
 
-Only one child runs at a time. Only the WebSocket that started it receives its lines
-(`terminal/json_prompt.py`) and may answer. If this WebSocket ends, the child is interrupted as by
-Ctrl-C, so it still sends zero speeds to the board. The child also ends with this server, because it
-watches its standard input.
+Only one child runs at a time. Only the WebSocket that started the child receives the lines that the
+child prints (`terminal/json_prompt.py`), and may answer its questions. If this WebSocket ends, the
+child is interrupted as by Ctrl-C, so the child still sends zero speeds. The child also ends when
+this server ends, because the child watches its standard input.
 """
 
 from __future__ import annotations
@@ -30,10 +30,11 @@ from acsard.web.calls import Ending
 from acsard.web.socket_messages import Begin, Ended, FrameError, Guided, Press, Reply, Running
 
 PATIENCE_S = 6.0
-"""Time, s, that an interrupted child has to send zero speeds and exit before it is killed."""
+"""Time, s, that an interrupted child process has to send zero speeds and exit, before it is
+killed."""
 
 NO_DEVICE = (
-    "No serial port is visible from here. Is the board plugged in? If the page runs as a "
+    "The page's server sees no serial port. Is the board plugged in? If the server runs as a "
     "service, it has no access to devices: run `sudo systemctl stop acsard` and `acsard mcu "
     "check` in a terminal on the robot."
 )
@@ -48,7 +49,10 @@ Say = Callable[[Guided], None]
 
 
 class Reach(Struct, frozen=True):
-    """The options by which a child connects to this server's daemon. An empty one is left out."""
+    """The options with which a child process connects to the daemon of this server's robot.
+
+    An option whose value is empty is left out.
+    """
 
     config: str
     endpoint: str
@@ -78,7 +82,7 @@ class Choices(Struct, frozen=True):
 
 
 class _Said(Struct, frozen=True):
-    """The fields of the child's lines that this server acts on."""
+    """The fields in the lines of the child process to which this server reacts."""
 
     question: int = 0
     leg: bool = False
@@ -86,10 +90,10 @@ class _Said(Struct, frozen=True):
 
 
 class Guide:
-    """Runs one check or calibration at a time, and tells all viewers of the page which one."""
+    """Runs one check or calibration at a time, and tells all viewers of the page what runs."""
 
     def __init__(self, reach: Reach, configured: str) -> None:
-        """Store how a child reaches the daemon, and `configured`, the configured serial port."""
+        """Store the options that connect a child to the daemon, and the configured serial port."""
         self._reach, self._configured = reach, configured
         self._viewers: dict[object, Say] = {}
         self._errand: _Errand | None = None
@@ -103,7 +107,10 @@ class Guide:
         return Choices(NEEDS, way, advice, found, "" if sees_one else NO_DEVICE)
 
     def join(self, viewer: object, say: Say) -> None:
-        """Add a viewer and tell it what runs, if anything. It may have missed a child's end."""
+        """Add a viewer, and tell the viewer which check or calibration runs, or that none runs.
+
+        A viewer that connects again may have missed the end of a check or calibration.
+        """
         self._viewers[viewer] = say
         say(Guided(Running("")) if self._errand is None else self._errand.about(viewer))
 
@@ -114,7 +121,10 @@ class Guide:
             errand.leave()
 
     def begin(self, viewer: object, by: str, asked: Begin) -> str:
-        """Start a child for a viewer whose user is `by`. Return "" or the reason for a refusal."""
+        """Start the check or calibration `asked` for a viewer, whose user is `by`.
+
+        Return "" or the reason for a refusal.
+        """
         if self._errand is not None:
             return (
                 f"{self._errand.name} already runs ({self._errand.by}), and only one can run at a "
@@ -129,11 +139,14 @@ class Guide:
         """Pass a viewer's answer to the child. Return "" or the reason for a refusal."""
         errand = self._of(viewer)
         if errand is None or not errand.answer(reply):
-            return f"the question {reply.reply} is not open: answer the newest question here"
+            return f"the question {reply.reply} is over: answer the newest question on this page"
         return ""
 
     def press(self, viewer: object, press: Press) -> None:
-        """Pass a viewer's key press to its child, or interrupt the child, unless it has ended."""
+        """Pass a key press to the child that the viewer started, or interrupt this child.
+
+        If the child has ended, do nothing.
+        """
         if (errand := self._of(viewer)) is None:
             return
         if press.press == "key":
@@ -142,19 +155,23 @@ class Guide:
             errand.leave()
 
     async def stop(self) -> Ending:
-        """Interrupt the running child, because a client stops the robot. Any client may do this.
+        """Interrupt the running check or calibration, because a client stops the robot.
 
-        During a check, the daemon cannot stop the wheels, because the check holds the serial port.
+        The client need not be the one that started it. The daemon alone cannot stop the wheels
+        during a check, because the check holds the serial port.
         """
         if self._errand is None or self._task is None:
             return Ending()
         self._errand.leave()
-        what = f"the {self._errand.name} of {self._errand.by}"
+        what = f"the {self._errand.name} started by {self._errand.by}"
         done, _ = await asyncio.wait([self._task], timeout=1.0)
         return Ending(f"{what} has ended" if done else f"{what} is being ended", bool(done))
 
     def heard(self, viewer: object) -> None:
-        """Send the viewer's child a sign of life, which it needs while something moves."""
+        """Send a sign of life to the child that the viewer started.
+
+        While the robot may move, the child ends if such signs stop.
+        """
         if (errand := self._of(viewer)) is not None:
             errand.relay()
 
@@ -178,7 +195,10 @@ class Guide:
         try:
             code, text = await errand.run(words(asked, self._reach, await self._ports(asked)))
         except (FrameError, OSError, TimeoutError) as error:
-            code, text = int(Exit.USAGE), str(error) or "no list of serial ports arrived: try again"
+            code, text = (
+                int(Exit.USAGE),
+                str(error) or "the serial ports were not found in time: try again",
+            )
         finally:
             self._errand = None
         meaning = WORDS.get(code, "ended") if not errand.left else "stopped"
@@ -199,7 +219,10 @@ class Guide:
 
 
 def boards(configured: str) -> list[Board]:
-    """Return the serial ports to choose from, the configured one first. Call this in a thread."""
+    """Return the serial ports, and the simulator, from which the user chooses one to check.
+
+    The configured port is the first. Call this in a thread, because it blocks.
+    """
     found: dict[str, str] = {}
     for device in serial_devices():
         name = device.names[0] if device.names else device.device
@@ -217,10 +240,11 @@ def boards(configured: str) -> list[Board]:
 
 
 def words(begin: Begin, reach: Reach, ports: Collection[str]) -> list[str]:
-    """Return the arguments of `acsard` for the request `begin`. Raises `FrameError`.
+    """Return the arguments with which `acsard` carries out the request `begin`.
 
     This function chooses the options. A text from the browser can only become the value of an
-    option, and must be in a known set of values or be a plain key.
+    option. It must be one of a known set of values, or a plain Zenoh key. Otherwise, this function
+    raises `FrameError`.
     """
     config = [f"--config={reach.config}"] if reach.config else []
     if begin.begin == "check":
@@ -230,7 +254,7 @@ def words(begin: Begin, reach: Reach, ports: Collection[str]) -> list[str]:
             raise FrameError("begin", f"port must be one of {', '.join(sorted(ports))}")
         return ["mcu", "check", "--json-lines", *config, f"--port={begin.port}"]
     if begin.port:
-        raise FrameError("begin", "`port` is only for the check of a board")
+        raise FrameError("begin", "`port` is only for a check of the board, not for a calibration")
     given = [f"--connect={reach.endpoint}", f"--id={reach.robot_id}"]
     if reach.tls:
         given.append(f"--tls={reach.tls}")
@@ -243,10 +267,10 @@ def _method(begin: Begin) -> list[str]:
     if (begin.method == POSITIONS) != bool(begin.positions):
         raise FrameError(
             "begin",
-            f"`positions`, a key, is required by the method {POSITIONS} and valid only there",
+            f"`positions` must be a Zenoh key for the method {POSITIONS}, and only for that method",
         )
     if begin.positions and not KEY.match(begin.positions):
-        raise FrameError("begin", "`positions` must be a key like sim/pose: letters, digits, _ / -")
+        raise FrameError("begin", "`positions` must be a Zenoh key of letters, digits, _ / -")
     options = {"method": begin.method, "positions": begin.positions}
     return [f"--{name}={value}" for name, value in options.items() if value]
 
@@ -259,7 +283,7 @@ class _Errand:
         self.left = False
         self._process: Process | None = None
         self._question = 0
-        """Number of the open question; 0 if none is open."""
+        """Number of the child's question that is not answered yet; 0 if there is none."""
         self._leg = self._rides = False
         # The browser sends signs of life at about half this rate (page/guide.js), so none is lost.
         self._relayed = Bucket(Rate(20.0))
@@ -282,7 +306,7 @@ class _Errand:
         return code if code >= 0 else 128 - code, self._words()
 
     def answer(self, reply: Reply) -> bool:
-        """Send the child an answer; return False if its question is not the open one."""
+        """Send the child an answer; return False if it is not for the open question."""
         if not self._question or reply.reply != self._question:
             return False
         self._question, self._rides = 0, self._leg
@@ -290,18 +314,24 @@ class _Errand:
         return True
 
     def key(self) -> None:
-        """End the present drive of a calibration. Further presses in the same drive are ignored."""
+        """Tell the child that a key was pressed, which ends the present drive of a calibration.
+
+        Further presses during the same drive are ignored.
+        """
         if self._rides:
             self._rides = False
             self._write({"key": True})
 
     def relay(self) -> None:
-        """Tell the child that the operator's browser, which can stop it, is still connected."""
+        """Tell the child that the operator's browser is still connected and can interrupt it."""
         if self._relayed.take(clock.mono_ns()):
             self._write({})
 
     def leave(self) -> None:
-        """Interrupt the child once, as Ctrl-C does, and kill it if it does not exit."""
+        """Interrupt the child as Ctrl-C does, and kill the child if it does not exit in time.
+
+        Further calls do nothing.
+        """
         if self.left:
             return
         self.left = True

@@ -17,7 +17,8 @@ from acsard.core.values import NS_PER_S, WHEELS
 LASTS_NS = 60 * NS_PER_S
 
 STEP_NS = NS_PER_S // 5
-"""Nominal interval of the rows, ns. It is about one pixel wide in a plot on a phone."""
+"""Nominal time between two rows of plotted values, ns. It is about one pixel wide in a plot on a
+phone."""
 
 EARLY_NS = STEP_NS // 4
 """A state may become the next row if it arrives at most this long before the row is due, ns."""
@@ -28,7 +29,8 @@ ROWS = LASTS_NS // (STEP_NS - EARLY_NS)
 MEASURED = 2 + len(WHEELS)
 
 WIDTH = MEASURED + 5
-"""Number of values in a row: measured speeds, commanded twist (2), lateness (2), voltage (1)."""
+"""Number of values in a row: measured speeds (`MEASURED`), commanded twist (2), lateness (2) and
+voltage (1)."""
 
 MS = 1e-3
 

@@ -16,21 +16,26 @@ SOCKETS, SOCKETS_HERE = 256, 96
 opens six connections in addition to its WebSocket."""
 
 SOCKETS_OF_ONE, SOCKETS_OF_TOKEN = 64, 64
-"""Maximum numbers of TCP connections: without a valid token per network, and per valid token.
-Further connections with a token count as connections without one."""
+"""Maximum numbers of TCP connections: from one network without a valid token (`SOCKETS_OF_ONE`),
+and with one valid token (`SOCKETS_OF_TOKEN`). Further connections with this token count as
+connections without a valid token."""
 
 SOCKETS_OF_BROWSER = 7
-"""Number of connections that each token keeps when all places are taken: one browser's."""
+"""Number of TCP connections that each token keeps when all places are taken. One browser needs this
+number."""
 
 SOCKETS_LEAST = 16
-"""Minimum of the limit on connections from other machines, if the process may open few files."""
+"""Smallest limit on TCP connections from other machines. It applies if the process may open only
+few files."""
 
 OWN_FILES = 128
-"""Number of files reserved for other uses: 20 always, more during a report or calibration."""
+"""Number of open files that are reserved for uses other than connections: 20 files are always open,
+and more during a report or calibration."""
 
 UNREAD_BYTES = 32768
-"""Limit on the bytes that wait for a client that does not read. Above it, the client's next request
-waits, and its WebSocket gets no new values. asyncio's default for TLS is 512 KiB."""
+"""Limit on the bytes that the server holds for a client that does not read them. Above the limit,
+the client's next request waits, and its WebSocket gets no new values. asyncio's default for TLS is
+512 KiB."""
 
 OVERRUNS = 600
 """Number of messages beyond the rate limit `MESSAGES` after which a WebSocket is closed."""
@@ -41,7 +46,8 @@ at one address. Because of the last limit, one program cannot lock out other tok
 address."""
 
 CONNECTIONS_HERE = 20
-"""Maximum number of WebSockets from the robot itself. Other machines cannot use them up."""
+"""Maximum number of WebSockets from the robot itself. These places are only for clients on the
+robot."""
 
 STREAMS, STREAMS_OF_ONE = 200, 50
 """Maximum numbers of subscribed keys of other robots: in all, and per token. Keys of the page's own
@@ -49,36 +55,44 @@ robot are few and are not counted."""
 
 
 REQUESTS = Rate(50.0, 200.0)
-"""Limit on HTTP requests per token. The page's static files are exempt."""
+"""Limit on HTTP requests per token, as a rate per second and a largest burst. The page's static
+files are exempt."""
 
 STOPS, PICTURES, OPENINGS = Rate(50.0, 100.0), Rate(100.0, 200.0), Rate(4.0, 20.0)
-"""Limits on stops, camera pictures and new WebSockets, for each token in each network. Requests
-beyond a limit wait. A page asks for at most 20 pictures a second."""
+"""Limits on stops, camera pictures and new WebSockets, for each token in each network, as rates per
+second and largest bursts. Requests beyond a limit wait. A page asks for at most 20 pictures a
+second."""
 
 STRANGERS = Rate(30.0, 150.0)
-"""Limit on the rate of requests without a valid token from one network. Requests beyond it wait. A
-phone loads the page with 16 requests, so eight phones behind one address can load it at once."""
+"""Limit on requests without a valid token from one network, as a rate per second and a largest
+burst. Requests beyond the limit wait. A phone loads the page with 16 requests, so eight phones
+behind one address can load the page at once."""
 
 HANDSHAKES = Rate(30.0, 100.0)
-"""Limit on TLS handshakes per network. Handshakes beyond it wait. A browser needs six."""
+"""Limit on TLS handshakes per network, as a rate per second and a largest burst. Handshakes beyond
+the limit wait. A browser needs six."""
 
 HOLD_S = 0.5
-"""Delay of a request beyond a rate limit, s. A refusal costs the server as much as an answer."""
+"""Delay of a request beyond a rate limit, s. Refusing the request at once would not help, because a
+refusal costs the server as much as an answer."""
 
 MESSAGES = Rate(200.0, 400.0)
-"""Limit on messages per WebSocket. A client sends a burst when its network returns."""
+"""Limit on messages per WebSocket, as a rate per second and a largest burst. A client sends a burst
+when its network returns."""
 
 COMMANDS = Rate(60.0, 120.0)
-"""Limit on commands per token, or per WebSocket from the robot itself. The page's stick sends 20 a
-second, and the daemon accepts 1000 a second from this server. Without the limit, 24 WebSockets with
-180 a second each made it drop half of the commands of a client that drove."""
+"""Limit on commands per token, or per WebSocket from the robot itself, as a rate per second and a
+largest burst. The page's stick sends 20 commands a second, and the daemon accepts 1000 a second
+from this server. Before this limit existed, 24 WebSockets with 180 commands a second each made the
+daemon drop half of the commands of a client that was driving."""
 
 STOPS_ELSEWHERE = Rate(4.0, 16.0)
-"""Limit on stops per token to robots that may not exist: no page shows them, and they have answered
-no stop from this server."""
+"""Limit on stops per token to robots that may not exist, as a rate per second and a largest burst.
+A robot may not exist if this server neither sees it on the bus nor has received its answer to a
+stop."""
 
 GUESSES_OF_ONE, GUESSES = Rate(10 / 60, 10.0), Rate(100 / 60, 100.0)
-"""Limits on wrong tokens: from one network, and in all."""
+"""Limits on wrong tokens, from one network and in all, as rates per second and largest bursts."""
 
 
 C = TypeVar("C", bound=Hashable)
@@ -95,7 +109,7 @@ class Sockets(Generic[C]):
 
     1. The network with the most connections without a valid token loses the oldest of these.
     2. If every connection has shown a valid token, the token with the most connections loses its
-       oldest one. If it has only `SOCKETS_OF_BROWSER`, the new connection is refused instead.
+       oldest one. If this token has only `SOCKETS_OF_BROWSER`, the new connection is refused.
     """
 
     def __init__(self, most: int) -> None:
@@ -106,7 +120,8 @@ class Sockets(Generic[C]):
         self._known: dict[C, str] = {}
         """The token of each connection that is counted under a token (see `SOCKETS_OF_TOKEN`)."""
         self._shown: dict[C, str] = {}
-        """The last valid token of each connection, even beyond the limit `SOCKETS_OF_TOKEN`."""
+        """The last valid token that each connection has shown, even if the connection is beyond the
+        limit `SOCKETS_OF_TOKEN`."""
         self._tokens: Counter[str] = Counter()
 
     def enter(self, network: str, one: C) -> C | None:
@@ -168,11 +183,11 @@ class Sockets(Generic[C]):
         self._fewer(token)
 
     def ended(self, valid: Collection[str]) -> list[C]:
-        """Return the connections that have shown a token, if the last one is not in `valid`."""
+        """Return the connections whose last shown token was valid once but is not in `valid`."""
         return [one for one, token in self._shown.items() if token and token not in valid]
 
     def strangers(self) -> list[C]:
-        """Return the connections that have shown no valid token."""
+        """Return the connections that count as connections without a valid token."""
         return [one for network in self._strangers.values() for one in network]
 
     def _fewer(self, token: str) -> None:
@@ -187,7 +202,10 @@ class Sockets(Generic[C]):
 
 
 class Seats:
-    """Limits the open WebSockets. Those from the robot itself are counted separately."""
+    """Limits the number of open WebSockets.
+
+    WebSockets from the robot itself are counted separately.
+    """
 
     def __init__(self) -> None:
         self._here = Places(CONNECTIONS_HERE, CONNECTIONS_HERE)
@@ -215,7 +233,10 @@ class Seats:
             places.leave(name)
 
     def _places(self, address: str, token: str) -> list[tuple[Places, str, str]]:
-        """Return the limits that apply, with the name to count under and the text of a refusal."""
+        """Return the limits that apply to a WebSocket.
+
+        Each has the name under which the WebSocket is counted, and the text of a refusal.
+        """
         if not token:
             here = f"{CONNECTIONS_HERE} pages are open on the robot itself: close some"
             return [(self._here, address, here)]
@@ -236,9 +257,10 @@ class Seats:
 
 
 class Shares:
-    """Limits the resources in use, in total and per holder. A shared one counts once in total.
+    """Limits the number of resources in use, in total and per holder.
 
-    The server uses this for subscriptions to keys of other robots. Their holders are tokens.
+    A resource that several holders share counts once in the total. The server uses this class for
+    subscriptions to keys of other robots. The holders of these are tokens.
     """
 
     def __init__(self, most: int, of_one: int) -> None:

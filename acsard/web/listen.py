@@ -1,4 +1,4 @@
-"""The addresses at which the page listens: parsing, binding, and the URLs on an invitation."""
+"""The addresses at which the page's server listens, and the URLs on an invitation."""
 
 from __future__ import annotations
 
@@ -66,10 +66,10 @@ def listens(text: str) -> Listen:
 
 
 def invitations(listen: Sequence[Listen], tls: str) -> list[str]:
-    """Return the URLs to write on an invitation, the likeliest to work first; none without HTTPS.
+    """Return the URLs to write on an invitation; the first one is the most likely to work.
 
-    IP addresses come before names, because not every phone resolves mDNS names. Call
-    `require_certificate` first.
+    Only HTTPS addresses have such URLs. IP addresses come before names, because not every phone
+    resolves mDNS names. Call `require_certificate` first.
     """
     found: list[str] = []
     older_ports = _older_ports(listen)
@@ -96,7 +96,10 @@ def opened_by(one: Listen, tls: str) -> list[str]:
 
 
 def require_certificate(listen: Sequence[Listen], tls: str) -> None:
-    """Raise `MendableError` if there is an HTTPS address but no usable certificate in `tls`."""
+    """Raise `MendableError` if an HTTPS address has no usable certificate.
+
+    `tls` is the directory of the certificate.
+    """
     away = [one for one in listen if one.secure]
     if away and not tls:
         raise CertificateError(
@@ -108,18 +111,27 @@ def require_certificate(listen: Sequence[Listen], tls: str) -> None:
 
 
 def bound(listen: Sequence[Listen], next_port: bool) -> list[tuple[Listen, socket.socket]]:
-    """Open a socket at each address; `next_port` allows later ports. Raises `InUseError`."""
+    """Open a socket at each address.
+
+    If `next_port` is true and a port is taken, use a later port. Raises `InUseError`.
+    """
     older_ports = _older_ports(listen)
     return [_bound(one, next_port, one.port not in older_ports) for one in listen]
 
 
 def _older_ports(listen: Sequence[Listen]) -> set[int]:
-    """Return the ports of the IPv4 addresses. At such a port, a `::` socket is for IPv6 only."""
+    """Return the ports of the IPv4 addresses and host names.
+
+    At such a port, a `::` socket must be for IPv6 only.
+    """
     return {one.port for one in listen if ":" not in one.host}
 
 
 def _bound(one: Listen, next_port: bool, both: bool) -> tuple[Listen, socket.socket]:
-    """Open a socket at the first free port; `both` lets `::` accept IPv4 too."""
+    """Open a socket at the port of `one`, or with `next_port` at the first free port from there.
+
+    If `both` is true, a socket at `::` accepts IPv4 connections too.
+    """
     ports = range(one.port, min(65536, one.port + TRIES)) if next_port else [one.port]
     both = both and one.host == EVERYWHERE_6 and socket.has_dualstack_ipv6()
     trouble: OSError | None = None
@@ -135,6 +147,6 @@ def _bound(one: Listen, next_port: bool, both: bool) -> tuple[Listen, socket.soc
         opened.setblocking(False)
         return Listen(one.secure, one.host, port), opened
     raise InUseError(
-        f"cannot listen at {one.url}: {trouble}; stop the program that uses it, or choose "
-        "another address with --address (web.address)"
+        f"cannot listen at {one.url}: {trouble}; stop the program that uses this address, or "
+        "choose another address with --address or the setting web.address"
     ) from None

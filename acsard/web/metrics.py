@@ -40,12 +40,12 @@ def text(
     def add(name: str, kind: Kind, what: str, samples: Iterable[Sample]) -> None:
         lines.extend(_family(f"acsard_{name}", kind, what, robot, samples))
 
-    add("up", "gauge", "1 while messages from the daemon arrive", [({}, float(heard))])
+    add("up", "gauge", "1 while the daemon's messages arrive, else 0", [({}, float(heard))])
     if state is not None and heard:
         add(
             "info",
             "gauge",
-            "always 1; the label is the version of the daemon",
+            "always 1; the label `version` is the version of the daemon",
             [({"version": version}, 1.0)],
         )
         for name, kind, what, samples in _of_robot(state):
@@ -79,7 +79,7 @@ def _of_robot(state: RobotState) -> Iterator[tuple[str, Kind, str, Iterable[Samp
         yield (
             "certificate_seconds",
             "gauge",
-            "seconds until the first TLS certificate expires",
+            "seconds until the first of the TLS certificates expires",
             left,
         )
     if state.emergency_stop:
@@ -106,7 +106,7 @@ def _of_robot(state: RobotState) -> Iterator[tuple[str, Kind, str, Iterable[Samp
         yield "linear_speed_mps", "gauge", "measured, forward", [({}, state.linear)]
         yield "angular_speed_radps", "gauge", "measured; left is positive", [({}, state.angular)]
     pose = [({"axis": a}, v) for a, v in (("x", state.x), ("y", state.y), ("yaw", state.yaw))]
-    yield "pose", "gauge", "pose in the frame odom, m and rad", pose
+    yield "pose", "gauge", "pose in the frame odom, in m and rad", pose
     wheels = [({"wheel": w}, v) for w, v in zip(WHEELS, state.wheels, strict=False)]
     if wheels:
         yield "wheel_speed_radps", "gauge", "measured", wheels
@@ -142,7 +142,8 @@ NAMED = 5
 """Maximum number of clients that a log line about refusals names, the most frequent ones first."""
 
 KNOWN = 1000
-"""Maximum number of clients counted between two log lines. A client may use many addresses."""
+"""Maximum number of clients whose refusals are counted by client between two log lines. There is a
+maximum, because one client may use many addresses."""
 
 
 class Counts:
@@ -154,7 +155,7 @@ class Counts:
         self._refused: Counter[str] = Counter()
         self._told: Counter[str] = Counter()
         self._origins: Counter[str] = Counter()
-        """Refusals since the last log line, by the address and name of the client."""
+        """Number of refusals since the last log line, by the address and name of the client."""
 
     def add(self, name: str, more: int = 1) -> None:
         with self._lock:

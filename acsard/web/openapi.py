@@ -1,7 +1,7 @@
 """The page's interface for programs as an OpenAPI 3.1 document. This module is pure.
 
-The paths come from the table of routes, and the schemas from msgspec and `json_schema.SCHEMAS`, so
-a new row, key or field appears in the document without a change here.
+The paths come from the table `app.ROUTES`, and the schemas from msgspec and `json_schema.SCHEMAS`.
+So a new route, key or field appears in the document without a change here.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ LINES = (
     json_prompt.JobMessage, json_prompt.Doing, json_prompt.Progress, json_prompt.Question,
     json_prompt.Found, json_prompt.Result,
 )  # fmt: skip
-"""Types of the field `guide`, which reports a running check or calibration to the client."""
+"""Types of the values of the field `guide`, which reports a running check or calibration to the
+client."""
 
 KEYS = {topic.key: topic.type for topic in FOLLOWED}
 """Message type of each key to which a client can subscribe."""
@@ -66,7 +67,9 @@ def _value(key: str, kind: str) -> type[Struct]:
             ("age", Annotated[float, Meta(ge=0, description="ms")]),
             ("robot", Annotated[str, Meta(description="only for another robot")], ""),
         ],
-        namespace={"__doc__": "The newest message of this key; null if it is not readable."},
+        namespace={
+            "__doc__": "The newest message of this Zenoh key; null if the message is not readable."
+        },
         tag_field="key",
         tag=key,
     )
@@ -76,7 +79,10 @@ VALUES = tuple(_value(key, kind) for key, kind in KEYS.items())
 
 ERRORS = {
     "401": "The token is missing or not valid.",
-    "403": "The role is too low, or the request came through a proxy or from another web page.",
+    "403": (
+        "The role of the token is too low, or the request came through a proxy or from another "
+        "web page."
+    ),
     "429": "Too many requests, or too many wrong tokens.",
     "default": "Any other failure.",
 }
@@ -93,7 +99,7 @@ def document(version: str, routes: Sequence[Route]) -> Described:
     for kind in KINDS.values():
         schemas[kind.__name__]["x-least-role"] = kind.least
     messages, of_the_socket = _messages(), _of_the_socket(refs)
-    assert not (schemas | of_the_socket).keys() & messages.keys(), "one name for two types"
+    assert not (schemas | of_the_socket).keys() & messages.keys(), "two types have the same name"
     paths: Described = {}
     for row in described:
         paths.setdefault(row.path, {})[row.method.lower()] = _operation(row, refs)
@@ -102,9 +108,9 @@ def document(version: str, routes: Sequence[Route]) -> Described:
         "info": {
             "title": "acsard",
             "version": version,
-            "description": "The robot's page, for programs. On the robot itself no token is "
-            "needed. From other machines the header `Authorization: Bearer ...` "
-            "carries the token. `security` names the least role of the token.",
+            "description": "The interface of the robot's page for programs. A program on the "
+            "robot needs no token. A program on another machine sends its token in the header "
+            "`Authorization: Bearer ...`. `security` names the lowest role that may use a path.",
         },
         "paths": paths,
         "components": {
@@ -156,7 +162,10 @@ def _needed(kind: type | str) -> bool:
 
 
 def _messages() -> Described:
-    """Return the bus messages' schemas without `$defs`, which most readers cannot resolve."""
+    """Return the schemas of the bus messages, by name.
+
+    The types in `$defs` become schemas of their own, because most readers cannot resolve `$defs`.
+    """
     found: Described = {}
     for name, schema in SCHEMAS.items():
         whole = _flat(schema, f"{name}.")

@@ -37,13 +37,13 @@ hashes."""
 NICE = 19
 
 DRAW_S = 600.0
-"""Time limit for drawing a report, s. A full file, one to four hours, takes minutes."""
+"""Time limit for drawing a report, s. A full recording of one to four hours takes minutes."""
 
 ALONE_NS = 60 * NS_PER_S
 """Time, ns, after which the drawing of a report is cancelled if no client asks for its progress."""
 
 KEEP_NS = 900 * NS_PER_S
-"""Time, ns, after which a finished report is dropped if no client has asked for it."""
+"""Time, ns, after which a finished report is dropped if no client asks for it again."""
 
 BYTES = 32 << 20
 """Maximum size of a report, bytes; a typical one has 5 to 8 MB."""
@@ -52,15 +52,16 @@ MEMORY = 256 << 20
 """Limit of the data memory of the child process that draws a report, bytes."""
 
 TOO_LONG = (
-    f"it takes longer than {DRAW_S / 60:.0f} min here: fetch the recording, and draw it on a "
-    "faster machine with acsard recording report"
+    f"the drawing takes longer than {DRAW_S / 60:.0f} min here: fetch the recording, and draw its "
+    "report on a faster machine with acsard recording report"
 )
 TOO_MUCH = (
-    f"it takes over {MEMORY >> 20} MB of memory: draw it on another machine, with "
+    f"the drawing takes over {MEMORY >> 20} MB of memory: draw the report on another machine, with "
     "acsard recording report"
 )
 TOO_BIG = (
-    f"it has over {BYTES >> 20} MB: draw a part of it, with acsard recording report --from --to"
+    f"the report has over {BYTES >> 20} MB: draw a part of the recording, with "
+    "acsard recording report --from --to"
 )
 
 
@@ -69,7 +70,9 @@ class Recording(Struct, frozen=True):
 
     name: str
     begin: Annotated[float | None, Meta(description="s since 1970; null if unknown")]
-    seconds: Annotated[float | None, Meta(description="null if there is no end marker")]
+    seconds: Annotated[
+        float | None, Meta(description="duration; null if the recording has no end marker")
+    ]
     bytes: int
     events: Annotated[str, Meta(description="summary of the recorded events")]
 
@@ -92,7 +95,10 @@ class BlackBox:
             raise _unread(place, error) from None
 
     async def found(self, name: str) -> tuple[Path, tuple[int, int]]:
-        """Return a recording's path and a stamp that changes with it. Raises `RefusedError`."""
+        """Return a recording's path, and a stamp that changes when the recording changes.
+
+        Raises `RefusedError` if the recording does not exist.
+        """
         place = self._place()
 
         def look() -> tuple[Path, tuple[int, int]] | None:
@@ -122,7 +128,8 @@ class BlackBox:
         if not self._robots.about.recordings:
             raise TroubleError(
                 404,
-                "nothing is recorded: record.directory is not set. Set it and restart the daemon",
+                "the daemon records nothing, because record.directory is not set: set it and "
+                "restart the daemon",
             )
         return Path(self._robots.about.recordings)
 
@@ -178,10 +185,14 @@ class ReportState(Struct, frozen=True, omit_defaults=True):
     """The state of a report."""
 
     report: State
-    text: Annotated[str, Meta(description="why the report failed, or why to wait")] = ""
+    text: Annotated[str, Meta(description="why the report failed, or why the client must wait")] = (
+        ""
+    )
     percent: int = 0
     seconds: Annotated[float, Meta(description="since the drawing began")] = 0.0
-    href: Annotated[str, Meta(description="the finished report, relative to the page")] = ""
+    href: Annotated[
+        str, Meta(description="address of the finished report, relative to the page")
+    ] = ""
 
 
 class _Drawing:
@@ -206,26 +217,29 @@ class Reports:
     """Draws one report at a time, in a child process, and keeps the newest report in memory.
 
     A recording may contain text from unknown senders, so a report could contain a malicious script.
-    There are three defences. The report escapes the text. The policy in the report allows exactly
-    two scripts and no loading. `POLICY` gives the report an opaque origin, so a script in the
-    report could use neither the cookie nor the interface of the robot's page.
+    There are three defences. The report escapes the text. The content security policy inside the
+    report allows exactly two scripts, and does not allow the report to load anything. `POLICY`
+    gives the report an opaque origin, so a script in the report could use neither the cookie nor
+    the interface of the robot's page.
     """
 
     def __init__(self, command: Sequence[str] = ()) -> None:
-        """Set the command that draws a report; without one, `acsard recording report`."""
+        """Set the command that draws a report. The default is `acsard recording report`."""
         self._command = command or acsard("recording", "report", "--supervised")
         self._one: _Drawing | None = None
         self._work: asyncio.Task[None] | None = None
 
     def ask(self, path: Path, stamp: tuple[int, int]) -> ReportState:
-        """Return the progress of the report of a recording, and start drawing it if needed.
+        """Return the progress of the report of a recording, and start drawing the report if needed.
 
-        A report that failed, or whose `stamp` is old, is drawn again only after a client has
-        received its result.
+        A report is drawn again if it failed, or if `stamp` shows that the recording has changed
+        since. This happens only after a client has received the result of the previous drawing.
         """
         one, now_ns = self._one, clock.mono_ns()
         if one is not None and not one.ended and one.path != path:
-            return ReportState("busy", f"the report of {one.path.name} is being drawn: wait for it")
+            return ReportState(
+                "busy", f"the report of {one.path.name} is being drawn: wait until it is finished"
+            )
         if one is None or one.path != path or (one.told and (one.failed or one.stamp != stamp)):
             one = self._one = _Drawing(path, stamp)
             self._work = asyncio.get_running_loop().create_task(self._draw(one))
@@ -238,7 +252,10 @@ class Reports:
         return ReportState("drawing", percent=one.percent, seconds=round(seconds, 1))
 
     def drawn(self, name: str) -> bytes | None:
-        """Return the finished report as gzip, or None. Each call restarts the time `KEEP_NS`."""
+        """Return the finished report of the recording `name` as gzip, or None.
+
+        Each call restarts the time `KEEP_NS`, after which the report is dropped.
+        """
         one = self._one
         if one is None or one.path.name != name or not one.packed:
             return None
@@ -246,7 +263,10 @@ class Reports:
         return one.packed
 
     def tidy(self) -> None:
-        """Cancel an unwanted drawing, or drop an old report. Call this once a second."""
+        """Cancel the drawing, or drop the finished report, if no client has asked for it in time.
+
+        Call this once a second. The times are `ALONE_NS` and `KEEP_NS`.
+        """
         one = self._one
         if one is None:
             return
@@ -281,11 +301,13 @@ class Reports:
             code = await child.wait()
         if code == -signal.SIGKILL:
             raise _FailedError(
-                "the system ended it, most likely because memory ran out: draw it on another "
-                "machine, with acsard recording report"
+                "the operating system ended the drawing, most likely because memory ran out: draw "
+                "the report on another machine, with acsard recording report"
             )
         if code:
-            raise _FailedError(_why(said) or f"the drawing program {how_it_ended(code)}")
+            raise _FailedError(
+                _why(said) or f"the program that draws the report {how_it_ended(code)}"
+            )
         return body
 
 
@@ -312,7 +334,10 @@ async def _body(child: Process) -> bytes:
 
 
 async def _listened(child: Process, one: _Drawing) -> str:
-    """Read the child's error output. Store its progress in `one`, and return the other lines."""
+    """Read the child's error output until it ends, and return its lines as text.
+
+    Lines that are numbers are not returned. They are stored as the progress of the drawing `one`.
+    """
     assert child.stderr is not None
     said = ""
     while part := await child.stderr.read(1 << 12):

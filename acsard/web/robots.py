@@ -33,10 +33,12 @@ AGAIN_S = 1.0
 """Delay before the next attempt to reach a daemon that does not answer, s."""
 
 ASK_S, ASK_SOON_S = 10.0, 1.0
-"""Intervals of the queries for `About`, s: after an answer, and after a query without one."""
+"""Time until the next query of the values of `About`, s: after an answer, and after a query without
+an answer."""
 
 PATH_S, PATH_POINTS, PATH_STEP_M = 600.0, 5000, 0.02
-"""Limits of the drawn path: age of a point, s; number of points; minimum distance, m."""
+"""Limits of the drawn path: maximum age of a point, s; maximum number of points; minimum distance
+between two points, m."""
 
 T = TypeVar("T")
 
@@ -57,7 +59,7 @@ class About(Struct, frozen=True):
     recordings: str
     """Directory of the black box, "" if nothing is recorded."""
     timeouts: Mapping[str, float]
-    """The command sources and their timeouts, s."""
+    """Timeout of each command source, s, by the name of the source."""
 
 
 def _path() -> Track:
@@ -74,7 +76,10 @@ class _Asking:
         self._asked: asyncio.Task[None] | None = None
 
     def ask(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
-        """Query a key unless a query is still running; `take` is called with each reply."""
+        """Query a key, unless an earlier query is still running.
+
+        `take` is called with each reply.
+        """
         if self._asked is None or self._asked.done():
             self._asked = asyncio.create_task(self._ask(name, take))
 
@@ -87,11 +92,14 @@ class Robots:
     """The connection to the daemon of the page's robot, and the data for a newly opened page."""
 
     def __init__(self, address: Address, connect: Connect, about: About, counts: Counts) -> None:
-        """Store the arguments. `about` holds local values, used until the daemon answers."""
+        """Store the arguments.
+
+        `about` holds values of the local configuration. They are used until the daemon answers.
+        """
         self.id, self.endpoint = address.robot_id, address.endpoint
         self.certificate = shown_at(address.endpoint, address.tls)
-        """Common name of this server's certificate for the bus, a part of the public names of all
-        viewers; "" without TLS."""
+        """Common name of the TLS certificate with which this server connects to the bus; "" without
+        TLS. It is a part of the public names of all viewers."""
         self.about = about
         self.client: Client | None = None
         self.streams = Streams()
@@ -105,7 +113,10 @@ class Robots:
         self._watch: Watch | None = None
 
     async def run(self) -> None:
-        """Connect and follow the robot. Raises `MendableError` if trying again cannot help."""
+        """Connect to the robot's daemon, and process the robot's states until cancelled.
+
+        Raises `MendableError` if another attempt to connect cannot help.
+        """
         client = self.client = await self._reached()
         asking = asyncio.create_task(self._ask_again_and_again())
 
@@ -123,11 +134,11 @@ class Robots:
         return None if self._watch is None else self._watch.state
 
     def ask_anew(self) -> None:
-        """Query the facts in `about` at once, because they may have changed."""
+        """Query the values of `about` again at once, because they may have changed."""
         self._asks.set()
 
     def way(self) -> dict[str, list[tuple[float, float]]]:
-        """Return the points (x, y) of the recent paths, m.
+        """Return the points (x, y) of the robot's recent paths, m, by the name of the path.
 
         "path" is the robot's path in the odom frame, and "truth" is the true path of a simulator.
         """
@@ -152,7 +163,7 @@ class Robots:
             try:
                 return await call()
             except UNREADY:
-                self.gone = "the bus is stuck; the page tries again by itself"
+                self.gone = "the Zenoh bus is stuck; the page tries again by itself"
                 await asyncio.sleep(AGAIN_S)
 
     async def _follow(self, watch: Watch) -> None:
@@ -169,13 +180,13 @@ class Robots:
             quiet = watch.silent(now)
             if quiet and watch.unreadable:
                 self.gone = (
-                    "the daemon's state cannot be read: does the daemon have another version? Use "
-                    "the same version here"
+                    "the daemon's state cannot be read: does the daemon run another version of "
+                    "acsard? Use the same version here"
                 )
             elif quiet and (watch.heard or not self.gone):
                 self.gone = (
-                    f"nothing is received from the daemon at {self.endpoint}: does it run? "
-                    "`acsard doctor` on the robot checks it"
+                    f"nothing is received from the daemon at {self.endpoint}: does the "
+                    "daemon run? `acsard doctor` on the robot finds the cause"
                 )
             elif watch.heard and not quiet and self.gone:
                 self.gone = ""
@@ -194,7 +205,10 @@ class Robots:
             self._minute.add(now_ns, state, self._wished(now_ns))
 
     def _wished(self, now_ns: int) -> Twist | None:
-        """Return the last twist on `cmd_vel_out`; None if it is too old or no viewer follows it."""
+        """Return the last twist that was published on the key `cmd_vel_out`.
+
+        Return None if the twist is too old, or if no viewer is subscribed to this key.
+        """
         stream = self.streams.followed(self.id, "cmd_vel_out")
         raw = None if stream is None else stream.raw()
         # A commanded twist that is older than this is not plotted.
@@ -230,7 +244,7 @@ class Robots:
                 pass
 
     async def _ask(self) -> bool:
-        """Query the facts in `about`; return whether the daemon answered."""
+        """Query the values of `about`; return whether the daemon answered."""
         client = self.client
         assert client is not None
         try:

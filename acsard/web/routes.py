@@ -27,7 +27,8 @@ RECORDINGS: Role = "operator"
 JSON, FORM = "application/json", "application/x-www-form-urlencoded"
 
 PARAMETERS = {"type": "[A-Za-z0-9_]{1,80}"}
-"""Regular expressions of path parameters. Any other parameter matches any text without a slash."""
+"""Regular expressions of path parameters, by name. A parameter that is not listed matches any text
+without a slash."""
 
 _PARAMETER = re.compile(r"{(\w+)}")
 
@@ -45,12 +46,12 @@ class Problem(Struct, frozen=True):
 
 
 class Body(Struct, frozen=True):
-    """The body of an answer."""
+    """Description of the body of an answer."""
 
     what: str
     """Description for the OpenAPI document."""
     kind: Any = ""
-    """Type of the body, or the name of a message of the bus; "" for any value."""
+    """Type of the body, or the name of a bus message in `SCHEMAS`; "" for any value."""
     media: str = JSON
     """Media type of the body; "" for an answer without a body."""
 
@@ -59,7 +60,7 @@ class Route(Struct, frozen=True):
     """One row of the table of routes: an HTTP method on a path."""
 
     method: Literal["GET", "POST"]
-    """GET includes HEAD."""
+    """HTTP method. A route for "GET" also accepts HEAD."""
     path: str
     """The path as OpenAPI writes it: `{name}` is a parameter."""
     least: Role | None
@@ -68,18 +69,21 @@ class Route(Struct, frozen=True):
     summary: str = ""
     """Description for the OpenAPI document; "" leaves the row out of it."""
     takes: type | str | None = None
-    """Type of the request's body, or the name of a message of the bus; None without a body."""
+    """Type of the request's body, or the name of a bus message in `SCHEMAS`; None without a
+    body."""
     forms: tuple[str, ...] = (JSON,)
     """Media types of the request's body."""
     gives: Mapping[int, Body] = {}
-    """Body of the answer by HTTP status. The body of any other error is a `Problem`."""
+    """Maps each HTTP status to the body of the answer. For a status that is missing here, the body
+    is a `Problem`."""
     rate: Rate = REQUESTS
-    """Limit on the requests of one token. All rows with the same rate share one limit."""
+    """Limit on the rate of the requests of one token. All routes with the same rate share one
+    limit."""
     waits: bool = False
-    """True if a request beyond the rate waits; False if it is refused. A POST is carried out at
-    once, and only its answer waits. If true, `rate` applies to each token in each network
-    separately, so a program cannot use up the limit of a page that uses the same token in another
-    network."""
+    """True if a request beyond `rate` is delayed; False if it is refused. A POST is always carried
+    out at once, and only its answer is delayed. If true, `rate` applies to each token in each
+    network separately, so a program cannot use up the limit of a page that uses the same token in
+    another network."""
 
     @property
     def parameters(self) -> list[str]:
@@ -113,8 +117,8 @@ def services(handler: Handler) -> Iterator[Route]:
         # The daemon decodes the payload, so a refusal contains the daemon's message.
         takes = Which if verb == "stop" else SERVICES[verb].payload or None
         gives = {
-            200: Body("It was done.", "ServiceReply"),
-            409: Body("It was not done; the reason is in the answer.", "ServiceReply"),
+            200: Body("The service call succeeded.", "ServiceReply"),
+            409: Body("The service call failed; the reason is in the answer.", "ServiceReply"),
         }
         yield Route(
             "POST", f"/api/{key}", SERVICE_ROLES[verb], handler, notes[key],

@@ -39,7 +39,8 @@ TIDY_S, TELL_S = 1.0, 1.0
 
 FIELD_BYTES, FIELDS = 8190, 64
 """Maximum size of the request line and of a header, bytes; maximum number of headers. A browser
-sends the cookies for all ports of a host in one header, so a lower limit could lock it out."""
+sends the cookies for all ports of a host in one header, so a lower limit could lock out a
+browser."""
 
 LEAVE_S = 0.3
 """Time, s, that the server has at its shutdown to send zero velocities for viewers that drive."""
@@ -58,12 +59,15 @@ class Wanted(Struct, frozen=True):
     file: str = ""
     """Configuration file named on the command line, or ""."""
     supervised: bool = False
-    """True if the daemon started this server. It then uses a later port if the requested one is
-    taken, and ends when its standard input closes."""
+    """True if the daemon started this server. Such a server uses a later port if the requested one
+    is taken, and ends when its standard input closes."""
 
 
 async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], log: Log) -> None:
-    """Serve until a signal arrives; `announce` gets the bound addresses. Raises `MendableError`."""
+    """Serve until a signal arrives or the daemon that started this server ends.
+
+    `announce` is called with the bound addresses. Raises `MendableError`.
+    """
     # A command or a stop waits at most this long while another thread holds the interpreter.
     sys.setswitchinterval(0.0005)
     leaving = asyncio.Event()
@@ -140,7 +144,10 @@ async def _tell(counts: Counts, log: Log) -> None:
 
 
 async def _held(leaving: asyncio.Event) -> None:
-    """Send signs of life to the parent; set `leaving` when the parent closes the standard input."""
+    """Send signs of life to the parent process; set `leaving` when the parent ends this process.
+
+    The parent ends this process by closing the standard input.
+    """
     parent, loop = Parent(sys.stdin.fileno()), asyncio.get_running_loop()
 
     def look() -> None:
@@ -206,7 +213,7 @@ def _names(directory: str) -> set[str]:
 async def _renew(
     context: ssl.SSLContext, names: set[str], files: CertificateFiles, directory: str, log: Log
 ) -> None:
-    """Use each new certificate for later connections, and add its names to `names`."""
+    """Use changed certificate files for later connections, and add their names to `names`."""
     while True:
         await asyncio.sleep(TIDY_S)
         if not files.renewed():
@@ -217,5 +224,5 @@ async def _renew(
             names |= _names(directory)
             log.info(
                 "configuration",
-                text="the page has a new certificate and keeps its open connections",
+                text="the page uses its new TLS certificate and keeps its open connections",
             )

@@ -176,9 +176,11 @@ def decode(text: str) -> Frame:
 def _require(frame: Frame) -> None:
     # JSON has no NaN, and msgspec refuses a number that is too large to be finite.
     if isinstance(frame, Command) and not 0.0 < frame.stamp < LATEST_STAMP_MS:
-        raise FrameError("cmd", "stamp must be the time of the sender's clock in ms since 1970")
+        raise FrameError("cmd", "`stamp` must be the time of the sender's clock in ms since 1970")
     if isinstance(frame, Subscribe) and not 0.0 < frame.rate <= MAX_RATE:
-        raise FrameError("subscribe", f"rate must be above 0 and at most {MAX_RATE:g} a second")
+        raise FrameError(
+            "subscribe", f"`rate` must be above 0 and at most {MAX_RATE:g} messages a second"
+        )
 
 
 # The messages that the server sends.

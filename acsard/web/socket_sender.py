@@ -1,6 +1,6 @@
 """The outgoing side of one WebSocket: its subscribed keys, and the messages that it sends.
 
-While the client has not read earlier data, values are skipped and not queued.
+While the client does not read, new values of the keys are skipped instead of queued.
 """
 
 from __future__ import annotations
@@ -27,14 +27,18 @@ from acsard.web.socket_messages import Refused, Subscribe, Unsubscribe
 from acsard.web.streams import KEYS, UNREADY, Stream
 
 REPORTS = Rate(1.0)
-"""Limit on reports of refusals to a client, for each kind of message and each reason."""
+"""Limit on the reports to a client that its messages are refused, per second. It applies to each
+kind of message and each reason separately."""
 
 
 class Following:
     """A key to which the client has subscribed, and the time at which its next value is due."""
 
     def __init__(self, robot: str, name: str, own: str, period: float) -> None:
-        """Store a subscription. `own` is the id of the page's own robot, and `period` is in s."""
+        """Store a subscription to the key `name` of `robot`, with a value every `period` s.
+
+        `own` is the id of the page's own robot.
+        """
         self.robot, self.name, self.period = robot, name, period
         told = {"key": name} if robot == own else {"key": name, "robot": robot}
         self.head = msgspec.json.encode(told)[:-1] + b',"value":'
@@ -71,7 +75,10 @@ class Outgoing:
         self._news.set()
 
     def refuse(self, what: str, reason: Reason, text: str) -> None:
-        """Count a refused message, and tell the client why at most at the rate `REPORTS`."""
+        """Count a refused message, and report the reason to the client within the limit `REPORTS`.
+
+        `what` is the kind of the message.
+        """
         self._counts.refuse(reason, self._origin)
         if self._reports.take(f"{what} {reason}", clock.mono_ns()):
             self.say(Refused(what, text))
@@ -79,8 +86,8 @@ class Outgoing:
     async def pump(self, look_around: Callable[[float], float]) -> None:
         """Send messages until the task is cancelled or the connection closes.
 
-        `look_around(now)` is called in each round, and returns the time at which it must be called
-        again. `now` and the result are in s on the event loop's clock.
+        After each round of sending, `look_around(now)` is called. It returns the time at which it
+        must be called again. Both times are in s on the event loop's clock.
         """
         loop = asyncio.get_running_loop()
         try:
@@ -99,9 +106,10 @@ class Outgoing:
             pass  # closing; `Viewer.run` notices
 
     async def close(self, why: str) -> None:
-        """Send a close frame with `why`, at most 120 characters, and cut the connection after 1 s.
+        """Send a close frame with the reason `why`, and cut the connection 1 s later.
 
-        An immediate cut would look like a lost network to many programs.
+        `why` has at most 120 characters. Without the delay, many programs would report a lost
+        network.
         """
         if self._closing:
             return
@@ -120,9 +128,10 @@ class Outgoing:
             self._transport.abort()
 
     def pong(self, data: bytes) -> None:
-        """Queue the answer to the newest ping, and drop earlier answers, as the protocol allows.
+        """Queue the answer to a ping, in place of an unsent answer to an earlier ping.
 
-        So a client that sends pings and does not read cannot fill the memory.
+        The WebSocket protocol allows this. So a client that sends pings and does not read cannot
+        fill the memory.
         """
         self._pong = data
         self._news.set()
@@ -139,7 +148,10 @@ class Outgoing:
             await self._send(self._out.popleft())
 
     async def _send_due(self, one: Following, now: float) -> float:
-        """Send a value if it is due and new. Return the next due time, s on the loop's clock."""
+        """Send the newest value of a key if a value is due and this one has not been sent yet.
+
+        Return the time at which the next value is due, s on the event loop's clock.
+        """
         stream = one.stream
         if stream is None:
             return now + one.period  # `Keys._join` wakes the task when the stream exists
@@ -163,11 +175,15 @@ class Outgoing:
 MOST = 32
 
 FRAMES_HZ = 300.0
-"""Maximum message rate of all keys of a connection. Driving needs processor time too."""
+"""Maximum sum of the message rates of all keys of one WebSocket, Hz. The rest of the processor time
+is for driving."""
 
 
 class Keys:
-    """The subscriptions of one WebSocket, counted under `holder`, the client's token or name."""
+    """The subscriptions of one WebSocket.
+
+    They are counted under `holder`, which is the client's token, or its name without a token.
+    """
 
     def __init__(
         self,
@@ -179,7 +195,7 @@ class Keys:
         self._out, self._robots, self._start, self._holder = out, robots, start, holder
 
     def subscribe(self, frame: Subscribe) -> None:
-        """Subscribe to a key, or change its rate. Tell the client why if this is refused."""
+        """Subscribe to a key, or change its rate. If this is refused, tell the client why."""
         robot, key = frame.robot or self._robots.id, frame.subscribe
         try:
             require_id(robot)
@@ -196,19 +212,19 @@ class Keys:
             self._out.refuse(
                 "subscribe",
                 "too_many",
-                f"more than {FRAMES_HZ:g} messages a second in all: lower the rates",
+                f"all keys together have over {FRAMES_HZ:g} messages a second: lower the rates",
             )
         elif known is not None:
             known.period, known.due = 1.0 / frame.rate, 0.0
             self._out.wake()
         elif len(self._out.following) >= MOST:
             self._out.refuse(
-                "subscribe", "too_many", f"more than {MOST} keys followed: unsubscribe from some"
+                "subscribe", "too_many", f"you follow more than {MOST} keys: unsubscribe from some"
             )
         elif robot != self._robots.id and not self._shares.enter(self._holder, (robot, key)):
             text = (
-                f"one token may follow {STREAMS_OF_ONE} keys of other robots at once, "
-                f"and all tokens together {STREAMS}"
+                f"one token may follow at most {STREAMS_OF_ONE} keys of other robots at once, "
+                f"and all tokens together at most {STREAMS}"
             )
             self._out.refuse("subscribe", "too_many", f"{text}: unsubscribe from some")
         else:
@@ -260,7 +276,7 @@ class Keys:
             return await self._robots.streams.follow(client, one.robot, one.name)
         except UNREADY:
             self._out.refuse(
-                "subscribe", "stuck", "the bus is stuck; the page tries again by itself"
+                "subscribe", "stuck", "the Zenoh bus is stuck; the page tries again by itself"
             )
             await asyncio.sleep(AGAIN_S)
             return None

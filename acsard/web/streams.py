@@ -32,8 +32,8 @@ KEYS = frozenset(topic.key for topic in FOLLOWED)
 DECLARE_S = 3.0
 
 STATE = "state"
-"""Key of a robot's state. The state of another robot is not queried, because a router's storage
-would return a last state even if the robot was off for a week."""
+"""Key of a robot's state. The server does not query the state of another robot, because the storage
+of a router would answer with an old state even if the robot has been off for a week."""
 
 UNREADY = (TimeoutError, zenoh.ZError, UsageError)
 """Errors that mean that the bus is stuck or the session is closed. A later attempt may succeed."""
@@ -65,7 +65,10 @@ class Stream:
             self._newest = (self._newest[0] + 1, sample, clock.mono_ns())
 
     def answered(self, sample: zenoh.Sample) -> None:
-        """Store the answer to a query, unless a published message, which is newer, has arrived."""
+        """Store the answer to a query as the newest message.
+
+        If a published message has arrived already, ignore the answer, because it is older.
+        """
         with self._taking:
             if not self._newest[0]:
                 self._newest = (1, sample, clock.mono_ns())
@@ -84,19 +87,22 @@ class Stream:
 
 
 class Streams:
-    """Subscriptions to keys of robots, shared by their users until the last one leaves."""
+    """Subscriptions to keys of robots.
+
+    All users of a key share one subscription, which ends when the last user leaves.
+    """
 
     def __init__(self) -> None:
         self._streams: dict[tuple[str, str], Stream] = {}
         self._ending: set[asyncio.Task[None]] = set()
         self.shares = Shares(STREAMS, STREAMS_OF_ONE)
-        """Limits the subscriptions to keys of other robots. The caller of `follow` acquires a share
-        before the call, and releases it when it ends the subscription."""
+        """Limits the subscriptions to keys of other robots. A caller must acquire a share before it
+        calls `follow()` for such a key, and release the share when it calls `leave()`."""
 
     async def follow(self, client: Client, robot: str, key: str) -> Stream:
-        """Subscribe to a key of a robot if no other user has, and return the stream of messages.
+        """Return the stream of a robot's key. Subscribe to the key if no other user has done so.
 
-        Call `leave` after use. Raises an error of `UNREADY` if the bus is not ready.
+        Call `leave` after use. If the bus is not ready, one of the errors in `UNREADY` is raised.
         """
         name = robot, key
         stream = self._streams.get(name)
@@ -113,11 +119,14 @@ class Streams:
         return stream
 
     def followed(self, robot: str, key: str) -> Stream | None:
-        """Return the stream of a robot's key, or None if the stream has no user."""
+        """Return the stream of a robot's key, or None if no user follows the key."""
         return self._streams.get((robot, key))
 
     def leave(self, robot: str, key: str) -> None:
-        """Remove a user of a stream. After the last one, end the subscription in the background."""
+        """Remove one user of the stream of a robot's key.
+
+        If no user is left, end the subscription in the background.
+        """
         stream = self._streams.get((robot, key))
         if stream is None:
             return
@@ -161,7 +170,7 @@ async def _ended(subscriber: Any) -> None:
 
 
 def as_json(encoding: str, payload: bytes) -> bytes:
-    """Return a message as JSON, or null if it is not readable."""
+    """Return a message as JSON, or the JSON value null if the message cannot be decoded."""
     try:
         known = detect(encoding, payload) == "json"
         told = msgspec.json.decode(payload) if known else msgspec.msgpack.decode(payload)

@@ -26,7 +26,7 @@ from acsard.web.callers import Who
 FILE, MODE = "tokens.json", 0o600
 
 SERVICE = Path("/var/lib/acsard-web")
-"""State directory of the systemd service."""
+"""State directory of the systemd service that runs `acsard web`."""
 
 HOUR_S, DAY_S = 3600, 86400
 
@@ -54,11 +54,15 @@ class Vault:
     def __init__(self, directory: Path, robot: str) -> None:
         self.path, self.robot = directory / FILE, robot
         self._read: tuple[tuple[int, int] | None, list[Token]] = None, []
-        """Modification time, ns, and inode number of the file when it was read, and its tokens.
-        They are one value, because several threads replace it."""
+        """Two values in one tuple, because several threads replace them: the stamp of the token
+        file when it was last read (modification time, ns, and inode number), and all tokens in
+        it."""
 
     def known(self, text: str) -> Who | None:
-        """Return the owner of a valid token, or None. This does not read the file again."""
+        """Return the owner of the token `text`, or None if the token is not valid.
+
+        The token file is not read again, so a recent change of the file has no effect.
+        """
         return owner_in(self._own(self._read[1]), text)
 
     def left_s(self, digest: str) -> int:
@@ -97,8 +101,8 @@ class Vault:
         if self.path.parent == service or not os.path.lexists(service):
             return ""
         return (
-            f"this token is in {self.path}, which the service on this machine does not read: to "
-            "invite users to the page of the service, run this command with sudo"
+            f"this token is in {self.path}, a file that the service acsard-web on this machine "
+            "does not read: to invite users to the page of that service, run this command with sudo"
         )
 
     def invite(self, role: Role, name: str, days: int, hours: int = 0) -> tuple[str, Token]:
@@ -116,7 +120,9 @@ class Vault:
                     f"old token with --revoke {name}"
                 )
             if len(ours) >= MOST:
-                raise UsageError(f"there are {MOST} tokens already: revoke some with --revoke NAME")
+                raise UsageError(
+                    f"the robot already has {MOST} tokens: revoke some with --revoke NAME"
+                )
             text = secrets.token_urlsafe(32)
             ends = now_s + days * DAY_S + hours * HOUR_S
             token = Token(name, role, _digest(text), now_s, ends, self.robot)
@@ -124,19 +130,26 @@ class Vault:
         return text, token
 
     def revoke(self, name: str) -> None:
-        """Delete a token by name, effective at once; raises `UsageError` if it does not exist."""
+        """Delete the token with this name; the token is not valid from then on.
+
+        Raises `UsageError` if it does not exist.
+        """
         with self._changing() as tokens:
             ours = [one for one in tokens if one.robot == self.robot]
             if all(one.name != name for one in ours):
                 known = ", ".join(one.name for one in ours) or "none"
                 raise UsageError(
-                    f"there is no token {name} of {self.robot} in {self.path}; its tokens: {known}"
+                    f"there is no token {name} of {self.robot} in {self.path}; the robot's tokens: "
+                    f"{known}"
                 )
             tokens[:] = [one for one in tokens if (one.name, one.robot) != (name, self.robot)]
 
     @contextmanager
     def _changing(self) -> Iterator[list[Token]]:
-        """Yield the tokens under an exclusive lock. Write them back unless an exception occurs."""
+        """Yield the tokens of all robots, with exclusive access to the file for the `with` block.
+
+        At the end of the block, write the tokens back unless an exception occurred.
+        """
         directory = self.path.parent
         try:
             directory.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -173,7 +186,7 @@ class Vault:
 
 
 def place() -> Path:
-    """Return the token file's directory: the service's state directory or the user's own."""
+    """Return the directory of the token file: that of the service, or that of the user."""
     if "STATE_DIRECTORY" in os.environ:
         return Path(os.environ["STATE_DIRECTORY"].partition(":")[0])
     if os.geteuid() == 0 and SERVICE.is_dir():

@@ -1,6 +1,7 @@
 """Serves one WebSocket of a page or a program. To the daemon, each WebSocket is one sender.
 
-Incoming messages never wait for outgoing ones, so a client that does not read can still stop.
+Incoming messages never wait for outgoing ones, so a client that does not read can still stop the
+robot.
 """
 
 from __future__ import annotations
@@ -61,30 +62,33 @@ HEARTBEAT_S = 10.0
 CALLS_AT_ONCE = 8
 
 FLEET, FLEET_S, FLEET_FIRST_S = "fleet", 1.0, 0.2
-"""Key on which a client follows all robots; interval of the lists, s; delay of the first list, s.
-Without the delay, the first list would be empty."""
+"""Name to which a client subscribes for the list of all robots; interval of the lists, s; delay of
+the first list, s. Without the delay, the first list would be empty."""
 
 
 class ViewerCommands:
     """Puts the newest velocity command of each viewer on the bus.
 
-    A command is sent once, with the stamp of its sender, or it is dropped. The server creates only
-    one command of its own: a zero velocity for a viewer that was driving and has disconnected.
+    A command is either sent once, with the stamp of its sender, or dropped. The server itself
+    creates only one kind of command: a zero velocity for a viewer that was driving and has
+    disconnected.
     """
 
     def __init__(self, client: Callable[[], Client | None], counts: Counts) -> None:
         self._client, self._counts = client, counts
         self._rates = Buckets(COMMANDS)
         self.outbox = Outbox(partial(counts.add, "commands_dropped"))
-        """Queue of commands. If its thread dies, no zero is sent, so the server must exit."""
+        """Queue of commands, with the thread that sends them. If the thread dies, the server could
+        not stop the robot of a viewer that disconnects, so the server must exit."""
 
     def give(
         self, owner: str, source: str, commander: Commander, sender: Sender, wish: Wish
     ) -> bool:
-        """Queue a command, in place of an older one of the same commander that still waits.
+        """Queue a command, in place of an older command of the same commander that still waits.
 
-        `owner` is a token, or a viewer on the robot itself. If it exceeds the rate limit
-        `COMMANDS`, return False and queue nothing, except for a zero that ends a drive.
+        `owner` is the client's token, or the public name of a viewer on the robot itself. If the
+        owner exceeds the rate limit `COMMANDS`, return False and queue nothing. However, a zero
+        that ends a drive is always queued.
         """
         now_ns = clock.mono_ns()
         ends = wish.twist == REST and commander.drives(now_ns)
@@ -174,7 +178,10 @@ class Viewer:
             self._fleet.leave(self)
 
     def end(self, why: str) -> None:
-        """Release the robot and close the connection; `why` has at most 120 characters."""
+        """Stop the robot if this viewer may still drive it, and close the connection.
+
+        `why` is the reason for the client, with at most 120 characters.
+        """
         if self._ended:
             return
         self._ended = True
@@ -194,7 +201,7 @@ class Viewer:
             self._ping(message)
             return
         if message.type != aiohttp.WSMsgType.TEXT:
-            self._out.refuse("message", "malformed", "messages must be JSON as text")
+            self._out.refuse("message", "malformed", "messages must be JSON in text frames")
             return
         room = self._bucket.take(clock.mono_ns())
         if not room:
@@ -208,12 +215,17 @@ class Viewer:
             if room or urgent:
                 self._obey(frame)
             else:
-                self._refuse(frame, f"more than {MESSAGES.hz:g} messages a second: send fewer")
+                self._refuse(
+                    frame, f"you send more than {MESSAGES.hz:g} messages a second: send fewer"
+                )
         if self._overruns >= OVERRUNS:
             self.end("too many messages")
 
     def _ping(self, message: aiohttp.WSMessage) -> None:
-        """Answer a ping of the WebSocket protocol. The rate limit counts pings and pongs too."""
+        """Answer a ping of the WebSocket protocol.
+
+        The rate limit `MESSAGES` counts not only messages but also pings and pongs.
+        """
         if not self._bucket.take(clock.mono_ns()):
             self._overruns += 1
             if self._overruns >= OVERRUNS:
@@ -263,7 +275,7 @@ class Viewer:
             stamp_ns += 1
         if stamp_ns <= self._stamp_ns:
             self._out.refuse(
-                "cmd", "replayed", "stamp must be later than that of the previous command"
+                "cmd", "replayed", "`stamp` must be later than the previous command's stamp"
             )
             return
         self._stamp_ns = stamp_ns
@@ -271,11 +283,11 @@ class Viewer:
         commander = self._commanders.setdefault(frame.source, Commander())
         owner = self.who.token or self.sender
         if not self._commands.give(owner, frame.source, commander, self._sender, wish):
-            text = f"more than {COMMANDS.hz:g} commands a second with this token: send fewer"
+            text = f"this token sends more than {COMMANDS.hz:g} commands a second: send fewer"
             self._out.refuse("cmd", "too_fast", text)
 
     def _release(self) -> None:
-        """Queue a zero for each command source with which this viewer may still drive the robot."""
+        """Queue a zero velocity for each command source with which this viewer may still drive."""
         timeouts = self._robots.about.timeouts
         for source, commander in self._commanders.items():
             self._commands.outbox.release(commander, timeouts.get(source, LONGEST_S))
@@ -295,7 +307,11 @@ class Viewer:
             self._start(self._answer(frame))
 
     def _refuse(self, frame: Frame, text: str) -> None:
-        """Refuse a message beyond a limit. A call gets an answer, because its sender waits."""
+        """Refuse a message because it exceeds a limit.
+
+        If the message is a call, send the reason as the answer, because the client waits for an
+        answer.
+        """
         if isinstance(frame, Call):
             self._counts.refuse("too_fast", self.who.origin)
             self._out.say(socket_messages.Answer(frame.id, False, text))
@@ -352,7 +368,8 @@ class Viewer:
     def _look_around(self, now: float) -> float:
         """Tell the client what has changed, and send the list of robots when it is due.
 
-        Return the time of the next call. That time and `now` are in s on the event loop's clock.
+        Return the time at which this method must be called again. This time and `now` are in s on
+        the event loop's clock.
         """
         if self._robots.gone != self._gone:
             self._gone = self._robots.gone

@@ -257,7 +257,7 @@ def test_the_first_try_of_a_ros_user_is_answered_in_words(world: World, way: Way
     Speaker(world, way).hold(0.5, 5.0, hz=10.0)
     assert world.state.x == 0.0
     assert "send a zero first: app must send a zero" in world.state.reason
-    assert "`ros2 topic pub` of a speed never sends a zero" in world.state.reason
+    assert "`ros2 topic pub` with a speed never sends a zero" in world.state.reason
     (told,) = [event for event in world.events if event.name == "commands_without_effect"]
     assert told.text == f"app: {world.state.reason}"
 

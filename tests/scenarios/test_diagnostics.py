@@ -39,7 +39,7 @@ def test_a_source_that_is_refused_is_a_warning_as_long_as_it_is_refused(world: W
         world.send(0.3, source="nobody")
         world.hold(0.3, seconds=0.1)
         assert row(world, "commands").level == WARN
-    assert "source nobody: not one of commands.sources" in row(world, "commands").message
+    assert "source nobody: this source is not in commands.sources" in row(world, "commands").message
     world.hold(0.3, seconds=2.0)
     assert (row(world, "commands").level, world.state.source) == (OK, "app")
 

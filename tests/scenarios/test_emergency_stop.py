@@ -272,7 +272,7 @@ def test_a_clear_that_came_before_the_release_is_refused_also_if_one_step_takes_
             world.run(0.05)
         answer = json.loads(world.bus.replies[99][0].payload)
         assert (answer["success"], world.state.emergency_stop) == (False, "released")
-        assert "before the release" in answer["message"]
+        assert "before the cause of the stop or fault had ended" in answer["message"]
         assert world.state.mode == "stopped"
         assert world.call("clear").success
 

@@ -128,7 +128,7 @@ def test_a_stolen_secret_counts_under_no_other_certificate(certificate: str) -> 
         assert abs(turn_rate(world)) < 0.01
     assert (world.state.mode, world.state.sender) == ("driving", shown)
     assert world.state.counters["command_other_certificate"] == 50
-    assert "this sender id first came from" in world.state.refused
+    assert "this sender id is already in use" in world.state.refused
     world.run(1.0)
     refused = [event for event in world.events if event.name == "command_refused"]
     assert {event.by for event in refused} == {f"{shown.partition(' [')[0]} [mallory]"}

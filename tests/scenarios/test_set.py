@@ -57,7 +57,10 @@ def slopes(lines: list[tuple[float, float]]) -> list[float]:
 def test_a_daemon_without_a_file_keeps_nothing_and_sets_nothing(world: World) -> None:
     wishes = {"settings": {"limits.linear_speed": 0.4}, "keep": True}
     reply = world.call("set", msgspec.json.encode(wishes))
-    told = "nothing is set: this daemon has no configuration file; leave out `keep`"
+    told = (
+        "nothing is set: this daemon has no configuration file in which to keep settings; "
+        "leave `keep` out of the request"
+    )
     assert (reply.success, reply.message) == (False, told)
     assert config(world).limits.linear_speed == Config().limits.linear_speed
     assert world.call("set", msgspec.json.encode(wishes | {"keep": False})).success

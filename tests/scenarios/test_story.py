@@ -182,12 +182,12 @@ def first_run(host: Host) -> None:
     host.note("start", "^start: the daemon starts")
     host.run(3.0)
     host.world.wall_offset_ns += 10 * 3600 * NS_PER_S
-    host.note("wrong clock", "^clock: the clock of this computer was set forward by 10 h")
+    host.note("wrong clock", "^clock: the clock of the daemon's computer was set forward by 10 h")
     host.run(2.0)
 
     host.drive()
     host.hold(ANN, "teleop", 0.0, 0.5)
-    waits = "waits: sends speeds and must wait: the robot follows"
+    waits = "waits: this sender must wait: the robot follows the speeds of"
     host.note(
         "two commanders", rf"^commander: nav \({NAV}/\w+\) -> teleop \({ANN}/\w+\)", after=-0.5
     )
@@ -302,7 +302,7 @@ def first_run(host: Host) -> None:
     host.note(
         "damaged board",
         "^wheel fault: .*front_left wheel is left out .* check its encoder",
-        "^fault: front_left wheel turns against its command: check the motor's leads",
+        "^fault: front_left wheel turns against its command: check the leads of its motor",
         "^mode: driving -> fault: front_left wheel",
         after=0.3,
     )
@@ -340,9 +340,10 @@ def first_run(host: Host) -> None:
     host.hold(NAV, "nav", 0.5, 4.0)
     host.note(
         "the disk has room again",
-        r"^recording: to .* again; \d+ steps are missing, at most \d\.0 s "
+        r"^recording: the daemon records to .* again; \d+ steps are missing, at most \d\.0 s "
         r"\(.*No space left on device\)",
-        r"^continues: this recording continues an earlier one: driving, link up, .* \(by nav\)",
+        r"^continues: this recording continues an earlier recording. The robot is now: driving, "
+        r"link up, .* \(by nav\)",
     )
     host.hold(NAV, "nav", 0.5, 4.0)
     host.note(

@@ -28,7 +28,10 @@ REWORDED: tuple[tuple[str, str], ...] = (
     ("nothing but zeros", "only zeros"),
     ("which sends only zeros", "which has sent only zeros"),
     ("is kept waiting", "must wait"),
-    (r"sends none: (.*) has tools that", r"never sends a zero; \1 lists tools that"),
+    (
+        r"of a speed sends none: (.*) in (\S+) has tools that do",
+        r"with a speed never sends a zero; the section \1 of \2 lists tools that send one",
+    ),
     ("has the higher priority: until", "has priority: wait until"),
     (
         "of the same priority, came first: until",
@@ -42,11 +45,11 @@ REWORDED: tuple[tuple[str, str], ...] = (
     (r"\(told (.*), saw ", r"(commanded \1, measured "),
     (
         "look at cable, motor and encoder; if it is motor d, at",
-        "check cable, motor and encoder, and for motor d also",
+        "check cable, motor and encoder, and for motor d also the setting",
     ),
     (
-        "look at the motor's leads, its encoder's A and B, and",
-        "check the motor's leads, the A and B lines of its encoder, and",
+        "look at the motor's leads, its encoder's A and B, and its",
+        "check the leads of its motor, the wires A and B of its encoder, and the wheel's",
     ),
     (
         "the motor driver or its encoder is at fault",
@@ -68,6 +71,7 @@ REWORDED: tuple[tuple[str, str], ...] = (
     ("impossible feedback: ", "the board reports impossible speeds: "),
     (r"impossible speeds: (\w+) (-?\d)", r"impossible speeds: \1 at \2"),
     ("release it there", "release it at the robot"),
+    ("charge it to", "charge the battery to"),
     ("mend it, or switch", "repair the driver, or switch"),
     (
         "no motion leads away, so the robot stands until the release",
@@ -77,13 +81,13 @@ REWORDED: tuple[tuple[str, str], ...] = (
     (": only straight", ": the robot drives only straight"),
     ("stopped at the start, because", "stopped when the daemon started, because"),
     ("a stop cannot be kept over a restart", "a stop would not survive a restart"),
-    ("it is of another version", "another version wrote it"),
+    ("it is of another version", "another version of acsard wrote the file"),
     (
         r"what else runs here\? \(`top`; as a service it goes first\)",
-        "`top` shows which other program uses the processor; if acsard runs as the service, it "
-        "has priority",
+        "the Linux command `top` shows which other program uses the processor; acsard has priority "
+        "if it runs as the systemd service",
     ),
-    ("and this daemon reads", "but this daemon reads"),
+    ("and this daemon reads", "but this daemon reads format"),
     ("and heard nothing of the", "so it received nothing from the"),
     ("heard nothing of the", "received nothing from the"),
     ("and heard too little for a link", "so it received too little for a link"),
@@ -99,7 +103,7 @@ REWORDED: tuple[tuple[str, str], ...] = (
     ("nothing at all heard", "nothing was received"),
     (
         "is it powered, is this its port and mcu.baud_rate its own, are TX and RX crossed",
-        "does the board have power, is this its port, is mcu.baud_rate right, are TX and RX "
+        "does the board have power, is mcu.port its port, is mcu.baud_rate right, are TX and RX "
         "swapped",
     ),
     (
@@ -113,9 +117,9 @@ REWORDED: tuple[tuple[str, str], ...] = (
     ),
     (
         "what disturbs the cable, or prints on it too",
-        "is there noise on the cable, or does another program write to it too",
+        "is there noise on the cable, or does another program send on the cable too",
     ),
-    ("is mcu.baud_rate the board's own", "is mcu.baud_rate the rate of the board"),
+    ("is mcu.baud_rate the board's own", "is mcu.baud_rate the baud rate of the board"),
     ("look at cable, ground and baud rate", "check the cable, the ground and the baud rate;"),
     (
         "if its lines are further apart than ours, say so by mcu.reply_period",

@@ -68,7 +68,7 @@ BAD = [
     Bad(GO, "wrong_shape", "cmd/app", encoding="application/msgpack"),
     Bad(pack(twist(0.5)), "malformed", "cmd/app", encoding="application/json"),
     Bad(GO + b" " * 60_000, "too_big", "bytes"),
-    Bad(GO, "unknown_source", "not one of commands.sources", "cmd/stranger"),
+    Bad(GO, "unknown_source", "this source is not in commands.sources", "cmd/stranger"),
     Bad(GO, "wildcard", "exact key", "cmd/*"),
     Bad(GO, "wildcard", "exact key", "cmd/a$*"),
     Bad(GO, "wildcard", "exact key", "wheel_cmd/*"),

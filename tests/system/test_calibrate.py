@@ -72,7 +72,7 @@ def router(endpoint: str) -> Iterator[zenoh.Session]:
         yield session
 
 
-STARTS = "Enter starts it"
+STARTS = "Enter starts this drive"
 RIDES_S = 120.0
 
 
@@ -238,7 +238,7 @@ def test_a_person_with_a_tape_alone_is_guided_to_the_written_file(tmp_path: Path
     with running(tmp_path, config=SKIDDING) as (daemon, bus):
         said = goes_through(daemon, bus, "tape", reads)
         written = parse(daemon.config.read_bytes()).drive
-    assert "error of a turn of 360 deg" in said
+    assert "heading error after a turn of 360 deg" in said
     assert abs(written.wheel_separation_multiplier - 1.6 * 1.06) < 0.1
     assert written.left_wheel_radius_multiplier == pytest.approx(0.99, abs=0.006)
     assert written.right_wheel_radius_multiplier == pytest.approx(1.0, abs=0.006)
@@ -287,7 +287,7 @@ def test_a_person_with_a_wall_or_marks_is_guided_to_the_written_file(
         written = parse(daemon.config.read_bytes()).drive
     print(f"{way}: {written.wheel_separation_multiplier} {written.left_wheel_radius_multiplier} "
           f"{written.right_wheel_radius_multiplier}")  # fmt: skip
-    assert "error of a turn of 360 deg" in said
+    assert "heading error after a turn of 360 deg" in said
     assert abs(written.wheel_separation_multiplier - 1.6 * 1.06) < 0.1
     ratio = written.left_wheel_radius_multiplier / written.right_wheel_radius_multiplier
     assert ratio == pytest.approx(0.99, abs=0.006)

@@ -227,7 +227,7 @@ def test_echo_of_silence_ends_with_1_after_its_timeout(shared: Daemon) -> None:
             ["echo", "imu", "--csv", "--id", "acsra"],
             "there is no robot acsra. Robots here: acsar",
         ),
-        (["echo", "cmd/nobody"], "robot acsar is there, but no program sends on cmd/nobody now"),
+        (["echo", "cmd/nobody"], "but no program sends on the Zenoh key cmd/nobody now"),
     ],
 )
 @pytest.mark.nightly
@@ -242,7 +242,7 @@ def test_who_waits_for_what_does_not_come_is_told_why_once_and_goes_on_waiting(
         assert waiting.ended(5.0) == 0
     (told,) = waiting.stderr.splitlines()
     key = "state" if "state" in words else words[1]
-    assert told.startswith("acsard: waiting for acsard/acs")
+    assert told.startswith("acsard: waiting for messages on acsard/acs")
     assert f"/{key}: " in told
 
 
@@ -461,7 +461,8 @@ def test_set_changes_the_robot_that_runs_and_with_write_the_file(
         ended = typed(*words)
         assert (ended.code, ended.out) == (
             0,
-            'rates.state = 5.0 (was 10.0), log.level = "debug" (was "info"); until the next start',
+            'rates.state = 5.0 (was 10.0), log.level = "debug" (was "info"); '
+            "until the daemon's next start",
         )
         assert bus.get("config")["rates"]["state"] == 5.0
         assert "state = 10.0  # often" in file.read_text(encoding="utf-8")

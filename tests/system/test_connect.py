@@ -108,7 +108,7 @@ def test_two_daemons_that_see_each_other_directly_say_so_and_a_tool_how_many_it_
         toml = f'[robot]\nid = "two"\n[bus]\nlisten = ["{two.endpoint}"]\n'
         _, found = examined(tmp_path, toml + f'connect = ["{one.endpoint}"]\n')
         (mend,) = (each["mend"] for each in found["router"] if "not a router" in each["text"])
-        assert "connect all robots to a router" in mend
+        assert "connect all robots to a Zenoh router" in mend
         stopped = finish(acsard("call", "stop", "--id", "*", "--connect", one.endpoint), tmp_path)
         assert stopped.out.startswith("one: stopped")
         assert f"all robots visible at {one.endpoint}: 1 robot" in stopped.err

@@ -266,7 +266,7 @@ def test_a_key_that_others_may_read_is_a_failure(tmp_path: Path) -> None:
 
 def test_a_router_on_a_plain_endpoint_is_a_warning(tmp_path: Path) -> None:
     _, found = examined(tmp_path, toml(more='connect = ["tcp/127.0.0.1:7447"]\n'))
-    assert "every program behind that router" in worst(found["bus"])["text"]
+    assert "every program that is connected to that router" in worst(found["bus"])["text"]
 
 
 def test_for_people_each_finding_is_a_line_and_its_mend_another(tmp_path: Path) -> None:

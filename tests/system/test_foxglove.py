@@ -450,7 +450,7 @@ def test_each_viewer_is_a_sender_of_its_own(viewer: Viewer, shows: Shows, bus: B
         with Viewer(shows.port) as other, Panel(other, speed(-0.2)):
             other.status(
                 f"your commands do not drive the robot: another program, {first}, drives the "
-                "robot as app"
+                "robot as source app"
             )
             assert (bus.state()["linear"] or 0.0) > 0.0
     bus.at_rest()
@@ -582,13 +582,13 @@ def test_a_daemon_that_is_gone_is_reported_and_waited_for(tmp_path: Path) -> Non
         looked = viewer.show("/odom")
         looked.first()
         daemon.signal(signal.SIGKILL)
-        gone = viewer.status("the daemon of acsar is gone; this bridge waits for it")
+        gone = viewer.status("the daemon of robot acsar is gone; `acsard foxglove` waits for it")
         with Viewer(own.port) as late:
             late.show("/odom")
             late.status("is gone")
         assert not viewer.call("/acsard/stop", {})["success"]
         with Daemon(tmp_path, endpoint=endpoint, name="again"):
-            viewer.status("the daemon of acsar is back", 10.0)
+            viewer.status("the daemon of robot acsar is back", 10.0)
             until(lambda: gone["id"] in viewer.removed, 5.0, "it is not gone any more")
             count = len(looked.came)
             until(lambda: len(looked.came) > count + 10, 10.0, "odometry again")

@@ -102,7 +102,7 @@ async def test_a_key_stops_the_leg_and_all_others_see_that_it_goes_on(
         for number in range(150):
             await guided.ours.say(reply=number, value="start")
         refused = await guided.ours.find(lambda said: said.get("refused") == "reply")
-        assert "is not open" in refused["reason"]
+        assert "is over" in refused["reason"]
         assert (standing.state()["linear"] or 0.0) > 0.25
         pressed = time.monotonic()
         await guided.ours.say(press="key")
@@ -155,10 +155,10 @@ async def test_who_is_not_heard_any_more_drives_no_more(page: Page, standing: Bu
             await guided.answer(await guided.asks("How wide"), 300)
             await guided.starts()
             end = await guided.ended()
-            if "no sign of life" in end["text"]:
+            if "sent no sign of life" in end["text"]:
                 break
             await guided.says(lambda said: said.get("running") == "")
-        assert f"no sign of life from the operator arrived for {HEARD_S:g} s" in end["text"]
+        assert f"page or program sent no sign of life for {HEARD_S:g} s" in end["text"]
         await beside(standing.at_rest)
 
 

@@ -123,7 +123,9 @@ def test_a_stolen_secret_does_not_take_the_robot_under_another_certificate(robot
         refused = bus.count("command_other_certificate")
         states = attacked(robot, victim, victim._sender._id)
         assert bus.count("command_other_certificate") > refused
-        assert "this sender id first came from the robot's own machine" in bus.state()["refused"]
+        assert (
+            "this sender id is already in use on the robot's own machine" in bus.state()["refused"]
+        )
     assert not [state for state in states if abs(state["angular"] or 0.0) > 0.05]
     assert {state["sender"] for state in states if state["mode"] == "driving"} == {victim.sender}
     events = robot.daemon.events("command_refused")

@@ -30,7 +30,10 @@ def test_the_daemon_drives_checked_with_samples_and_leaves_with_a_stop(tmp_path:
     with Daemon(tmp_path, config=config) as daemon, Bus(daemon.endpoint) as bus:
         until(lambda: bus.state()["link"] == "up", 5.0, "link up")
         outcome = daemon.events("link_check")[-1]  # if a busy machine lost the link, there are two
-        assert outcome["text"] == "the serial lines are checked with samples"
+        assert (
+            outcome["text"]
+            == "the form of the lines on the serial port is now checked with samples"
+        )
         with connect(daemon.endpoint) as robot:
             began = time.monotonic()
             before = drives(robot)

@@ -217,7 +217,7 @@ def test_a_signal_while_a_wheel_turns_ends_in_zeros(tmp_path: Path, number: sign
                 check.process.wait(0.5)
             check.signal(number)
             assert check.ended(5.0) == (130 if number == signal.SIGINT else 128 + number)
-            assert "zeros go out" in check.stderr
+            assert "sends zero speeds" in check.stderr
             assert "Traceback" not in check.stderr
         # The next check finds the wheels at rest, and the port free.
         words = acsard("mcu", "check", "--port", port, "--yes")

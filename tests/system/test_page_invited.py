@@ -148,7 +148,7 @@ def test_a_link_with_fewer_permissions_is_used_only_after_a_question(
         stranger.opens(server.invite("viewer", f"lesser{agrees}"))
         until(lambda: browser.js("window.asked"), 15.0, "it asks")
         asked = browser.js("window.asked")
-        makes = f"mine{agrees} (operator) already; the link would make it lesser{agrees} (viewer)"
+        makes = f"mine{agrees} (operator); the link would sign it in as lesser{agrees} (viewer)"
         assert makes in asked
         stranger.shows("role", role)
         assert browser.js("location.hash") == ""

@@ -120,7 +120,7 @@ def test_a_fault_of_the_daemon_is_reported_and_the_input_of_that_step_is_recorde
         assert "ZeroDivisionError: a fault of our own" in said
     assert replayed(tmp_path, path) > 3
     again = finish(acsard("recording", "replay", str(path)), tmp_path)
-    assert "which ended the daemon, does not end this version" in again.out
+    assert "in which the recorded daemon failed, does not fail in this version" in again.out
 
 
 @pytest.mark.soak

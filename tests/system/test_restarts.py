@@ -277,7 +277,7 @@ def test_the_answer_of_a_stop_says_that_a_slow_disk_has_not_stored_it_yet(
         slow.touch()
         answer = bus.get("srv/stop")
         assert answer["success"]
-        assert "a restart may lose a stop" in answer["message"]
+        assert "it may lose a stop" in answer["message"]
         slow.unlink()
         file = daemon.states / "acsar.latches.json"
         until(lambda: "stopped by" in file.read_text(), 5.0, "the disk has the stop")

@@ -278,7 +278,7 @@ async def test_without_its_library_a_report_is_refused_with_what_to_type(
         async with aiohttp.ClientSession(without.here) as session:
             _, told = await drawn(session)
             assert (told["status"], told["report"]) == (503, "failed")
-            assert re.search("needs the library plotly; run: .*pip install.*report", told["text"])
+            assert re.search("needs the library plotly; .*pip install.*report", told["text"])
 
 
 @pytest.mark.slow

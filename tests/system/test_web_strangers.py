@@ -344,7 +344,7 @@ def test_who_was_refused_is_told_by_address_and_by_the_name_of_the_token(
         async with hands(page, operator) as ours:
             for _ in range(2):
                 await ours.say(cmd={"linear_x": 0.1, "angular_z": 0}, stamp=1763700000000.0)
-            await ours.find(lambda said: said.get("reason", "").startswith("stamp must"))
+            await ours.find(lambda said: said.get("reason", "").startswith("`stamp` must"))
 
     run(story)
     until(lambda: told("from 127.0.0.1 (tv)") and told("from 127.0.0.1 (phone)"), 10.0, "named")

@@ -220,7 +220,7 @@ def test_a_viewer_s_foxglove_is_told_what_he_may(robot: Robot) -> None:
             assert viewer.call("/acsard/stop", {})["success"]
             for source in ("nav", "app"):
                 viewer.show(f"/cmd_vel_in/{source}")
-            deaf = "clients over TLS cannot receive the commands of the sources (/cmd_vel_in/…)"
+            deaf = "clients over TLS cannot receive the commands that programs send to the robot"
             viewer.status(deaf)
         with Viewer(port) as late:
             late.show("/odom").first()

@@ -109,7 +109,7 @@ def test_it_starts_says_it_is_ready_publishes_and_drives(
     # Without AF_NETLINK the daemon gets this far and then publishes nothing.
     until(lambda: driver.states(began), 5.0, "it publishes")
     driver.drives(board)
-    status = "driving 0.5 m/s by app"
+    status = "driving at 0.5 m/s, commanded by app"
     until(lambda: container.show("StatusText") == status, 3.0, "its status says so")
     driver.sends(0.0)
     until(lambda: "0.0 m/s" in container.show("StatusText"), 3.0, "its status follows")

@@ -1,8 +1,9 @@
 """Computes the error budget of a drive: the odometry error that each single cause makes.
 
 The errors of one cause are propagated alone through the error model of the odometry
-(`core/motion/uncertainty.py`). The recorded drive is repeated until the robot has driven 100 m, for
-the position error, and until it has turned by 360 deg to one side, for the heading error.
+(`core/motion/uncertainty.py`). For the position error, the computation repeats the recorded drive
+until the robot has driven 100 m. For the heading error, it repeats the drive, with all turns to the
+left, until the robot has turned by 360 deg.
 
 Feedback lines show the errors of stamps, quantization, gaps and contradicting wheels. A gyro shows
 the error of the track. The noise of the gyro is taken from the variance that the odometry
@@ -43,14 +44,17 @@ LEAST_LINES = 20
 """Minimum number of feedback lines. With fewer, the robot is treated as standing still."""
 
 STEP_S = 0.1
-"""Minimum length of the steps into which a drive is divided, s."""
+"""Minimum duration of the steps into which a drive is divided, s."""
 
 MOST_STEPS = 20_000
-"""Maximum number of steps in 100 m of driving. In a slow drive, steps are longer than `STEP_S`."""
+"""Maximum number of steps in 100 m of driving. A slow drive has steps longer than `STEP_S`."""
 
 STRAIGHT = Steps(np.array([[0.05, 0.0] + [0.0] * 7]))
 SPIN = Steps(np.array([[0.0, 0.05] + [0.0] * 7]))
-"""Steps without errors (`STRAIGHT` 0.05 m, `SPIN` 0.05 rad), used if the robot stood still."""
+"""Steps of 0.05 m ahead (`STRAIGHT`) and of 0.05 rad on the spot (`SPIN`), without errors.
+
+If the robot stood still, its budget is computed for these steps.
+"""
 
 
 NOISE = (
@@ -67,7 +71,7 @@ PARAMETERS = (
 
 
 class Share(Struct, frozen=True):
-    """Standard deviations due to one cause alone, each None if this drive does not show it."""
+    """The odometry errors that one cause alone makes, as standard deviations; None if unknown."""
 
     cause: Cause
     mm_per_100_m: float | None
@@ -96,7 +100,7 @@ class Budget(Struct, frozen=True):
     gyro: bool
     """True if the heading comes from a gyro."""
     still: bool
-    """True if the robot hardly moved. `shares` then contains only errors that settings declare."""
+    """True if the robot hardly moved. `shares` then contains only errors that settings state."""
     at_rest: tuple[float, float]
     """Standard deviations of linear (m/s) and angular (rad/s) speed at rest, due to rounding."""
     shares: tuple[Share, ...]
@@ -106,9 +110,9 @@ class Budget(Struct, frozen=True):
     """Mean ratio of effective track to wheel separation that the gyro implies; None if unknown."""
     learned_std: float = 0.0
     learned_used: bool = False
-    """True if the odometry uses `learned` for turns that only the wheels measure."""
+    """True if the odometry uses `learned` for turns that only the wheels, not a gyro, measure."""
     coarse: bool = False
-    """True if the wheel speeds jump like those of coarse encoders, and the counts are unknown."""
+    """True if the wheel speeds jump as with coarse encoders, and the encoder counts are unknown."""
 
     def largest(self, *bases: Basis) -> Share | None:
         """Return the share with the largest position error, among the shares with one of `bases`.
@@ -123,9 +127,10 @@ class Budget(Struct, frozen=True):
         return None
 
     def total(self) -> tuple[float | None, float | None]:
-        """Return the errors of all causes together, in mm after 100 m and deg after a turn.
+        """Return the errors of all causes together, in mm after 100 m and deg after a full turn.
 
-        The causes are independent, so squares are added. An error is None if all causes are None.
+        The causes are independent, so the squares of their errors are added. A total is None if the
+        errors of all causes are None.
         """
         return _squares([share.mm_per_100_m for share in self.shares]), _squares(
             [share.deg_per_turn for share in self.shares]
@@ -139,7 +144,7 @@ class Received(Struct, frozen=True):
     sent: list[float]
     """Times at which the daemon sent lines to the microcontroller, s."""
     whole: bool = True
-    """True if `lines` contains every feedback line that the daemon received."""
+    """True if `lines` contains nearly every feedback line that the daemon received."""
     counted: bool = False
     """True if feedback lines carry encoder counts and the microcontroller's time."""
     gyro: bool = False
@@ -149,9 +154,9 @@ class Received(Struct, frozen=True):
     deviation: float = 0.0
     """Relative standard deviation of `learned`."""
     used: bool = False
-    """True if the odometry uses `learned` for turns that only the wheels measure."""
+    """True if the odometry uses `learned` for turns that only the wheels, not a gyro, measure."""
     coarse: bool = False
-    """True if the wheel speeds jump like those of coarse encoders, and the counts are unknown."""
+    """True if the wheel speeds jump as with coarse encoders, and the encoder counts are unknown."""
 
 
 def budget(received: Received, config: Config, metres: float = METRES) -> Budget:
@@ -240,7 +245,8 @@ class _Model:
     def __init__(self, config: Config, metres: float) -> None:
         self.odometry, self.kinematics = config.odometry, Kinematics(config.drive)
         self.rolls = self.turns = True
-        """Whether position errors (`rolls`) and heading errors (`turns`) can be extrapolated."""
+        """Whether the drive suffices to extrapolate position errors (`rolls`) and heading errors
+        (`turns`)."""
         self._metres = metres
 
     @property
@@ -254,7 +260,7 @@ class _Model:
         """Return the errors that one cause makes.
 
         Args:
-            basis: the source of their size. If it is "unknown", the errors are None.
+            basis: the source of the errors' size. If it is "unknown", the errors are None.
             ahead: the steps to repeat for the position error.
             left: the steps to repeat for the heading error, with all turns to the left.
             only: the settings without the errors of other causes.

@@ -14,7 +14,7 @@ from acsard.terminal.output import table
 MEANING: dict[Cause, str] = {
     "time": "errors in the times of feedback lines",
     "quantization": "rounding of the values in a feedback line",
-    "gaps": "distance driven while no feedback lines came",
+    "gaps": "distance driven while no feedback lines arrived",
     "slip": "wheels that skid",
     "parameters": "wheel radii and track",
     "gyro": "bias, noise and scale of the gyro",
@@ -29,10 +29,11 @@ ADVICE: dict[Cause, str] = {
     "look for a loose cable, noise on the wire or a busy machine (`acsard top`); if the feedback "
     "lines carry encoder counts, a lost line loses no distance (mcu.link_check, "
     "mcu.encoder_counts)",
-    "slip": "drive on other ground or turn less on the spot; a gyro measures turns that "
-    "skidding wheels do not show ([odometry] gyro)",
+    "slip": "drive on other ground, turn less on the spot, or use a gyro ([odometry] gyro), which "
+    "measures turns that skidding wheels do not show",
     "parameters": "run `acsard calibrate`: it measures wheel radii and effective track",
-    "gyro": "let the robot stand for a second now and then, so that it learns the gyro's bias",
+    "gyro": "let the robot stand for a second now and then, so that the daemon learns the bias of "
+    "the gyro",
 }
 
 BASIS: dict[Basis, str] = {
@@ -42,14 +43,14 @@ BASIS: dict[Basis, str] = {
 }
 
 COARSE = (
-    "the encoders are coarse and the daemon does not know their counts, so an error in the time "
-    "of a feedback line becomes an error of the heading: write mcu.encoder_counts, the counts per "
-    "wheel turn (`acsard mcu check` estimates them)"
+    "the encoders are coarse and the daemon does not know how many counts they have per wheel "
+    "turn, so an error in the time of a feedback line becomes an error of the heading: write this "
+    "number as mcu.encoder_counts (`acsard mcu check` estimates it)"
 )
 
 CALIBRATE = (
-    "the error of wheel radii and track width is unknown, and if the wheels skid, it is usually "
-    "the largest error: run `acsard calibrate`"
+    "the errors of the configured wheel radii and track width are unknown, and if the wheels skid, "
+    "they are usually the largest errors: run `acsard calibrate`"
 )
 
 
@@ -65,11 +66,14 @@ def parts(budget: Budget) -> Iterator[RenderableType]:
 
 
 def advice(budget: Budget) -> str:
-    """Return advice on the largest measured cause, and on a declared cause if that is larger."""
+    """Return advice on the largest measured cause of errors.
+
+    If the settings of `[odometry]` state a larger error, the advice covers its cause as well.
+    """
     if budget.still:
         return (
             "drive the robot, also around curves, while the tool measures: a robot that stands "
-            "does not show most causes"
+            "does not show most causes of errors"
         )
     measured, largest = budget.largest("measured"), budget.largest("measured", "settings")
     advice = [COARSE] if budget.coarse else []
@@ -77,12 +81,13 @@ def advice(budget: Budget) -> str:
         advice.append(CALIBRATE)
     if largest is not None and largest is not measured:
         advice.append(
-            f"according to the settings in [odometry], the largest cause is {largest.cause}: "
-            f"{_advice_on(largest, budget)}"
+            "according to the settings in [odometry], the largest cause of errors is "
+            f"{largest.cause}: {_advice_on(largest, budget)}"
         )
     if measured is not None:
         advice.append(
-            f"the largest measured cause is {measured.cause}: {_advice_on(measured, budget)}"
+            f"the largest measured cause of errors is {measured.cause}: "
+            f"{_advice_on(measured, budget)}"
         )
     return "; ".join(advice) or "this drive shows no error of the odometry"
 
@@ -100,7 +105,7 @@ def _driven(budget: Budget) -> str:
 def _table(budget: Budget) -> Table:
     causes = [(s.cause, s.mm_per_100_m, s.deg_per_turn, MEANING[s.cause], BASIS[s.basis])
               for s in budget.shares]  # fmt: skip
-    total = ("all", *budget.total(), "root of the sum of their squares", "")
+    total = ("all", *budget.total(), "square root of the sum of the squares above", "")
     rows = [
         (name, _number(mm, 0), _number(deg, 2), *words)
         for name, mm, deg, *words in [*causes, total]
@@ -129,12 +134,12 @@ def _standing(budget: Budget) -> str:
     counts = budget.counts
     return (
         f"the robot stands still ({budget.lines} feedback lines in {budget.seconds:.1f} s), so "
-        "errors of driving cannot be measured. Wheel speeds in two decimals of rad/s leave the "
+        "errors of driving cannot be measured. Wheel speeds with two decimals (rad/s) leave the "
         f"twist uncertain by {1e3 * along:.2f} mm/s and {1e3 * turning:.1f} mrad/s; "
         + (
             f"the encoders have {counts} counts per wheel turn"
             if counts
-            else "the counts of the encoders are not known"
+            else "the daemon does not know the encoder counts per wheel turn"
         )
         + f"; {_declared(budget)}"
     )
@@ -146,8 +151,9 @@ def _declared(budget: Budget) -> str:
     if share is None or share.basis == "unknown":
         return "wheel radii and track were never calibrated"
     return (
-        f"wheel radii and track are known to {_number(share.mm_per_100_m, 0)} mm in 100 m ahead "
-        f"and {_number(share.deg_per_turn, 2)} deg a turn"
+        "the uncertainty of wheel radii and track causes an error of "
+        f"{_number(share.mm_per_100_m, 0)} mm in 100 m straight ahead and "
+        f"{_number(share.deg_per_turn, 2)} deg in a full turn of the robot"
     )
 
 
@@ -166,10 +172,10 @@ def _advice_on(share: Share, budget: Budget) -> str:
         )
     if 0 < budget.counts <= COARSE_COUNTS:
         return (
-            f"the encoders have {budget.counts} counts per wheel turn: use finer encoders, on the "
-            "shafts of the motors"
+            f"the encoders have only {budget.counts} counts per wheel turn: use encoders with more "
+            "counts, on the shafts of the motors"
         )
     return (
-        "a plain feedback line has only two decimals: let the feedback lines carry encoder counts "
-        "(mcu.link_check)"
+        "the speeds in a plain feedback line have only two decimals: set mcu.link_check, so that "
+        "the microcontroller adds encoder counts to the feedback lines"
     )

@@ -27,25 +27,26 @@ from acsard.daemon.bus.subscription import encoded
 from acsard.host.errors import ReplyError
 
 KEYS = ("odom", "wheel_states", "cmd_vel_out")
-"""Keys of the messages that an error budget needs."""
+"""Zenoh keys of the messages that an error budget needs."""
 
 MOST = 60_000
 """Maximum number of feedback lines that are kept: ten minutes at 100 Hz."""
 
 SHARE_COARSE = 0.1
-"""Fraction of feedback lines with signs of coarse encoders, above which the report says so."""
+"""Fraction of feedback lines with signs of coarse encoders above which the report mentions them."""
 
 LEAST_LOST, SHARE_LOST = 3, 0.01
 """Number and fraction of feedback lines that this program may miss. The larger limit applies.
 
-A few are always missing: the counters and the messages do not start and stop together.
+A few are always missing, because the daemon's counters and its messages are not read at the same
+moment.
 """
 
 SAMPLED = "checked with samples"
-"""Value of `check` in `diagnostics` if the feedback lines carry encoder counts."""
+"""Value of `check` in the message `diagnostics` if the feedback lines carry encoder counts."""
 
 LOOK_S = 0.05
-"""Period in which the message queues are polled, s."""
+"""Interval at which the message queues are polled, s."""
 
 
 def budgets(robot: Client, config: Config, seconds: float) -> Iterator[Budget]:
@@ -66,7 +67,7 @@ def _await_line(robot: Client, lines: Subscription) -> None:
     end = time.monotonic() + FIRST_S
     while lines.try_recv() is None:
         if time.monotonic() > end:
-            raise ReplyError(f"no feedback lines come: {robot.get('state').reason}")
+            raise ReplyError(f"the daemon receives no feedback lines: {robot.get('state').reason}")
         time.sleep(LOOK_S)
 
 
@@ -81,13 +82,13 @@ def _follow(feed: Feed, queues: Mapping[str, Subscription], seconds: float) -> N
                     feed.add(decoders[key].decode(*encoded(sample)))
                 except DecodeError as error:
                     raise ReplyError(
-                        f"cannot read {key} ({error}); does the daemon have another version? Use "
-                        "the same version here"
+                        f"cannot read the daemon's messages on the Zenoh key {key} ({error}): if "
+                        "the daemon has another version of acsard, use that version here too"
                     ) from None
 
 
 class Feed:
-    """Collects the messages of a daemon. Call `add` for each message, and then `received`."""
+    """Collects the messages of a daemon. Call `add()` for each message, and then `received()`."""
 
     def __init__(self, config: Config, first: RobotState) -> None:
         """Start the collection. `first` is the daemon's state just before the first message."""
@@ -100,7 +101,7 @@ class Feed:
         self._count = 0
 
     def add(self, message: Message) -> None:
-        """Add a message of one of `KEYS`. The messages of each key must be in order."""
+        """Add a message of one of `KEYS`. The messages of a key must be in order of time."""
         if isinstance(message, TwistStamped):
             self._sent.append(message.header.stamp.to_ns())
         elif isinstance(message, Odometry):
@@ -111,7 +112,7 @@ class Feed:
             self._join(message.header.stamp.to_ns())
 
     def received(self, last: RobotState, diagnostics: DiagnosticArray) -> Received:
-        """Return the drive so far. `last` and `diagnostics` are the daemon's latest messages."""
+        """Return the drive so far. `last` is the daemon's latest state."""
         learned, deviation, used = _learned(diagnostics)
         return Received(
             list(self._lines),

@@ -45,19 +45,20 @@ At 100 Hz they take 0.3 s, the longest time for which a busy host does not run t
 """
 
 MISSING = 0.6
-"""If the smallest delay among `AHEAD` lines grows by this number of periods, a line was lost."""
+"""If the smallest delay among `AHEAD` lines grows by this many periods, a line was lost."""
 
 FOLLOWED = 0.05
-"""Gain of the low-pass filter that computes the expected delay from the smallest delays.
+"""Gain of the low-pass filter that follows the smallest delay among `AHEAD` lines.
 
-The delays drift because the period is at first known only to about 1 %.
+This delay drifts because the period is at first known only to about 1 %.
 """
 
 CLUSTERED, ALIKE_TIMES = 0.4, 0.25
-"""Limits for taking the median interval between lines as the period, instead of the mean.
+"""Limits that decide whether the period of lines is their median or their mean interval.
 
-More than the fraction `CLUSTERED` of the intervals must differ from the median by less than the
-fraction `ALIKE_TIMES` of the median. If lines arrive in bursts, fewer do.
+The median is taken if more than the fraction `CLUSTERED` of the intervals differ from the median by
+less than the fraction `ALIKE_TIMES` of the median. Otherwise the lines arrive in bursts, and the
+mean is taken.
 """
 
 
@@ -75,7 +76,7 @@ def line_times(t: Floats, sent: Floats) -> LineTimes:
 
     `t` contains the stamps of at least 3 feedback lines, s, and `sent` the times of the daemon's
     lines, s. One estimate assumes a fixed period, the other a board that answers each line of the
-    daemon. The one with the smaller delays is returned.
+    daemon. The estimate with the smaller delays is returned.
     """
     even = _even(t)
     asked = _asked(t, sent)
@@ -141,19 +142,20 @@ def _missing(at: Floats) -> Counts:
 
 
 BLOCK_S = 0.5
-"""Time within which errors of line stamps are correlated, s. Stalls of the host are shorter."""
+"""Time within which errors of line stamps are correlated, s, because one stall causes them."""
 
 LEAST_LINES, ALIKE = 20, 0.99
 """Limits for the fit that separates the noise of the gyro from its scale error.
 
 `LEAST_LINES` is the minimum number of lines while the robot moves. If the turns are nearly
-proportional to time (cosine above `ALIKE`), the fit cannot separate the two.
+proportional to time (cosine above `ALIKE`), the fit cannot separate noise and scale error.
 """
 
 LATEST_S = 0.1
 """Largest delay of a feedback line, s, that counts as an error of its stamp.
 
-An interval of at least this length in which the pose did not move counts as a gap.
+Two successive lines that are at least this far apart enclose a gap if the pose did not move between
+them.
 """
 
 Wheels = tuple[float, float, float, float]
@@ -164,11 +166,11 @@ class Line(Struct, frozen=True):
     """A feedback line and the odometry computed from it."""
 
     at: float
-    """Stamp, s since the start."""
+    """Stamp of the line, s since the start of the measurement."""
     speeds: Wheels
     """Wheel speeds, rad/s."""
     positions: Wheels
-    """Wheel angles since the start of the daemon, rad."""
+    """Angles that the wheels have rolled since the daemon started, rad."""
     yaw: float
     """Heading, rad."""
     yaw_variance: float
@@ -176,35 +178,36 @@ class Line(Struct, frozen=True):
 
 
 class Motion(Struct, frozen=True):
-    """The motion between feedback lines, and its errors. Arrays start with the second line."""
+    """The motion from line to line, and its errors. Arrays have no row for the first line."""
 
     seconds: float
     period: float
     """Mean interval between two lines, s."""
     distance: Floats
-    """Signed distance, m."""
+    """Distance from each line to the next, m, negative backwards."""
     turn: Floats
-    """Turn, rad."""
+    """Turn from each line to the next, rad, positive to the left."""
     yaw_variance: Floats | None
-    """Variance of the heading due to the noise of the gyro, rad2; None if it is unknown."""
+    """Variance that the noise of the gyro adds to each turn, rad2; None if it is unknown."""
     late: Floats
-    """Errors of the motion due to wrong stamps, rows of (m, rad)."""
+    """Errors of distance and turn due to wrong stamps, rows of (m, rad)."""
     lateness: float
     """RMS error of the stamps, s."""
     filled: Floats
-    """Variances (m2, rad2) of the motion in gaps that the odometry filled; 0 without such a gap."""
+    """Variances (m2, rad2) of the motion that the odometry assumed for lost lines; 0 elsewhere."""
     unfilled: Floats
-    """Motion in unfilled gaps, which the pose missed, and its variances: (m, rad, m2, rad2)."""
+    """Motion that the pose missed during gaps, and its variances: rows of (m, rad, m2, rad2)."""
     missing: int
     unseen: float
-    """Total duration of the gaps, s."""
+    """Total duration of the gaps in the feedback, s."""
 
 
 def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool) -> Motion:
-    """Compute the motion of a drive of at least 3 feedback lines, and its errors.
+    """Compute the motion between at least 3 feedback lines, and the errors of this motion.
 
     `sent` contains the times of the daemon's lines, s. `whole` is true if this program received
-    every line that the daemon received. If it is false, lost lines do not count as filled gaps.
+    every line that the daemon received. If `whole` is false, a missing line may have been lost on
+    the way to this program, so it does not count as an error of the odometry.
     """
     t = np.array([line.at for line in lines])
     found = line_times(t, sent)
@@ -234,8 +237,8 @@ def _noise(t: Floats, speeds: Floats, turns: Floats, variances: Floats) -> Float
     The gyro's scale error adds to the variance as well: S^2 A^2, where S is the relative standard
     deviation of the scale and A the turn since the pose was set. A line with the turn dA adds
     2 S^2 A dA. A is unknown at the first line, so a least-squares fit estimates A and the noise.
-    The result is None if the fit cannot separate the two. The variance is 0 while the wheels stand
-    still.
+    The result is None if the fit cannot separate the noise from A. The variance is 0 for lines at
+    which the wheels stand still.
     """
     # Leave out the lines in which the variance falls, because the pose was set there.
     dt, moves = np.diff(t), speeds[1:].any(axis=1) & (variances[1:] > variances[:-1] / 2)
@@ -306,21 +309,24 @@ def _gaps(
 
 
 TOGETHER = 0.8
-"""Fraction of lines with equal speeds at which two wheels have the same rounding errors."""
+"""Two wheels with equal speeds in at least this fraction of lines have equal rounding errors."""
 
 LEAST_VALUES = 3
 """Minimum number of different speeds that are needed to find a quantization step."""
 
 
 class Rounding(Struct, frozen=True):
-    """Rounding errors of wheel speeds: a row for each feedback line, columns as `values.WHEELS`."""
+    """Rounding errors of wheel speeds.
+
+    `variance` and `offset` have a row for each feedback line and the columns of `values.WHEELS`.
+    """
 
     variance: Floats
-    """Variance of the angle rolled since the last line, rad2. Errors of lines are independent."""
+    """Variance of the angle that a wheel rolled since the previous line, rad2."""
     offset: Floats
     """Known error of the angle that a wheel rolled from line to line, rad."""
     alike: Floats
-    """Pairs of wheels with the same errors: 1 for such a pair, otherwise 0; shape (4, 4)."""
+    """1 for a pair of wheels with equal rounding errors, 0 for another pair; shape (4, 4)."""
     quantum: float
     """Quantization step, rad/s."""
     count: float
@@ -330,7 +336,8 @@ class Rounding(Struct, frozen=True):
 def rounding(speeds: Floats, period: float) -> Rounding:
     """Estimate the errors that the rounding of wheel speeds causes.
 
-    `speeds`, rad/s, has a row for each line and a column for each wheel. A line covers `period` s.
+    `speeds`, rad/s, has a row for each line and a column for each wheel. `period` is the
+    time between lines, s.
     """
     moving = np.any(speeds != 0.0, axis=1)
     same = speeds[moving][:, :, None] == speeds[moving][:, None, :]
@@ -345,7 +352,7 @@ def rounding(speeds: Floats, period: float) -> Rounding:
 
 
 def _runs(values: Floats) -> Floats:
-    """Return the variances of the rounding errors of a wheel, as multiples of q^2 / 12.
+    """Return the variances of a wheel's rounding errors, divided by (quantization step)^2 / 12.
 
     A run of n equal speeds has the variance n^2 at its last speed, and 0 at the others. If the
     wheel passed through this speed while it became faster or slower, the last variance is 1.
@@ -378,7 +385,7 @@ class Steps(Struct, frozen=True):
     """One row for each step, with nine columns:
 
     - 0, 1: distance (m) and turn (rad) of the step
-    - 2, 3: variances of both (m2, rad2) that are independent of other steps
+    - 2, 3: variances of distance and turn (m2, rad2), independent of other steps
     - 4, 5: motion that the pose missed (m, rad), with the same sign in each step
     - 6, 7: variances of the missed motion (m2, rad2)
     - 8: variance of the turn if a gyro measured it (rad2)
@@ -387,7 +394,7 @@ class Steps(Struct, frozen=True):
     """Whether a gyro measured the turns. Otherwise the wheels did."""
 
     def to_the_left(self) -> Steps:
-        """Return the steps, with those to the right mirrored so that all turns are to the left."""
+        """Return the steps with right turns mirrored, so that all turns are to the left."""
         rows = self.rows.copy()
         rows[rows[:, 1] < 0.0] *= (1, -1, 1, 1, 1, -1, 1, 1, 1)
         return Steps(rows, self.by_gyro)
@@ -396,7 +403,8 @@ class Steps(Struct, frozen=True):
 class Driving:
     """Divides a drive into steps of about `step_s` s.
 
-    Each method adds the errors of one cause. `gyro` is true if a gyro measured the turns.
+    Each method returns the steps with the errors of one cause. `gyro` is true if a gyro measured
+    the turns.
     """
 
     def __init__(
@@ -407,7 +415,7 @@ class Driving:
         self._each = max(1, round(step_s / motion.period))
         twists = [kinematics.twist(WheelSpeeds(*row)) for row in np.eye(4).tolist()]
         self._weights = np.array([[t.linear for t in twists], [t.angular for t in twists]])
-        """Motion of the robot if one wheel rolls by 1 rad, shape (2, 4): rows in m and in rad."""
+        """Distance (row 0, m) and turn (row 1, rad) of the robot if one wheel rolls 1 rad."""
 
     def plain(self) -> Steps:
         """Return the steps without errors."""
@@ -431,7 +439,7 @@ class Driving:
         return self._steps(squares)
 
     def missed(self) -> Steps:
-        """Return the steps with the errors of times without feedback lines."""
+        """Return the steps with the errors that gaps in the feedback cause."""
         return self._steps(self._motion.filled, self._motion.unfilled)
 
     def rounded(self) -> Steps:
@@ -446,9 +454,10 @@ class Driving:
         return self._steps(np.column_stack(variances))
 
     def contradicted(self) -> Steps:
-        """Return the steps with the errors of wheels that contradict each other.
+        """Return the steps with the errors that differences between front and rear wheels show.
 
-        One of a side's two wheels is assumed right, so their mean is wrong by half the difference.
+        On each side, one of the two wheels is assumed to be right. The mean of the two is then
+        wrong by half their difference.
         """
         turned = np.diff([line.positions for line in self._lines], axis=0)
         front_right, front_left, rear_left, rear_right = turned.T
@@ -456,7 +465,7 @@ class Driving:
         return self._steps(missed=self._of_wheels(np.column_stack([right, left, left, right])))
 
     def _of_wheels(self, off: Floats) -> Floats:
-        """Return the motion missed because of the wheel angle errors `off`, rad: (m, rad, 0, 0)."""
+        """Return the missed motion (m, rad, 0, 0) if the rolled angles are wrong by `off`, rad."""
         moved = off @ self._weights.T
         return np.hstack([moved, np.zeros_like(moved)])
 
@@ -464,9 +473,9 @@ class Driving:
         self, variances: Floats | None = None, missed: Floats | None = None,
         gyro: Floats | None = None,
     ) -> Steps:  # fmt: skip
-        """Return the steps with these errors of all lines but the first; None means no error.
+        """Return the steps with these errors, given for all lines but the first; None means 0.
 
-        The columns are those of `Steps.rows`: 2, 3 (`variances`), 4 to 7 (`missed`) and 8 (`gyro`).
+        In `Steps.rows`, `variances` fill columns 2 and 3, `missed` 4 to 7, and `gyro` 8.
         """
         moved, count = self._motion, len(self._motion.distance)
         errors = [

@@ -20,10 +20,10 @@ from acsard.calibration.log_table import Floats
 from acsard.core.link.whole_counts import ROUNDING
 
 FINEST = 4 * ROUNDING
-"""Finest step that is searched, rad/s. A finer step would fit over half of all speeds by chance."""
+"""Finest step that is tried, rad/s. A finer step would fit over half of all speeds by chance."""
 
 DEVIATION = 0.01 / math.sqrt(12)
-"""Standard deviation of the rounding to two decimals, rad/s."""
+"""Standard deviation of the error of rounding to two decimals, rad/s."""
 
 STRAYS = 0.005
 """Fraction of the speeds that need not be multiples of the step, because of damaged lines."""
@@ -32,7 +32,10 @@ BY_CHANCE = 1e-5
 """A step is rejected if its probability of fitting all speeds by chance exceeds this value."""
 
 STEEP = 1.0
-"""Step, rad/s, above which there is no test against chance: only coarse encoders jump this much."""
+"""Smallest step, rad/s, that is accepted without a check against `BY_CHANCE`.
+
+Only the speeds of coarse encoders jump this much.
+"""
 
 
 def quantization_step(speeds: Floats) -> float:
@@ -53,7 +56,7 @@ def quantization_step(speeds: Floats) -> float:
 
 
 def _strays(speeds: Floats, step: float, doubt: float) -> int:
-    """Return how many speeds are not multiples of `step`, whose relative error is up to `doubt`."""
+    """Count the speeds that are not multiples of `step`. Its relative error is up to `doubt`."""
     off = np.abs(speeds - step * np.round(speeds / step))
     return int(np.count_nonzero(off > ROUNDING + doubt * speeds))
 

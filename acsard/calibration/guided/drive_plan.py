@@ -1,6 +1,7 @@
 """The types of a guided drive: `Method`, `Leg`, `Move` and measurements, and the robot's `Setup`.
 
-The command line and the page import this module to name the methods, so it does not load numpy.
+`acsard calibrate` and the web page import this module for the names of the methods. It does not
+import numpy, so that they start quickly.
 
 The robot stays within its limits and on a floor of 3 m x 3 m. Before the calibration it is unknown
 how far the robot turns for a command. The plan must therefore work for an effective track of 1 to
@@ -26,8 +27,8 @@ from acsard.core.values import AcsardError, Twist
 from acsard.terminal.prompt import Ask
 
 NEEDS: dict[str, str] = {
-    "gyro": "a gyro on the key imu, and a tape measure",
-    "positions": "positions on a key",
+    "gyro": "a gyro on the Zenoh key imu, and a tape measure",
+    "positions": "positions of the robot on a Zenoh key",
     "tape": "a tape measure and a straight line on the floor",
     "wall": "a straight wall and a tape measure",
     "umbmark": "a tape measure and marks",
@@ -37,8 +38,9 @@ NEEDS: dict[str, str] = {
 SIMULATED = (
     "positions",
     "The simulator has no floor to measure with a tape. Use either the method positions with the "
-    "key sim/pose (the true position), or the method gyro if [odometry] gyro is on; then leave "
-    "its distance empty. The methods tape, wall and umbmark are for a real robot.",
+    "Zenoh key sim/pose (the true position), or the method gyro if [odometry] gyro is on; the "
+    "method gyro asks for a distance, which you leave empty. The methods tape, wall and umbmark "
+    "are for a real robot.",
 )
 """The method of calibration to use first on the simulator, and the reason."""
 
@@ -76,7 +78,7 @@ Quantity = Literal["turned", "angle", "distance", "ahead", "aside"]
 - `turned`: the turn in rad, positive to the left, including whole turns.
 - `angle`: the turn in rad, positive to the left, with an unknown number of whole turns.
 - `distance`: the straight-line distance in m.
-- `ahead`, `aside`: the displacement in m, along the first heading and to the left of it.
+- `ahead`, `aside`: the displacement in m, along the heading of that pose and to the left of it.
 """
 
 
@@ -91,25 +93,34 @@ class Mean(Struct, frozen=True):
     plus: float = 0.0
     """Constant to add, m or rad, for example the whole turns that the person does not measure."""
     over: tuple[str, ...] = ()
-    """Names of the legs whose motion the person measured. () means only the last leg."""
+    """Names of the legs whose total motion the person measured; () means the leg just driven."""
 
 
 class Slant(Struct, frozen=True):
-    """A measurement of the robot's turn, from the distances of two of its points from a line."""
+    """A measurement of the robot's turn, computed from two points' distances from a line."""
 
     quantity: Quantity
     near: str
-    """Name of the answer with the distance of the point that a left turn moves towards the line."""
+    """Name of the answer that gives the distance of one point of the robot from the line.
+
+    A turn to the left moves this point towards the line.
+    """
     far: str
-    """Name of the answer with the distance of the point that a left turn moves away."""
+    """Name of the answer that gives the distance of the other point of the robot from the line.
+
+    A turn to the left moves this point away from the line.
+    """
     apart: str
-    """Name of the answer, asked before the first leg, with the distance between both points."""
+    """Name of the answer with the distance between the two points.
+
+    The tool asks for this distance once, before the first leg.
+    """
     since: str = ""
-    """Name of the leg after which the start angle was measured; "" if the robot began parallel."""
+    """Name of the leg after which the start angle to the line was measured; "" for 0."""
     plus: float = 0.0
     """Whole and half turns to add, rad, because the angle to the line does not show them."""
     over: tuple[str, ...] = ()
-    """Names of the legs whose motion the person measured. () means only the last leg."""
+    """Names of the legs whose total motion the person measured; () means the leg just driven."""
 
 
 Measure = Mean | Slant
@@ -126,9 +137,9 @@ class Leg(Struct, frozen=True):
     """Questions that the person answers after the moves."""
     measures: tuple[Measure, ...] = ()
     by_key: bool = False
-    """Whether the person ends the last move with a key. Its duration is then a timeout."""
+    """Whether the person ends the last move with a key. The move's duration is then a timeout."""
     placed: bool = False
-    """Whether a person places the robot before this leg, so that readings begin at a known pose."""
+    """Whether a person places the robot before this leg, so that the leg begins at a known pose."""
 
     @property
     def seconds(self) -> float:
@@ -136,10 +147,10 @@ class Leg(Struct, frozen=True):
 
 
 ROOM = 3.0
-"""Side of the free floor, m."""
+"""Side length of the square floor that must be free, m."""
 
 MOST_S = 90.0
-"""Longest driving time of all legs of a method together, s. The tests check each method."""
+"""Limit for the driving time of all legs of a method together, s. A test checks each method."""
 
 USUAL_SPEED = 0.3
 """Speed straight ahead in a guided drive, m/s, unless the robot's limits are lower."""
@@ -185,7 +196,7 @@ class Setup(Struct, frozen=True):
 
     @property
     def from_edge(self) -> float:
-        """Distance of the robot's middle from the near edge before the straight drive, m."""
+        """Distance of the robot's middle from the floor's edge before the straight drive, m."""
         return self.reach + EDGE
 
     @property
@@ -198,7 +209,10 @@ class Setup(Struct, frozen=True):
         return Move(abs(metres) / self.speed, math.copysign(self.speed, metres))
 
     def spin(self, rate: float, seconds: float) -> Move:
-        """Return a turn on the spot to the left at `rate` rad/s. A robot that skids turns less."""
+        """Return a turn on the spot at `rate`, rad/s, positive to the left, for `seconds`.
+
+        A robot that skids turns more slowly than `rate`.
+        """
         return Move(seconds, 0.0, self.command(rate))
 
     def arc(self, rate: float, metres: float) -> Move:
@@ -245,13 +259,14 @@ class Setup(Struct, frozen=True):
 Legs = Callable[[Setup, float], tuple[Leg, ...]]
 """Function that returns the legs for a setup and a ratio of effective track to separation.
 
-The first `turned` measurement shows the ratio. The legs up to it must not depend on the ratio.
+The first `turned` measurement shows the ratio. The legs up to that measurement must not depend on
+the ratio.
 """
 
 TRACKS = [1.0 + 0.05 * step for step in range(round((WIDEST - 1.0) / 0.05) + 1)]
 """Ratios of effective track to wheel separation for which the driving time is computed.
 
-With a smaller ratio, a leg may have one more full turn and take longer.
+The largest ratio need not take longest: with a smaller one, a leg may have one more full turn.
 """
 
 
@@ -279,17 +294,18 @@ def setup(config: Config) -> Setup:
     speed = min(speed, wheel)
     if speed < LEAST_SPEED or limits.angular_speed < LEAST_TURN:
         raise GuideError(
-            f"the limits do not let the robot drive at {LEAST_SPEED} m/s and turn at {LEAST_TURN} "
-            "rad/s: either raise limits.linear_speed, limits.angular_speed, limits.wheel_speed or "
-            "limits.linear_deceleration, or record a drive and use --log"
+            f"the calibration must drive at {LEAST_SPEED} m/s and turn at {LEAST_TURN} rad/s, but "
+            "the configured limits are too low: either raise limits.linear_speed, "
+            "limits.angular_speed, limits.wheel_speed or limits.linear_deceleration, or "
+            "record a drive and use --log"
         )
     reach = REACH * drive.wheel_separation + drive.wheel_radius / 2
     length = min(LONGEST, ROOM - 2 * (reach + EDGE) - STOPS_IN)
     if length < SHORTEST:
         raise GuideError(
-            f"the robot is too large to be calibrated on {ROOM:g} m x {ROOM:g} m "
-            f"(drive.wheel_separation = {drive.wheel_separation:g}): record a drive where there "
-            "is room, and use --log"
+            f"the robot is too large to be calibrated on a floor of {ROOM:g} m x {ROOM:g} m "
+            f"(drive.wheel_separation = {drive.wheel_separation:g}): record a drive "
+            "on a larger floor, and use --log"
         )
     return Setup(
         drive,

@@ -26,13 +26,21 @@ DEVIATES_S = 1.0
 """Time for which the robot may deviate from the command before the leg is halted, s."""
 
 LINEAR_OFF, ANGULAR_OFF, OFF_SHARE = 0.05, 0.15, 0.3
-"""Allowed deviation of the wheels from a command: m/s, rad/s, plus a fraction of the command."""
+"""Limits for the twist at the wheels minus the commanded twist.
+
+The difference may be `LINEAR_OFF` m/s and `ANGULAR_OFF` rad/s, each plus the fraction `OFF_SHARE`
+of the command.
+"""
 
 STILL = 0.02
 """Largest speed at which a wheel is considered to stand still, rad/s."""
 
 STANDING_S, STANDS_S = 0.5, 6.0
-"""Limits for the end of a leg, s: the wheels stand still for `STANDING_S` within `STANDS_S`."""
+"""Times for the end of a leg, s.
+
+The leg is done when the wheels have stood still for `STANDING_S`. If that takes longer than
+`STANDS_S`, the leg is halted.
+"""
 
 ENTER = "\r\n"
 PRESSED = "a key was pressed"
@@ -68,9 +76,9 @@ class LegDriver:
         self._begun = self._received = self._stepped = self._changed = now
         self._number, self._ends = -1, now
         self._command = REST
-        self._waits = "no state of the daemon has arrived"
+        self._waits = "no message with the daemon's state has arrived"
         """The reason why the daemon does not accept the commands yet, or ""."""
-        self._starved = f"no command of source {source} has arrived for {OPENING_S:g} s"
+        self._starved = f"the daemon has received no command of source {source} for {OPENING_S:g} s"
         """Reason to halt the leg if this computer is too busy to send commands."""
         self._still_since: float | None = None
         self._deviates_since: float | None = None
@@ -141,7 +149,7 @@ class LegDriver:
         elif now - self._received > QUIET_S:
             late = held_up > QUIET_S / 2
             self.silent = self.silent or not (late or self.over)
-            silence = "nothing received from the daemon: does it run (`acsard doctor`)?"
+            silence = "no messages of the daemon arrive: does the daemon run (`acsard doctor`)?"
             self._halt(HELD_UP if late else silence, disturbed=late)
         if self.phase is Phase.OPENING:
             self._open(now)
@@ -191,8 +199,8 @@ class LegDriver:
     def _tolerate_briefly(self, why: str, now: float, *, disturbed: bool) -> None:
         """Halt the leg if the reason `why` has lasted for `DEVIATES_S`; "" means no reason.
 
-        If this computer is busy for a moment, it sends commands late, and the robot only slows
-        down. `disturbed` tells whether the leg can be repeated afterwards.
+        A shorter deviation is harmless: if this computer is busy for a moment, it sends commands
+        late, and the robot only slows down. `disturbed` tells whether the leg can be repeated.
         """
         if not why:
             self._deviates_since = None
@@ -214,7 +222,8 @@ class LegDriver:
     def _deviation(self, state: RobotState, now: float) -> str:
         """Return a sentence about how the wheels deviate from the command, or "" if they do not.
 
-        A gyro's turn rate is not compared: a robot that skids turns less than commanded.
+        Only wheel speeds are compared with the command. The turn rate of a gyro is not, because a
+        robot that skids turns less than commanded.
         """
         if now - self._changed < OBEYED_S:
             return ""
@@ -228,7 +237,8 @@ class LegDriver:
             if abs(actual - commanded) > off + OFF_SHARE * abs(commanded):
                 return (
                     f"the wheels turn at {actual:.2f} {unit} although {commanded:.2f} is "
-                    "commanded: is there another commander, a limit or an obstacle?"
+                    "commanded: does another program send commands, or is there a limit or an "
+                    "obstacle?"
                 )
         return ""
 

@@ -26,7 +26,7 @@ from acsard.calibration.multipliers import LEAST_M
 from acsard.terminal.prompt import Ask
 
 TAPE_M = 0.005
-"""Standard deviation of a straight drive measured by tape, m, with the errors at both ends."""
+"""Standard deviation of a straight drive's length by tape, m, with the errors at both ends."""
 
 BY_EYE = 0.07
 """Standard deviation of a heading that a person judges by eye, rad."""
@@ -41,7 +41,7 @@ FIRST_TURN = 1.2
 """Turn rate that the first turn on the spot would have without skidding, rad/s."""
 
 MISSED = 1.1
-"""Timeout of the first turn, as a multiple of the time for a circle with the widest track."""
+"""Timeout of the first turn, as a multiple of the time for a full turn with the track `WIDEST`."""
 
 MOST_SPIN_S = 24.0
 """Longest time of a leg with several full turns on the spot, s."""
@@ -136,7 +136,9 @@ def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
             placed=True,
         ),
         Leg(
-            "back", "The robot drives back to the middle.", (setup.ahead(-setup.to_middle), SETTLE)
+            "back",
+            "The robot drives back to the middle of the floor.",
+            (setup.ahead(-setup.to_middle), SETTLE),
         ),
         around,
         spun("slowly", -1, 0.6, ROUND),
@@ -253,7 +255,7 @@ def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
         Ask(marks.format("left"), "mm", -1500, 1500, name="left"),
         Ask(marks.format("right"), "mm", -1500, 1500, name="right"),
         Ask(
-            "How far to the left of its marks is the robot (negative if to the right)?",
+            "How far to the left of its marks is the robot (negative if to the right of them)?",
             "mm", -1500, 1500, name="aside",
         ),
     )  # fmt: skip
@@ -262,11 +264,11 @@ def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
         corner = setup.turn(side * math.pi / 2, CORNER_RATE, track)
         return Leg(
             f"square to the {to}",
-            f"Place the robot's middle {(ROOM - edge) / 2:.2f} m from the near edge and the same "
-            f"distance from the {other} edge, facing the far edge. Make two marks on the floor: "
-            "one exactly beside the middle of its left side, one exactly beside the middle of its "
-            f"right side. The robot drives a square of {edge:.2f} m with turns to the {to}, and "
-            "ends about where it started.",
+            f"Place the robot's middle {(ROOM - edge) / 2:.2f} m from the near edge of the floor "
+            f"and the same distance from its {other} edge, facing the far edge. Make two marks on "
+            "the floor: one exactly beside the middle of the robot's left side, one exactly beside "
+            f"the middle of its right side. The robot drives a square with sides of {edge:.2f} m "
+            f"and turns to the {to}, and ends about where it started.",
             (STOP, *(setup.ahead(edge), STOP, corner, STOP) * 4),
             ends,
             (
@@ -289,11 +291,11 @@ def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
         ),
         once_round(
             setup,
-            "exactly when it has turned one full circle and faces as before; the tool asks how far "
-            "it turns on after that.",
+            "exactly when it has turned one full circle and faces as before; the tool then asks "
+            "how far the robot has turned on.",
             (
                 Ask(
-                    "How many degrees past a full circle did it turn (negative if less)?",
+                    "How many degrees past a full circle did the robot turn (negative if less)?",
                     "deg", -90, 90, name="past",
                 ),
             ),
@@ -308,13 +310,21 @@ def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
 # floor although its effective track is unknown.
 
 FAST, SLOW, CURVE = 1.5, 0.75, 0.8
-"""Rates that fast turns, slow turns and curves would have without skidding, rad/s."""
+"""Turn rates that fast turns, slow turns and curves would have without skidding, rad/s."""
 
 SPIN_S, CURVE_M, TURN_RAD = 7.5, 1.2, 5.0
-"""Sizes of moves: turns in "gyro" (s), curves (m), turns in "positions" (rad without skidding)."""
+"""Sizes of moves in the methods "gyro" and "positions".
+
+- `SPIN_S`: the duration of a turn on the spot in "gyro", s.
+- `CURVE_M`: the length of a curve, m.
+- `TURN_RAD`: the angle of a turn on the spot in "positions", rad, as it is without skidding.
+"""
 
 PETALS = ((FAST, CURVE), (-FAST, -CURVE), (SLOW, 0.0), (-SLOW, CURVE), (FAST, -CURVE))
-"""Turn rates in "positions" without skidding, rad/s: pairs of a turn on the spot and a curve."""
+"""Moves of the method "positions": each pair is a turn on the spot and a curve after it.
+
+A number is the turn rate of the move without skidding, rad/s.
+"""
 
 STANDING, PAUSE, SHORT = Move(2.5), Move(1.4), Move(0.7)
 """Pauses before the first drive, between drives, and where the robot only has to stop.
@@ -323,7 +333,7 @@ STANDING, PAUSE, SHORT = Move(2.5), Move(1.4), Move(0.7)
 """
 
 STRAIGHT = "straight"
-"""Name of the leg that drives straight ahead, whose length the person measures by tape."""
+"""Name of the leg straight ahead. In the method "gyro", a person may measure its length by tape."""
 
 
 def _straight(setup: Setup, asks: tuple[Ask, ...] = ()) -> Leg:
@@ -352,8 +362,8 @@ def _gyro(setup: Setup, track: float) -> tuple[Leg, ...]:
         _straight(setup, (far,)),
         Leg(
             "turns",
-            "The robot drives back to the middle, turns on the spot to both sides, fast and "
-            "slowly, and drives three curves there and back.",
+            "The robot drives back to the middle of the floor, turns on the spot to both sides, "
+            "fast and slowly, and drives three curves there and back.",
             (*moves, PAUSE),
         ),
     )
@@ -369,8 +379,8 @@ def _positions(setup: Setup, track: float) -> tuple[Leg, ...]:
         _straight(setup),
         Leg(
             "turns",
-            "The robot drives back to the middle. Then it repeatedly turns a part of a circle on "
-            "the spot and drives a curve there and back.",
+            "The robot drives back to the middle of the floor. Then it repeatedly turns a part of "
+            "a circle on the spot and drives a curve there and back.",
             tuple(moves),
         ),
     )

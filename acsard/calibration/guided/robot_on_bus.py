@@ -37,7 +37,7 @@ LOOK_S = 0.005
 """Period of polling keyboard and message queues, s. A key press takes effect within this period."""
 
 SHOWN_S = 0.2
-"""Period in which the progress of a leg is shown, s."""
+"""Interval between updates of the progress display of a leg, s."""
 
 RETURNS_S = 3.0
 """Time, s, in which a silent daemon must send its state again for the leg to be repeated."""
@@ -53,7 +53,7 @@ Take = Callable[[Any, float], object]
 
 
 class Sensor:
-    """A subscription to one key. Its messages are decoded as the first of `types` that fits."""
+    """A subscription to one Zenoh key. Messages are decoded as the first of `types` that fits."""
 
     def __init__(self, session: zenoh.Session, key: str, types: tuple[type, ...]) -> None:
         self.key = key
@@ -80,8 +80,8 @@ class Sensor:
         while not self.receive(lambda message, now: None, 0.0):
             if time.monotonic() > end:
                 raise GuideError(
-                    f"{what} does not arrive on {self.key}: does its sender run, and does it "
-                    "publish on this key?"
+                    f"{what} does not arrive on the Zenoh key {self.key}: does the sender run, and "
+                    "does it publish on this key?"
                 )
             time.sleep(LOOK_S)
 
@@ -96,8 +96,8 @@ class Sensor:
             self._decoders = self._decoders[at : at + 1]
             return message
         raise GuideError(
-            f"the messages on {self.key} cannot be read ({'; '.join(errors)}): do they have "
-            "another type?"
+            f"the messages on the Zenoh key {self.key} cannot be read ({'; '.join(errors)}): does "
+            "the sender publish another message type?"
         )
 
 
@@ -168,7 +168,7 @@ class Recorder:
 def times(samples: Sequence[Sample]) -> Floats:
     """Return the times of samples on this computer's clock, s.
 
-    They come from the stamps (`on_arrival_clock`), or from the arrivals if a stamp is missing.
+    They come from the stamps (`on_arrival_clock`), or from the arrivals if any stamp is missing.
     """
     came = np.array([sample.came for sample in samples])
     made = np.array([math.nan if s.made is None else s.made for s in samples])
@@ -195,7 +195,8 @@ class RobotOnBus:
     def positions(self, key: str, session: zenoh.Session | None) -> None:
         """Record the positions on `key` in each leg. Raises `GuideError` if none arrive.
 
-        `session` receives the positions. None means the session that also commands the robot.
+        `session` is the Zenoh session that receives the positions. None means the session that also
+        commands the robot.
         """
         sensor = Sensor(session or self._client.session, self._full(key), POSITIONS)
         sensor.await_first("a position (PoseStamped or Odometry)")
@@ -220,8 +221,8 @@ class RobotOnBus:
                 self._client.send(0.0, 0.0)
         if driver.halted and self._watch.unreadable:
             raise GuideError(
-                "the daemon's state cannot be read: does the daemon have another version? Use the "
-                "same version here"
+                "the messages with the daemon's state cannot be read: if the daemon has another "
+                "version of acsard, use that version here too"
             )
         if driver.halted:
             end = "" if driver.halted.endswith("?") else "."
@@ -277,5 +278,5 @@ class RobotOnBus:
         self._watch.look(time.monotonic())
 
     def _full(self, key: str) -> str:
-        """Return the key, with this robot's id in front if `acsard topics` lists the key."""
+        """Return the Zenoh key, with this robot's id in front if `acsard topics` lists the key."""
         return self._client.key(key) if by_key(key) is not None else key

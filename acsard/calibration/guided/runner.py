@@ -63,7 +63,7 @@ def guide(
     """Lead a person through the legs of a method of calibration, and return the result.
 
     Args:
-        name: a key of `METHODS`.
+        name: the name of the method, as in `METHODS`.
         ride: the function that drives one leg and returns its recording.
         simulated: whether the robot is the built-in simulator, which allows more repeats.
 
@@ -77,8 +77,8 @@ def guide(
     longest = method.longest_s(setup)
     prompt.say(
         f"Calibration with {NEEDS[name]}. The robot drives for at most {longest:.0f} "
-        "s in all. If a leg is disturbed, it is driven again. Stay near the robot: any key stops "
-        "it at once."
+        "s in all, in several legs. The robot repeats a leg that is disturbed. Stay near the "
+        "robot: any key stops the robot at once."
     )
     rides: dict[str, Run] = {}
     answers: Answers = {}
@@ -94,13 +94,13 @@ def guide(
             answers[leg, ask.name] = UNITS[ask.unit] * prompt.number(ask)
 
     def repeat(disturbed: DisturbedError) -> int:
-        """Return the index of the leg to repeat from. Raise `disturbed` after too many repeats."""
+        """Return the index of the leg to drive next. Raise `disturbed` after too many repeats."""
         leg = legs[number]
         repeats[leg.name] = repeats.get(leg.name, 0) + 1
         if repeats[leg.name] > most:
             raise disturbed
         again = begins_again(legs, number, sensor=not method.tool)
-        back = "" if simulated else ": set the robot back where it stood when that leg began"
+        back = "" if simulated else ": put the robot back where it stood when that leg began"
         prompt.say(
             f"Leg {number + 1} was disturbed: {disturbed.why}. The drive goes on with leg "
             f"{again + 1}{back}."

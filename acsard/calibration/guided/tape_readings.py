@@ -36,7 +36,10 @@ from acsard.calibration.solve import Calibration, Drives
 from acsard.core.config.settings import DriveConfig, OdometryConfig
 
 SKIDDING = 0.015
-"""Standard deviation of the heading due to skidding, rad per square root of a rolled metre."""
+"""Standard deviation of the heading due to skidding, rad, after 1 m.
+
+The deviation grows with the square root of the rolled distance.
+"""
 
 SKIDDING_LENGTH = 0.002
 """Standard deviation of a distance due to skidding, as a fraction of the distance."""
@@ -45,19 +48,23 @@ UNKNOWN = 1.0
 """Prior standard deviation of the mean wheel radius, as a fraction."""
 
 PRIOR_FREE = 4.0
-"""Degrees of freedom of the assumed noise, which is combined with the scatter of the readings."""
+"""Degrees of freedom of the assumed noise.
+
+They are the weight of the assumed noise in a mean with the noise that the readings show.
+"""
 
 MOST_STEPS = 50
 SMALL = 1e-9
-"""Largest step, as a fraction, at which the fit has converged."""
+"""If a step changes no parameter by more than this, the fit has converged."""
 
 WORST_CONDITION = 1e8
-"""Largest condition number at which the readings determine the parameters."""
+"""Largest condition number of normal equations from which the parameters can be computed."""
 
 ACTIVE = [P.LEFT, P.RIGHT, P.INVERSE_TRACK, P.TRACK_GROWTH]
 
 PRECISE = 0.2
-"""Relative standard deviation below which a turn reading can give the starting parameters."""
+"""Relative standard deviation below which a reading of a turn can give the parameters from which
+the fit starts."""
 
 
 class Reading(Struct, frozen=True, dict=True):
@@ -133,7 +140,10 @@ def predicted(steps: WheelSteps, quantity: Quantity, base: Base, parameters: Flo
 
 
 def fit_readings(readings: Sequence[Reading], base: Base) -> TapeFit:
-    """Fit the parameters to the readings. Raises `RefusedError` if they contradict each other."""
+    """Fit the parameters to the readings.
+
+    Raises `RefusedError` if the readings contradict each other or do not determine the parameters.
+    """
     parameters, normal = _solved(readings, base, _starting_parameters(readings, base))
     in_range(np.array([1 / parameters[P.INVERSE_TRACK], parameters[P.LEFT], parameters[P.RIGHT]]))
     compared = [(found, weight) for _, found, weight in _compared(readings, base, parameters)]
@@ -159,9 +169,9 @@ def _starting_parameters(readings: Sequence[Reading], base: Base) -> Floats:
             by_wheels = predicted(reading.steps, "turned", base, start).value
             if not 0.1 < by_wheels / reading.value < 10.0:
                 raise RefusedError(
-                    f"the wheels report {math.degrees(by_wheels):.0f} deg, but you measured "
-                    f"{math.degrees(reading.value):.0f} deg: start again, and let the robot turn "
-                    "one full circle to the left"
+                    f"according to the wheels the robot turned {math.degrees(by_wheels):.0f} deg, "
+                    f"but you measured {math.degrees(reading.value):.0f} deg: start again, and "
+                    "let the robot turn one full circle to the left"
                 )
             start[P.INVERSE_TRACK] *= reading.value / by_wheels
             break
@@ -198,8 +208,9 @@ def _solved(readings: Sequence[Reading], base: Base, start: Floats) -> tuple[Flo
         inner = normal[np.ix_(ACTIVE, ACTIVE)]
         if condition(inner) > WORST_CONDITION:
             raise RefusedError(
-                "the measurements cannot separate errors of the wheels from errors of the track: "
-                "the robot hardly moved or hardly turned. Give it room, and start again"
+                "the measurements cannot separate errors of the wheel radii from errors of the "
+                "track width, because the robot hardly moved or hardly turned: give the robot "
+                "room, and start again"
             )
         step = np.linalg.solve(inner, score[ACTIVE])
         parameters[ACTIVE] += step * min(1.0, 0.3 / (float(np.abs(step).max()) or 1.0))
@@ -266,9 +277,10 @@ def track_ratio(reading: Reading, drive: DriveConfig) -> float:
     least, most = CREDIBLE
     if not least < track < most:
         raise GuideError(
-            f"for one full turn the wheels report {math.degrees(by_wheels):.0f} deg: check that "
-            "the robot made exactly one turn, measure drive.wheel_radius and "
-            "drive.wheel_separation with a tape measure, and run this command again"
+            "the robot should have made one full turn, but according to the wheels it turned "
+            f"{math.degrees(by_wheels):.0f} deg: check that it made exactly one turn, "
+            "measure drive.wheel_radius and drive.wheel_separation with a tape measure, and run "
+            "this command again"
         )
     return min(WIDEST, max(1.0, track))
 
@@ -282,22 +294,26 @@ def slant(near: float, far: float, apart: float) -> float:
     sine = (far - near) / apart
     if abs(sine) > 0.98:
         raise RefusedError(
-            f"points {apart * 1000:.0f} mm apart cannot be {near * 1000:.0f} and "
-            f"{far * 1000:.0f} mm from the line: measure again from the start"
+            f"two points of the robot that are {apart * 1000:.0f} mm apart cannot be "
+            f"{near * 1000:.0f} mm and {far * 1000:.0f} mm from the line or wall: start the "
+            "calibration again, and measure anew"
         )
     return math.asin(sine)
 
 
 WORST = 0.1, 0.02
-"""Largest useful standard deviations, as fractions: of the track, and of the ratio of radii."""
+"""Largest accepted relative standard deviations of the track and of the ratio of the radii."""
 
 ADVICE = (
-    "they contradict each other, or the robot skids much. Start again on even ground, place the "
-    "robot exactly, and measure to the millimetre"
+    "the readings contradict each other, or the robot skids much. Start again on even ground, "
+    "place the robot exactly, and measure to the millimetre"
 )
 
 TURNED, STRAIGHT = np.pi, 0.5
-"""Limits, rad: a drive counts as a turn above `TURNED`, and as straight below `STRAIGHT`."""
+"""Limits for the angle that the robot turns in a drive, rad.
+
+Above `TURNED`, the drive counts as a turn; below `STRAIGHT`, it counts as straight.
+"""
 
 
 def calibrated(
@@ -339,7 +355,8 @@ def calibrated(
 def _improvement(readings: Sequence[Reading], base: Base, fit: TapeFit, rate: Rates) -> Improvement:
     """Return the odometry errors with the configured and with the new parameters.
 
-    Each error with new parameters is that of a fit without the reading, unless that fit fails.
+    Each reading shows one error. The new parameters for this error come from a fit without the
+    reading, unless that fit fails.
     """
     sums = {name: np.zeros(3) for name in ("turn", "straight", "place")}
     present = fit.parameters.copy()

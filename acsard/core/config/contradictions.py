@@ -28,8 +28,8 @@ from acsard.core.values import ROOT, WHEELS
 
 LEAST_WRAP_PERIODS = 2
 """Shortest allowed time, in control periods, until the encoder counts become ambiguous. They are
-ambiguous if a wheel turns by half their range between two feedback lines, which looks like a turn
-in the other direction. With two periods, one lost line does no harm."""
+ambiguous if they change by half of their range between two feedback lines, because a turn in the
+other direction could cause the same counts. With two periods, one lost line does no harm."""
 
 MOST_VOLTS = 99.99
 """Highest voltage that a status line can express, V."""
@@ -81,8 +81,8 @@ def warnings(config: Config) -> list[str]:
     outside = not all(_is_loopback(host) for host in hosts if host)
     if outside and config.robot.id == Config().robot.id:
         found.append(
-            f'robot.id = "{config.robot.id}" is the default id, on a bus that other machines '
-            "reach: a second robot there would share its keys; give each robot its own id"
+            f'robot.id = "{config.robot.id}" is the default id, but other machines reach the bus: '
+            "a second robot with this id would use the same keys; give each robot its own id"
         )
     ros = config.ros
     where = (
@@ -90,8 +90,8 @@ def warnings(config: Config) -> list[str]:
     )
     if where and (ros.bridge or ros.rmw) and not ros.namespace:
         found.append(
-            f'ros.namespace = "" on a bus {where}: a second robot there would share its ROS '
-            "topics; give each robot its own namespace"
+            f'ros.namespace = "" on a bus {where}: a second robot on this bus would use the same '
+            "ROS topics; give each robot its own namespace"
         )
     return found + named_faults.warnings(config)
 
@@ -104,7 +104,7 @@ def _count_warnings(config: Config) -> list[str]:
         return [
             f"mcu.encoder_counts = {mcu.encoder_counts}, but the simulated robot's encoders have "
             f"sim.encoder_counts = {config.sim.encoder_counts}: every distance will be wrong; "
-            "write the same number in both"
+            "write the same number for both keys"
         ]
     return []
 
@@ -132,12 +132,15 @@ def _wire_problems(config: Config) -> list[str]:
 
 
 def _shorter_lines(mcu: McuConfig, rate: float) -> str:
-    """Return the end of a message with a setting that makes the lines short enough, or ""."""
+    """Return the end of an error message, which names a setting that makes the lines shorter.
+
+    The result is "" if no setting makes them short enough.
+    """
     fixes = ((True, "mcu.encoder_counts = 0"), (False, 'mcu.link_check = "off"'))
     for check, fix in fixes:
         count = line_bytes(mcu.trailing_comma, check)
         if count < mcu.line_bytes and wire_use(rate, mcu.baud_rate, count) <= 1.0:
-            return f"; or {fix} (lines of {count} B)"
+            return f"; or {fix}, which shortens the lines to {count} B"
     return ""
 
 
@@ -250,15 +253,18 @@ def _reachability_problems(config: Config) -> list[str]:
     bus, found = config.bus, []
     if bus.mode == "client" and not bus.connect:
         found.append(
-            'bus.mode = "client" without an address to connect to; write bus.connect = '
+            'bus.mode = "client" needs an address to connect to; write bus.connect = '
             '["tcp/127.0.0.1:7447"] or bus.mode = "peer"'
         )
     if not bus.listen and bus.mode == "peer":
-        found.append('bus.listen = []: no client could connect; write ["tcp/127.0.0.1:7448"]')
+        found.append(
+            "bus.listen = []: no client could connect to the daemon; write bus.listen = "
+            '["tcp/127.0.0.1:7448"]'
+        )
     if bus.outside and not bus.plain:
         found.append(
-            f"bus.listen = {show(list(bus.listen))}: the TLS gateway reaches the daemon through "
-            'a tcp address on this machine, and none is listed; add "tcp/127.0.0.1:7448"'
+            f"bus.listen = {show(list(bus.listen))}: the TLS gateway needs a tcp address of this "
+            'machine to reach the daemon, but the list has none; add "tcp/127.0.0.1:7448"'
         )
     return found
 
@@ -301,8 +307,9 @@ def _ros_problems(config: Config) -> list[str]:
     ros = config.ros
     if ros.bridge and ros.namespace.partition("/")[0] == ROOT:
         return [
-            f"ros.namespace = {show(ros.namespace)}: acsard's own keys also begin with "
-            f'"{ROOT}", so the bridge\'s keys would mix with them; write another, like "robot1"'
+            f"ros.namespace = {show(ros.namespace)}: acsard's own Zenoh keys also begin with "
+            f'"{ROOT}", so the keys of the ROS bridge would mix with acsard\'s; write another '
+            'namespace, like "robot1"'
         ]
     return []
 

@@ -13,7 +13,9 @@ from acsard.core.config.validation import write
 
 
 def edited(text: str, keys: Mapping[str, object]) -> str:
-    """Return the text of a file with the new values `keys`, by dotted key.
+    """Return the text of a configuration file with new values.
+
+    `keys` maps dotted keys to the new values.
 
     Raises:
         ConfigError: the old or the new text is not a valid configuration.
@@ -33,7 +35,7 @@ def edited(text: str, keys: Mapping[str, object]) -> str:
     except TOMLKitError as error:
         raise ValueError(str(error)) from None
     if parse(changed.encode()) != from_builtins(wanted):
-        raise ValueError("its tables are written in a form that cannot be changed safely")
+        raise ValueError("acsard cannot safely change tables that are written in this form")
     return changed
 
 

@@ -22,12 +22,13 @@ When = Literal["always", "raised", "rest"]
 
 WHEN: dict[When, str] = {
     "always": "at any time",
-    "raised": "lowered only while the robot stands",
+    "raised": "raised at any time, lowered only while the robot stands",
     "rest": "only while the robot stands",
 }
-"""When a setting may change, in words. With a lower deceleration ("raised"), a driving robot could
-not stop in time. A lower `limits.wheel_speed` ("rest") would cut the speed at once. After a change
-in `commands` ("rest"), each sender must send a zero before it drives."""
+"""Says in words when a setting may change. A "raised" setting may be raised at any time, but it may
+be lowered only at rest, because a driving robot with a lower deceleration could not stop in time. A
+"rest" setting may change only at rest. A lower `limits.wheel_speed` would cut the speed at once,
+and after a change in `commands` each sender must send a zero before it drives."""
 
 
 class Live(Struct, frozen=True):
@@ -42,8 +43,12 @@ LIVE: dict[str, Live] = {
     "limits.angular_speed": Live("always", "highest turn rate"),
     "limits.linear_acceleration": Live("always", "acceleration"),
     "limits.angular_acceleration": Live("always", "acceleration of a turn"),
-    "limits.linear_deceleration": Live("raised", "deceleration, also when commands end"),
-    "limits.angular_deceleration": Live("raised", "deceleration of a turn, also when commands end"),
+    "limits.linear_deceleration": Live(
+        "raised", "deceleration to a slower command, and when the commands end"
+    ),
+    "limits.angular_deceleration": Live(
+        "raised", "deceleration of a turn to a slower command, and when the commands end"
+    ),
     "limits.linear_stop_deceleration": Live("raised", "deceleration after a stop or a fault"),
     "limits.angular_stop_deceleration": Live(
         "raised", "deceleration of a turn after a stop or a fault"
@@ -52,37 +57,49 @@ LIVE: dict[str, Live] = {
     "limits.angular_jerk": Live("always", "how fast the acceleration of a turn may grow"),
     "limits.wheel_speed": Live("rest", "highest speed of any wheel"),
     "commands.neutral_pause": Live(
-        "rest", "pause after a zero before a sender identity that several programs share may drive"
+        "rest",
+        "time without a speed after the first zero, before a shared sender identity may drive",
     ),
-    "commands.sources.*.timeout": Live("rest", "silence after which the source stops driving"),
+    "commands.sources.*.timeout": Live(
+        "rest", "time without a command after which the robot stops following the source"
+    ),
     "odometry.covariance": Live(
         "always", '"model" computes the covariances, "constant" publishes the configured diagonals'
     ),
     "odometry.pose_covariance_diagonal": Live(
         "always",
-        "x y z roll pitch yaw: uncertainty of the start pose and of the axes without a sensor",
+        "variances of x y z roll pitch yaw: of the start pose, and of the axes without a sensor",
     ),
     "odometry.twist_covariance_diagonal": Live(
-        "always", "x y z roll pitch yaw: uncertainty of the axes without a sensor"
+        "always", "variances of x y z roll pitch yaw: of the axes without a sensor"
     ),
-    "odometry.distance_variance_per_metre": Live("always", "variance of the distance, m2 per m"),
-    "odometry.yaw_variance_per_metre": Live("always", "variance of the heading, rad2 per m"),
-    "odometry.yaw_variance_per_radian": Live("always", "variance of the heading, rad2 per rad"),
-    "rates.odom": Live("always", "how often odom and tf are published"),
-    "rates.wheel_states": Live("always", "how often wheel_states are published"),
-    "rates.cmd_vel_out": Live("always", "how often cmd_vel_out is published"),
-    "rates.state": Live("always", "how often state is published"),
-    "rates.diagnostics": Live("always", "how often diagnostics are published"),
-    "log.level": Live("always", "lowest level that is logged"),
+    "odometry.distance_variance_per_metre": Live(
+        "always", "added variance of the distance per metre driven, m2 per m"
+    ),
+    "odometry.yaw_variance_per_metre": Live(
+        "always", "added variance of the heading per metre driven, rad2 per m"
+    ),
+    "odometry.yaw_variance_per_radian": Live(
+        "always", "added variance of the heading per radian turned, rad2 per rad"
+    ),
+    "rates.odom": Live("always", "how often the messages odom and tf are published"),
+    "rates.wheel_states": Live("always", "how often the message wheel_states is published"),
+    "rates.cmd_vel_out": Live("always", "how often the message cmd_vel_out is published"),
+    "rates.state": Live("always", "how often the message state is published"),
+    "rates.diagnostics": Live("always", "how often the message diagnostics is published"),
+    "log.level": Live("always", "lowest level of the events that are logged"),
 }
 """The settings that may change while the daemon runs, by their dotted keys in `acsard.toml`. A key
-of a command source contains its name, not its index; "*" stands for each name."""
+of a command source contains the name of the source, not its index; "*" stands for any name."""
 
 SECTIONS: dict[str, type[Struct]] = {field.name: field.type for field in fields(Config)}
 
 
 def live(key: str) -> Live | None:
-    """Return the row of a setting, or None if it takes effect only at the next start."""
+    """Return the entry of `LIVE` for a dotted key.
+
+    The result is None if the setting takes effect only at the next start of the daemon.
+    """
     parts = key.split(".")
     if parts[:2] == ["commands", "sources"] and len(parts) == 4:
         parts[2] = "*"
@@ -92,8 +109,9 @@ def live(key: str) -> Live | None:
 def flat(value: object, name: str = "") -> Iterator[tuple[str, object]]:
     """Yield the dotted name and the value of each key in nested tables.
 
-    A table in a list, such as a source, is named by its key `name` and not by its index. `name` is
-    the dotted name of `value`, "" for the whole configuration.
+    A table in a list, such as a command source, has the value of its key `name` in the dotted name,
+    not its index. The parameter `name` is the dotted name of `value`, "" for the whole
+    configuration.
     """
     if isinstance(value, Mapping):
         for key, inner in value.items():
@@ -122,7 +140,7 @@ class Difference(Struct, frozen=True):
 
 
 def differences(runs: Config, file: Config) -> dict[str, Difference]:
-    """Return both values of each key that differs between `runs`, in force, and `file`."""
+    """Return the keys whose values differ between `runs` (in force) and `file`."""
     its, ours = dict(flat(effective(runs))), dict(flat(effective(file)))
     return {
         key: Difference(its.get(key), ours.get(key))
@@ -145,7 +163,7 @@ def changed(config: Config, wishes: Mapping[str, object], at_rest: bool) -> tupl
     new = {key: value for key, value in wishes.items() if not _same(before.get(key), value)}
     fixed = [key for key in new if live(key) is None or key not in before]
     if fixed:
-        more = [f"and {len(fixed) - 1} more that cannot be set"] if len(fixed) > 1 else []
+        more = [f"and {len(fixed) - 1} more of these keys cannot be set"] if len(fixed) > 1 else []
         raise ConfigError([_refusal(fixed[0], new[fixed[0]], before), *more])
     problems: list[str] = []
     # The rules between tables need a list of tables here, not a tuple of structs.

@@ -34,7 +34,7 @@ def lowered(file: LimitsConfig, now: LimitsConfig) -> dict[str, float]:
 
 
 def with_lowered(config: Config, kept: Mapping[str, float]) -> tuple[Config, list[Event]]:
-    """Return the configuration with the limits that were lowered before the restart, and events.
+    """Apply the limits that were lowered before the restart. Return the configuration and events.
 
     `kept` contains these limits by dotted key. A limit is applied only if it is below that of
     `config`. If the limits together contradict a file that has changed, they are applied one by

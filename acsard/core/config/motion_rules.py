@@ -20,20 +20,21 @@ LONGEST_STOP_S = 2.0
 """Longest allowed time from full speed to rest after a stop, s. No person should wait longer."""
 
 LONGEST_RAMP_S = 5.0
-"""Longest allowed time from full speed to rest after commands have ended, s: nobody steers then."""
+"""Longest allowed time from full speed to rest after the commands end, s. In this time, no
+sender controls the robot."""
 
 HEADROOM = 1.1
 """Factor by which a healthy wheel may exceed its commanded speed for a moment."""
 
 MOST_WHEEL_SPEED = 99.99
-"""Highest wheel speed that a serial line can express, rad/s."""
+"""Highest wheel speed that a line to the board can express, rad/s."""
 
 LONGEST_REPLY_S = 0.25
 """Longest allowed time between two feedback lines, s. A board that is silent for one second counts
 as restarted. With this period, the next line arrives in time even if two lines are lost."""
 
 LINES_OF_EVIDENCE = 2
-"""Number of feedback lines that must show a wheel fault before it is reported. One is too few."""
+"""Number of feedback lines that must show a wheel fault before the fault is reported."""
 
 
 class _Reach(Struct, frozen=True):

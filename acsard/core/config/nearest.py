@@ -6,7 +6,8 @@ import difflib
 from collections.abc import Iterable
 
 LONGEST = 80
-"""Number of characters of a word that are compared, to limit the time for a very long word."""
+"""Largest number of characters of a mistyped word that `nearest` compares with the known words. The
+limit bounds the time for a very long word."""
 
 
 def nearest(word: str, known: Iterable[str]) -> list[str]:

@@ -44,7 +44,7 @@ def parse(text: bytes, overrides: dict[str, dict[str, object]] | None = None) ->
     # Python limits the length of numbers and the depth of nesting.
     except (ValueError, RecursionError):
         raise ConfigError(
-            ["not TOML: a number is too long or lists are nested too deep; correct it"]
+            ["not TOML: a number is too long or lists are nested too deep; shorten them"]
         ) from None
     for section, values in (overrides or {}).items():
         inner = table.setdefault(section, {})
@@ -55,7 +55,9 @@ def parse(text: bytes, overrides: dict[str, dict[str, object]] | None = None) ->
     try:
         config = build_partly(Config, table, "", problems, invalid)
     except RecursionError:
-        raise ConfigError(["lists or tables are nested too deep; no key needs that"]) from None
+        raise ConfigError(
+            ["lists or tables are nested too deep; no key needs so many levels"]
+        ) from None
     if config is not None:
         problems += contradictions(view_without(config, invalid))
     if config is None or problems:

@@ -1,4 +1,5 @@
-"""Runs the rules between keys, except the rules that read a key without a valid value."""
+"""Runs the rules that relate several keys of `acsard.toml` to each other. A rule is skipped if it
+reads a key that has no valid value."""
 
 from __future__ import annotations
 
@@ -13,7 +14,7 @@ Rule = Callable[[Config], Iterable[str]]
 
 
 class InvalidKeyError(AcsardError):
-    """Error for a rule that reads a key without a valid value."""
+    """Error that a rule causes when it reads a key that has no valid value."""
 
 
 def view_without(config: Config, invalid: Set[str]) -> Config:

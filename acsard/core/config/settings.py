@@ -24,7 +24,9 @@ Frame = Annotated[
     str,
     Meta(
         pattern=r"^[A-Za-z0-9_][A-Za-z0-9_/]{0,63}\Z",
-        extra={"unit": "a frame or joint name: 1 to 64 of A-Z a-z 0-9 _ /, no leading slash"},
+        extra={
+            "unit": "a frame or joint name: 1 to 64 characters of A-Z a-z 0-9 _ /, no leading slash"
+        },
     ),
 ]
 Text = Annotated[
@@ -40,7 +42,7 @@ CommonName = Annotated[
         # The name becomes a part of keys on the bus, and the message `state` shows it.
         pattern=r"^(?!@)[\w .:@+-]{1,64}\Z",
         extra={
-            "unit": "a common name of letters, digits, spaces and _.:@+-",
+            "unit": "the common name of a certificate: letters, digits, spaces and _.:@+-",
             "example": "operator",
         },
     ),
@@ -49,14 +51,17 @@ RosNode = Annotated[
     str,
     Meta(
         pattern=r"^[A-Za-z_][A-Za-z0-9_]{0,63}\Z",
-        extra={"unit": "a ROS name: letters, digits and _, not a digit first", "example": "acsard"},
+        extra={
+            "unit": "a ROS name: letters, digits and _, but no digit at the beginning",
+            "example": "acsard",
+        },
     ),
 ]
 RosNamespace = Annotated[
     str,
     Meta(
         pattern=r"^(|[A-Za-z_][A-Za-z0-9_]{0,63}(/[A-Za-z_][A-Za-z0-9_]{0,63}){0,3})\Z",
-        extra={"unit": "ROS names with / between them, or empty", "example": "robot1"},
+        extra={"unit": "one or more ROS names with / between them, or empty", "example": "robot1"},
     ),
 ]
 WebAddress = Annotated[
@@ -77,7 +82,7 @@ WebOrigin = Annotated[
             r"https?://(\[[0-9a-f:.]{2,45}\]|[a-z0-9.-]{1,253})(:[0-9]{1,5})?\Z"
         ),
         extra={
-            "unit": "http(s):// and a host in lower case, and a port unless it is 80 or 443",
+            "unit": "http(s):// and a host in lower case, then the port if it is not 80 or 443",
             "example": "http://127.0.0.1:5173",
         },
     ),
@@ -99,7 +104,7 @@ FaultName = Annotated[
     str,
     Meta(
         pattern=r"^[\x20-\x7e]{1,64}\Z",
-        extra={"unit": "a fault of `acsard sim --fault` in quotes", "example": "ftdi"},
+        extra={"unit": "a fault that `acsard sim --fault` accepts, in quotes", "example": "ftdi"},
     ),
 ]
 Length = Annotated[float, Meta(ge=0.001, le=10.0, extra={"unit": "m"})]
@@ -194,7 +199,7 @@ class JointsConfig(Struct, frozen=True):
     rear_right: Frame = "rear_right_wheel_joint"
 
     def as_tuple(self) -> tuple[str, str, str, str]:
-        """Return the four names in `values.WHEELS` order."""
+        """Return the names of the four wheel joints in the order of `values.WHEELS`."""
         return self.front_right, self.front_left, self.rear_left, self.rear_right
 
 
@@ -433,7 +438,8 @@ class Config(Struct, frozen=True):
 
     @property
     def rate_hz(self) -> float:
-        """Control rate, Hz. "auto" means 80 % use of the wire, but at most 100 Hz."""
+        """Control rate, Hz. `"auto"` means the rate that uses 80 % of the serial wire, but at most
+        100 Hz."""
         if self.control.rate != "auto":
             return float(self.control.rate)
         mcu = self.mcu

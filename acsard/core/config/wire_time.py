@@ -15,7 +15,7 @@ CHECK_BYTES = 8
 
 SAMPLE_BYTES = 21
 """Length of `@` and the sample fields of a reply (the board's clock, four encoder counts), bytes. A
-command that requests them is one letter longer."""
+command that requests the sample fields is one letter longer than a command that does not."""
 
 STATUS_BYTES = 28
 """Length of `!status estop=pressed*F4BC`, a typical status line, with CR LF, bytes."""

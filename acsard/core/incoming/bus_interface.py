@@ -106,7 +106,7 @@ class GatewayFollower:
 PEER = (
     "is not a router but another peer, perhaps a robot's daemon. A peer does not forward "
     "messages, so a client of one robot sees only that robot, and `acsard call stop --id '*'` "
-    "stops only that one; put a router between the robots (deploy/zenoh/README.md)"
+    "stops only that robot; put a router between the robots (deploy/zenoh/README.md)"
 )
 
 
@@ -135,7 +135,7 @@ class RouterFollower:
 
 def _words(what: str, endpoints: list[str]) -> str:
     tried = (
-        "; the daemon tries again until it connects, and driving goes on"
+        "; the daemon tries again until it connects, and the robot can drive meanwhile"
         if what.startswith("not")
         else ""
     )

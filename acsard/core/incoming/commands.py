@@ -57,10 +57,15 @@ class Bindings:
 
     def __init__(self) -> None:
         self._seen: dict[str, tuple[str, int]] = {}
-        """By sender: the certificate ("" on the robot itself) and the last command's time, ns."""
+        """Maps each sender id to its certificate ("" on the robot itself) and to the monotonic time
+        of its last command, ns."""
 
     def other(self, sender: str, certificate: str, now_ns: int) -> str | None:
-        """Bind `sender` to `certificate`, unless another one still binds it: return that one."""
+        """Bind `sender` to `certificate` and return None.
+
+        If `sender` is still bound to another certificate, change nothing and return that
+        certificate.
+        """
         bound, seen_ns = self._seen.get(sender, (certificate, now_ns))
         if bound != certificate and now_ns - seen_ns <= BOUND_NS:
             return bound
@@ -72,7 +77,8 @@ class Bindings:
 
 
 MAX_COMMAND_BYTES = 4096
-"""Largest payload in bytes. A TwistStamped in JSON is shorter than 300 bytes."""
+"""Largest payload of a command or a service query, bytes. A TwistStamped in JSON is shorter than
+300 bytes."""
 
 REPLACED_NS = NS_PER_S // 2
 """Zenoh replaces a timestamp that is ahead of the daemon's clock by more than this, ns."""
@@ -143,7 +149,8 @@ class Receiver:
         kind, source, certificate = parts(arrival.key)
         if "*" in arrival.key or "/" in certificate:
             raise DecodeError(
-                "wildcard", f"a command needs an exact key such as cmd/app, not {arrival.key}"
+                "wildcard",
+                f"a command needs an exact key such as cmd/app, but came on {arrival.key}",
             )
         if not arrival.put:
             raise DecodeError("not_a_put", "a DELETE is not a command: send a PUT")
@@ -163,10 +170,11 @@ class Receiver:
         if identity.signed:
             bound = self._bindings.other(identity.signed, certificate, arrival.arrived_ns)
             if bound is not None:
-                where = f"certificate {bound}" if bound else "the robot's own machine"
+                where = f"with the certificate {bound}" if bound else "on the robot's own machine"
                 raise DecodeError(
                     "other_certificate",
-                    f"this sender id first came from {where}: give each program its own sender id",
+                    f"this sender id is already in use {where}: give each program its own "
+                    "sender id",
                 )
         ours = arrival.received_ns
         return Command(
@@ -192,19 +200,21 @@ class Receiver:
             if not (isinstance(linear, UnsetType) and isinstance(angular, UnsetType)):
                 raise DecodeError(
                     "wrong_shape",
-                    "the message has vectors inside and outside `twist`: send only one of the two",
+                    "the message has velocities both inside and outside `twist`: send them in one "
+                    "place only",
                 )
             linear, angular = got.twist.linear, got.twist.angular
             header = None if isinstance(got.header, UnsetType) else got.header
         elif not isinstance(got.header, UnsetType):
             raise DecodeError(
-                "wrong_shape", "`header` without `twist`: put both vectors into `twist`"
+                "wrong_shape",
+                "the message has `header` but no `twist`: put `linear` and `angular` into `twist`",
             )
         if isinstance(linear, UnsetType) or isinstance(angular, UnsetType):
             raise DecodeError("wrong_shape", "the message needs both `linear` and `angular`")
         axes = (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
         if not all(map(math.isfinite, axes)):
-            raise DecodeError("not_finite", "NaN or infinity in the twist")
+            raise DecodeError("not_finite", "the twist contains NaN or infinity")
         twist = BodyTwist(linear.x, angular.z)
         return twist, header, twist == REST and any(axes)
 
@@ -223,7 +233,7 @@ class Receiver:
             for values in (got.velocity, got.position, got.effort)
         )
         if not all(map(math.isfinite, (*velocity, *position, *effort))):
-            raise DecodeError("not_finite", "NaN or infinity in the wheel speeds")
+            raise DecodeError("not_finite", "the wheel speeds contain NaN or infinity")
         twist = self._kinematics.twist(WheelSpeeds(*velocity))
         if not (math.isfinite(twist.linear) and math.isfinite(twist.angular)):
             raise DecodeError("not_finite", "the wheel speeds are too large to compute a twist")

@@ -102,7 +102,7 @@ def reading(arrival: Arrival) -> GyroSample:
     rate, variances = got.angular_velocity, got.angular_velocity_covariance or UNKNOWN
     numbers = (rate.x, rate.y, rate.z, variances[8])
     if not all(map(math.isfinite, numbers)):
-        raise DecodeError("not_finite", "NaN or infinity in the angular velocity")
+        raise DecodeError("not_finite", "the angular velocity contains NaN or infinity")
     # sensor_msgs/Imu marks an absent measurement by -1 in the first variance.
     if variances[0] == -1.0:
         raise DecodeError("no_rate", "this IMU does not measure the angular velocity")
@@ -114,7 +114,7 @@ def reading(arrival: Arrival) -> GyroSample:
         raise DecodeError(
             "out_of_range",
             f"the turn rate is over {MAX_RATE:g} rad/s, or its variance is over the square of "
-            "that: send rad/s",
+            "this limit: send the turn rate in rad/s",
         )
     stamp_ns = got.header.stamp.to_ns()
     return GyroSample(arrival.arrived_ns, stamp_ns if stamp_ns > 0 else None, rate.z, variances[8])

@@ -97,7 +97,8 @@ class SpeedLimiter:
         self._asked: tuple[Request, float] | None = None
         """The client's `set` of the speed in this step, and the speed that it asks for, m/s."""
         self._held: list[Request] = []
-        """The `set` requests for the next step. With a limit in force, a step takes only one."""
+        """The `set` requests that wait for the next control step. While a limit is in force, a step
+        takes only one `set` request."""
 
     @property
     def settings(self) -> Config:
@@ -106,7 +107,10 @@ class SpeedLimiter:
 
     @property
     def lowers(self) -> bool:
-        """Whether the limit lowers the speed. True until the robot has its higher setting again."""
+        """Whether the limit lowers the speed.
+
+        After the end of the limit, it is still True until the robot has its higher setting again.
+        """
         lowest = min(self._limit.speed, self._robot.limits.linear_speed)
         return lowest < self._settings.limits.linear_speed
 

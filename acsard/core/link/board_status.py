@@ -27,8 +27,8 @@ from msgspec.structs import astuple
 from acsard.core.link.codec import FrameError
 
 STATUS = b"!status"
-"""First bytes of every status line. A reply begins with a letter instead, and the line in which a
-board identifies itself with `!acsard-mcu`."""
+"""First bytes of every status line. No other line begins with them: a reply begins with a letter,
+and the line in which a board identifies itself begins with `!acsard-mcu`."""
 
 _LINE = re.compile(STATUS + rb"((?: [a-z]+=[^ *]+)+)(?:\*([0-9A-F]{4}))?")
 

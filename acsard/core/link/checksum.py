@@ -26,8 +26,8 @@ ASK_SAMPLE = b"S"
 """The request letter that asks for the sample fields."""
 
 ASK_NOTHING = b"H"
-"""A request letter that the board ignores. Replies contain no request letters, so a received line
-with this letter is an echo of the daemon's own line."""
+"""A request letter that the board ignores. It only marks the line: replies contain no request
+letters, so a received line with this letter is an echo of the daemon's own line."""
 
 # The pattern also restricts the characters of the plain part, because zero bytes in front of a line
 # do not change an XMODEM CRC.
@@ -54,7 +54,7 @@ class Checked(Struct, frozen=True):
 
 
 def seal(line: bytes, sequence: int, letters: bytes = b"") -> bytes:
-    """Return a plain command line in its checked form, with CR LF. `sequence` is 0 to 255."""
+    """Return a plain command in its checked form, with CR LF. `sequence` is 0 to 255."""
     body = b"%b#%02X%b" % (line.removesuffix(b"\r\n"), sequence, letters)
     return b"%b*%04X\r\n" % (body, binascii.crc_hqx(body, 0))
 

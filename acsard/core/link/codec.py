@@ -70,7 +70,7 @@ class Codec:
         self._last = (STILL, self.stop)
 
     def encode(self, speeds: WheelSpeeds) -> bytes:
-        """Return the command line for these speeds, clamped to 99.99 rad/s and rounded to 0.01.
+        """Return the line that commands these speeds, clamped to 99.99 rad/s and rounded to 0.01.
 
         Raises ValueError for a speed that is not finite, because that is a bug of the caller.
         """

@@ -21,14 +21,15 @@ from acsard.core.link.minimum_delay import MinimumDelay
 from acsard.core.values import NS_PER_S
 
 SLACK_COUNTS = 4
-"""Counts that a wheel may make between two readings beyond those of its highest speed. They cover
-one count at each end of the interval, and play in the gears."""
+"""Number of counts by which a wheel may exceed the counts of its highest speed between two
+readings. It covers one count at each end of the interval, and play in the gears."""
 
 ROUNDING_MS = 2
 """Largest error of the time between two readings, ms. Each reading has an error of up to 1 ms."""
 
 LATEST_MS = 1000.0
-"""Limit of the measured delay of a line, ms. After a longer gap the session restarts anyway."""
+"""Largest delay of a line that `MinimumDelay` measures, ms. A longer delay is treated as this
+value, because the session restarts after a gap of one second anyway."""
 
 Unknown = Literal["unknown", "leap", "restarted"]
 """The reason why the difference between two readings of the encoders cannot be used.
@@ -52,8 +53,10 @@ class Encoders:
     def __init__(self, counts: int, wheel_speed: float, quiet_ns: int) -> None:
         """Start.
 
-        After a restart the board's clock seems to jump ahead. The board has restarted if the delay
-        of a reading falls below the least delay so far by more than `quiet_ns`.
+        A restart sets the board's clock to 0. Because the clock is modulo 65536 ms, it then seems
+        to have jumped ahead, and the next reading seems to come too early. So the board is taken to
+        have restarted if the delay of a reading is below the least delay so far by more than
+        `quiet_ns`.
 
         Args:
             counts: Encoder counts per turn, 0 if unknown.
@@ -65,7 +68,7 @@ class Encoders:
         self._early_ms = quiet_ns * 1000 / NS_PER_S
         self._last: tuple[Reading, int] | None = None
         self._promptest = MinimumDelay(most=LATEST_MS)
-        """Measures by how much the delay of a reading exceeds the least delay, ms."""
+        """Measures by how much the delay of a reading exceeds the least delay so far, ms."""
 
     def forget(self) -> None:
         """Forget the last reading, in a new session or after a line without a reading."""

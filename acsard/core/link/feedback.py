@@ -4,13 +4,12 @@ The sample time is the time at which the board read its encoders. The time betwe
 from the best clock that is available:
 
 - the board's own clock, if the board sends it with its counts;
-- the times at which the command lines were written, if the board answers each line
-  (`PromptedTimes`);
+- the times at which the commands were written, if the board answers each line (`PromptedTimes`);
 - the period of the board, if it reports by its own clock (`FreeRunningTimes`);
 - otherwise the times at which the host read the lines, spread evenly if one read has several lines.
 
-`ReplyStyle` detects whether the board answers or reports by its own clock. The sample times do not
-affect the state of the link, which depends only on arrival times.
+`ReplyStyle` detects whether the board answers each command or reports by its own clock. The sample
+times do not affect the state of the link, which depends only on arrival times.
 """
 
 from __future__ import annotations
@@ -37,27 +36,28 @@ FULL_READ = 1024
 
 DIFFERS = 1.5
 """`ReplyStyle` evaluates a read of the port if the number of reply periods since the last read
-differs by at least this from the number of command lines. Scheduling alone causes less."""
+differs by at least this from the number of commands. Scheduling alone causes less."""
 
 TELLING = 2.5
-"""`ReplyStyle` decides only if its two sums (of reply periods and of command lines) differ by at
-least this number."""
+"""`ReplyStyle` decides only if its two sums (of reply periods and of commands) differ by at least
+this number."""
 
 LATEST = 100.0
 """Longest time between two reads of the port that `ReplyStyle` evaluates, in reply periods."""
 
 CLEAR = 0.5
-"""`ReplyStyle` decides only if the number of received lines is clearly nearer to one of its two
-sums: the two distances must differ by at least this share of the difference between the sums."""
+"""`ReplyStyle` has two sums (of reply periods and of commands), and compares each with the number
+of received lines. It decides only if one sum is clearly nearer to that number: the two distances
+must differ by at least this share of the difference between the sums."""
 
 AFTER = 3
 """Number of further reads of the port that `ReplyStyle` evaluates after one that reaches
 `DIFFERS`."""
 
 NEAR = 0.35
-"""`ReplyStyle` decides only if the nearer sum differs from the number of received lines by at most
-this share of that number, or by 1.5 lines if that is more. It is not 0, because some lines get
-lost."""
+"""`ReplyStyle` decides only if the nearer of its two sums (of reply periods and of commands) is
+close to the number of received lines. The difference may be at most this share of the received
+lines, or 1.5 lines if that is more. The share is not 0, because some lines get lost."""
 
 
 class Feedback(Struct, frozen=True, gc=False):
@@ -74,13 +74,15 @@ class Feedback(Struct, frozen=True, gc=False):
     gap: float = 0.0
     turned: Motors | None = None
     bridged: float = 0.0
-    """Time at the start of `dt` in which lines were lost, s. The odometry fills this time with the
-    speeds of the lines before and after it."""
+    """First part of `dt`, in which lines were lost, s. The odometry fills this part with the speeds
+    of the line before it and of the line after it."""
     asked_ns: int | None = None
-    """Monotonic time at which the answered command line was written, ns. None if unknown."""
+    """Monotonic time at which the daemon wrote the command that this line answers, ns. None if
+    unknown."""
     since: float = 0.0
-    """Time since the previous line, s, according to the board's clock if the line contains it, else
-    according to the arrival times. 0 after a silence or a gap. The plausibility checks use it."""
+    """Time since the previous line, s, for the plausibility checks. It is measured by the board's
+    clock if the line contains that clock, else by the arrival times. It is 0 after a silence or a
+    gap."""
     heard_ns: int = 0
     """Monotonic time at which the host had received the whole line, ns."""
     counted: Motors | None = None
@@ -99,21 +101,22 @@ class ReplyStyle:
     While the daemon sends one line per period, both kinds of boards look alike. Sometimes the
     daemon sends more or fewer lines, because the host did not run or because a new command was sent
     at once. Then the number of received lines equals either the number of periods or the number of
-    command lines. The class adds up both numbers over the reads in which they differ and over the
-    next few reads, which deliver the lines that a USB adapter still held. The sum that is nearer to
-    the number of received lines shows the kind of the board.
+    commands. The class adds up both numbers over the reads in which they differ and over the next
+    few reads, which deliver the lines that a USB adapter still held. The sum that is nearer to the
+    number of received lines shows the kind of the board.
     """
 
     def __init__(self, speaks: bool) -> None:
-        """Start. `speaks` is True if the configuration says that the board reports by itself."""
+        """Start. `speaks`: `mcu.reply_period` is set, so the board reports by its own clock."""
         self.speaks: bool | None = speaks or None
-        """True if the board reports by its own clock, False if it answers, None while unknown."""
+        """True if the board reports by its own clock, False if it answers each command, None while
+        unknown."""
         self._known = speaks
         self._left = self._after = 0
         self._came = self._periods = self._asked = 0.0
 
     def left(self) -> None:
-        """Count a command line that was written to the port."""
+        """Count a command that was written to the port."""
         self._left += 1
 
     def read(self, lines: int, periods: float) -> None:
@@ -177,7 +180,8 @@ class Timeline:
         self._later = 0.0
         """Mean time by which `PromptedTimes` places a line later than `FreeRunningTimes`, ns."""
         self.leaps = 0
-        """Number of lines with impossible encoder counts, for which speed times time is used."""
+        """Number of lines with impossible encoder counts. The motion of such a line is computed as
+        speed times time."""
         self.restarted = False
         """Whether the board's clock in the last line shows that the board has restarted."""
 
@@ -189,7 +193,7 @@ class Timeline:
         self._forgotten = True
 
     def left(self, at_ns: int) -> None:
-        """Record that a command line was written at `at_ns` on the monotonic clock."""
+        """Record that a command was written at `at_ns` on the monotonic clock."""
         self._prompts.left(at_ns)
         self._style.left()
 
@@ -217,7 +221,10 @@ class Timeline:
         self._prompts.read(end_ns, lines, following > 0)
 
     def spoilt(self) -> None:
-        """Skip the next line of the read, which is bad, and the command line that it may answer."""
+        """Skip the next line of the read, because it is bad.
+
+        Also skip the command that this line may answer.
+        """
         self._rest -= 1
         self._spoilt = True
         if not self._style.speaks:
@@ -240,7 +247,7 @@ class Timeline:
             following: The number of bytes in the read after the end of the line.
             length: The number of bytes of the line with its line end.
             silent: Whether a silence made the link stale, or a session begins with the line.
-            asked_ns: Monotonic time at which the answered command line was written, ns, or None.
+            asked_ns: Monotonic time at which the answered command was written, ns, or None.
         """
         self._rest -= 1
         # Bytes that followed in the same read were on the wire after this line was complete.
@@ -273,7 +280,10 @@ class Timeline:
         return Feedback(at, speeds, dt, gap, wheels, bridged, asked_ns, since, came_ns)
 
     def _placed(self, asked_ns: int | None, came_ns: int) -> Placed:
-        """Return the time of the next line, complete at `came_ns`, by the best available clock."""
+        """Return the time of the next line by the best available clock.
+
+        `came_ns` is the monotonic time at which the whole line had arrived, ns.
+        """
         speaks, answered = self._style.speaks, None
         if asked_ns is not None or not speaks:
             answered = self._prompts.place(asked_ns)
@@ -298,9 +308,9 @@ class Timeline:
     def _since_last(self, placed: Placed) -> tuple[float, float]:
         """Return the time since the last good line, and the part of it whose lines were lost, s.
 
-        If the times of the two lines come from different clocks, the result is the difference of
-        the two `due_ns`, corrected by the mean offset between the clocks. Without this correction,
-        the errors of many changes from one clock to the other would add up.
+        If the times of this line and of the last good line come from different clocks, the time is
+        the difference of their `due_ns`, corrected by the mean offset between the clocks. Without
+        this correction, the errors of many changes from one clock to another would add up.
         """
         last = self._last_placed
         back = placed.due_ns < last.due_ns
@@ -313,7 +323,7 @@ class Timeline:
         if by_clock is not None:
             return dt, placed.bridged
         period = self._usual_ns / NS_PER_S
-        # A prompted board only answers command lines, so a long time alone does not show that lines
+        # A prompted board only answers commands, so a long time alone does not show that lines
         # are missing. But a bad or ignored reply has covered a part of this time.
         missing = dt > 1.5 * period and (self._style.speaks is not False or self._spoilt)
         return dt, dt - period if missing else 0.0

@@ -23,15 +23,16 @@ SHARE = 0.5
 this share of `Link.quiet_ns`, this computer caused the silence and not the board."""
 
 BUSY = (
-    "`top` shows which other program uses the processor; if acsard runs as the service, it has "
-    "priority"
+    "the Linux command `top` shows which other program uses the processor; acsard has priority if "
+    "it runs as the systemd service"
 )
 
 HOST = "this computer did not run for"
 SIMULATOR = "the built-in simulator, which is a part of this program, is late"
 
 PATIENCE_NS = 3 * NS_PER_S
-"""Time before the first diagnosis, ns. A booting board has answered by then."""
+"""Time without a link before the first diagnosis, ns. A board that was booting has answered by
+then."""
 
 SHOWN = 64
 """Largest number of bytes that a diagnosis shows: a whole line and some noise."""
@@ -49,12 +50,12 @@ Look = Literal["nothing", "statuses", "cut", "foreign", "garbage", "few", "spars
 """
 
 LOOK_MENDS: dict[Look, str] = {
-    "nothing": "does the board have power, is this its port, is mcu.baud_rate right, are TX and "
-    "RX swapped?",
+    "nothing": "does the board have power, is mcu.port its port, is mcu.baud_rate right, are TX "
+    "and RX swapped?",
     "statuses": "is TX of this computer connected to RX of the board?",
     "cut": "does the board cut its lines short, or omit the line ends?",
-    "foreign": "is there noise on the cable, or does another program write to it too?",
-    "garbage": "is mcu.baud_rate the rate of the board?",
+    "foreign": "is there noise on the cable, or does another program send on the cable too?",
+    "garbage": "is mcu.baud_rate the baud rate of the board?",
     "few": "check the cable, the ground and the baud rate;",
     "sparse": "if the board sends its lines less often than the daemon, set mcu.reply_period;",
 }
@@ -81,7 +82,7 @@ def is_ours(words: str) -> bool:
 
 
 class Lateness:
-    """Detector of late control steps. Such a step is a silence that this computer itself causes."""
+    """Detector of late control steps, in which this computer and not the board causes a silence."""
 
     def __init__(self, simulated: bool, quiet_ns: int) -> None:
         """Start. `quiet_ns` is the duration of silence after which the link is stale, ns."""
@@ -96,7 +97,7 @@ class Lateness:
         """Record a step, and return whether a good line ends a silence that this computer caused.
 
         `good` says whether the step received a good line. The simulator runs on this computer, so
-        with it the result is True for every good line.
+        with the simulator the result is True for every good line.
         """
         before_ns, self._looked_ns = self._looked_ns, now_ns
         passed_ns = 0 if before_ns is None else now_ns - before_ns
@@ -218,19 +219,26 @@ class UnansweredLines:
     """Warning that the board does not answer all lines while the link is up.
 
     After every `WINDOW` sent lines, the number of sent lines is compared with that of good lines.
-    The warning is given once, and again only after a window without loss or after the link was
-    lost. A sound board that reports by its own clock causes the same warning if it sends fewer
-    lines than the daemon and mcu.reply_period is not set.
+    The warning is given once. It is given again only after a window without loss, or after the link
+    was lost. A sound board that reports by its own clock also causes the warning if it sends fewer
+    lines than the daemon and `mcu.reply_period` is not set.
     """
 
     def __init__(self, reply_period: float) -> None:
-        """Start. `reply_period` is mcu.reply_period, s. Unless it is 0, nothing is compared."""
+        """Start. `reply_period` is `mcu.reply_period`, s.
+
+        If it is not 0, the board reports by its own clock, so no warning is ever given.
+        """
         self._own_clock = reply_period > 0.0
         self._since: tuple[int, int] | None = None
         self._told = False
 
     def look(self, sent: int, good: int, linked: bool) -> Event | None:
-        """Process the numbers of sent and good lines since the start. Return a due warning."""
+        """Return the warning if it is due, else None.
+
+        `sent` and `good` are the numbers of sent lines and of received good lines, both counted
+        since the daemon started.
+        """
         if not linked or self._own_clock:
             self._since, self._told = None, False
             return None
@@ -246,7 +254,8 @@ class UnansweredLines:
         return Event(
             "lines_lost",
             f"the microcontroller answered only {answers} of {lines} lines: lines or answers get "
-            "lost, or it reports by its own clock; `acsard mcu check` finds out which",
+            "lost, or the microcontroller reports by its own clock; `acsard mcu check` finds out "
+            "which of these it is",
             "warning",
         )
 
@@ -263,7 +272,10 @@ def words(
     lateness: Lateness,
     longest_reply: float,
 ) -> str:
-    """Return a sentence about an open port's link. `longest_reply` limits mcu.reply_period, s."""
+    """Return a sentence about the link on an open port.
+
+    `longest_reply` is the highest value that `mcu.reply_period` may have, s.
+    """
     if link.state in ("booting", "stale"):
         heard = hearing.heard
         if check.trouble:
@@ -296,10 +308,11 @@ def _sparse(sparse_s: float, longest_reply: float) -> str:
 def check_event(check: Negotiation, wants_samples: bool) -> Event:
     """Return the event for the newly agreed form of the lines, plain or checked.
 
-    It is a warning if the board lacks the check, or the counts that `wants_samples` asks for.
+    The event is a warning if the board does not support the check, or if `wants_samples` is true
+    and the board does not send its encoder counts.
     """
     fallen = check.state == "plain" or (wants_samples and check.state == "checked")
-    text = f"the serial lines are {check.in_force}"
+    text = f"the form of the lines on the serial port is now {check.in_force}"
     if check.state == "plain":
         text += ": the microcontroller answers without a checksum"
     elif fallen:

@@ -52,7 +52,8 @@ WATCHDOG_S = 0.3
 """If the board receives no valid line from the daemon for this time, s, it stops the motors."""
 
 GOOD_LINES = 3
-"""Good lines in a row before the link is trusted. A board may print anything after a reset."""
+"""Number of good lines in a row after which the link is trusted. Fewer prove little, because a
+board may print anything after a reset."""
 
 BAD_LINES = 5
 """Number of bad lines in a row on a checked link after which the daemon renegotiates the check."""
@@ -92,7 +93,10 @@ class Link:
         return self._heard_ns is None or now_ns - self._heard_ns > self.quiet_ns
 
     def good(self, at_ns: int) -> int | None:
-        """Count a good line. Return the time since the previous one of the session, ns, if any."""
+        """Count a good line.
+
+        Return the time since the previous good line of the session, ns, or None for the first one.
+        """
         since_ns = None if self._heard_ns is None else at_ns - self._heard_ns
         if not self.silent(at_ns):
             self.excuse()
@@ -116,7 +120,8 @@ class Link:
             self._good_in_row = 0
 
     def bad(self) -> bool:
-        """Count a bad line. If True, the caller must renegotiate the check of a checked link."""
+        """Count a bad line. Return whether the caller must renegotiate the check of a checked
+        link."""
         self.missed()
         self._bad_in_row += 1
         return self._bad_in_row == BAD_LINES
@@ -127,7 +132,10 @@ class Link:
         return self._bad_in_row >= BAD_LINES
 
     def judge(self, now_ns: int, may_rise: bool) -> None:
-        """Make the link stale after a silence, or up after GOOD_LINES good lines if `may_rise`."""
+        """Change the state to stale after a silence, or to up after `GOOD_LINES` good lines.
+
+        The state changes to up only if `may_rise` is true.
+        """
         silent = self.silent(now_ns)
         if self.state == "up":
             if silent:

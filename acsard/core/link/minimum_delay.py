@@ -18,7 +18,11 @@ class MinimumDelay:
     """The delay of the last event in excess of the minimum, in the caller's unit of time."""
 
     def __init__(self, drift: float = DRIFT, most: float = math.inf) -> None:
-        """Start. `drift` is a relative error. An excess above `most` is treated as `most`."""
+        """Start.
+
+        `drift` is the largest relative drift between the two clocks. A delay that exceeds the
+        minimum by more than `most` is treated as if it exceeded the minimum by `most`.
+        """
         self._drift, self._most = drift, most
         self.late = 0.0
 

@@ -72,7 +72,8 @@ IN_FORCE: dict[State, str] = {
 }
 
 Trouble = Literal["", "echo", "forgotten", "unknown"]
-"""The reason why the negotiation does not end, so that the robot cannot drive; "" if there is none.
+"""The reason why the negotiation does not end, so that the robot cannot drive. "" means that the
+negotiation can end.
 
 - echo: the lines that the daemon sends come back
 - forgotten: the board answered with the check before and does not now
@@ -94,14 +95,16 @@ MENDS: dict[Trouble, str] = {
 
 TRIES = 3
 """Number of unanswered questions of one kind after which the daemon concludes that the board does
-not know this kind. One kind asks for a sample, and the other has no request letters."""
+not know this kind. A question is a stop line with a sequence number and a checksum. One kind asks
+for a sample, and the other has no request letters."""
 
 WINDOW = 64
-"""Largest number of lines that wait for an answer. It is far below the number of sequence numbers,
-so a reply cannot match the wrong line."""
+"""Largest number of written lines whose answers the daemon waits for. It is far below the number of
+sequence numbers (256), so a reply cannot match the wrong line."""
 
 LATE_NS = round(WATCHDOG_S * NS_PER_S)
-"""Largest delay of an answer, ns. Later, the board's watchdog has stopped the motors."""
+"""Longest time after a line was written in which its answer is accepted, ns. After this time
+without a line, the board's watchdog has stopped the motors."""
 
 BLIND_PERIOD_NS = NS_PER_S // 10
 """Least time between two stop lines while the board sends nothing, ns. 10 Hz is enough to wake the
@@ -111,15 +114,17 @@ THINKING_NS = 30_000_000
 """Time that the board and the drivers may take to answer, in addition to the wire time, ns."""
 
 FEW_SAMPLES = 5
-"""Number of correct replies in a row without a sample after which the daemon asks for none."""
+"""Number of correct replies in a row without a sample after which the daemon no longer asks for
+samples."""
 
 REPORTS = 20
-"""Number of reports in a row that must equal sent lines to count as an echo: 0.2 s at 100 Hz."""
+"""Number of reports (replies without a sample) in a row that must equal sent lines to count as an
+echo. 20 reports take 0.2 s at 100 Hz."""
 
 CHANGE = 2.0
-"""A run of reports counts as an echo only if its speed changes add up to this, rad/s. The change
-from one report to the next is that of the wheel with the largest change. With coarse encoders, a
-smaller sum may be a coincidence."""
+"""A run of reports counts as an echo only if its speed changes add up to at least this, rad/s. The
+change from one report to the next is that of the wheel with the largest change. With coarse
+encoders, a smaller sum may be a coincidence."""
 
 LINES = 8
 """Number of the newest sent lines with which `EchoDetector` compares a report. At 100 Hz, this
@@ -156,8 +161,8 @@ class EchoDetector:
     board that reports exactly the commanded speeds. A run of at least `REPORTS` reports is an echo
     under two conditions:
 
-    - Each report equals, byte for byte, one of the last `LINES` sent lines, and the number of lines
-      between the two is the same for all reports of the run.
+    - Each report equals, byte for byte, one of the last `LINES` sent lines. The number of lines
+      that were sent after the equal line is the same for all reports of the run.
     - The speed changes in the run add up to at least `CHANGE`. At rest every board looks like an
       echo, so a run without changes proves nothing.
 
@@ -179,8 +184,9 @@ class EchoDetector:
         """The last sent lines. The newest one has the number `_lines`."""
         self._lines = self._reports = 0
         self._runs: dict[int, _Run] = {}
-        """The runs by offset: the number of a report minus the number of the line that it equals.
-        In an echo, the offset is constant."""
+        """The runs of reports that equal sent lines, by offset. The offset is the number of a
+        report minus the number of the sent line that it equals. In an echo, the offset is
+        constant."""
 
     def left(self, line: bytes) -> None:
         """Record that `line`, with its line end, was written to the port."""
@@ -221,14 +227,17 @@ class Negotiation:
         first = (ASK_SAMPLE,) * TRIES if mcu.wants_samples else (ASK_NOTHING,)
         self._letters = (*first, *(b"",) * TRIES)
         self._question = b""
-        """The last question without its line end, b"" if it has no request letters."""
+        """The last question without its line end, to detect its echo. It is b"" if the question has
+        no request letters, because a reply may equal such a question."""
         longest = line_bytes(mcu.trailing_comma, check=True, sample=mcu.wants_samples)
         self._answer_ns = THINKING_NS + 4 * wire_ns(longest, mcu.baud_rate)
         self._sequence = 0
         self._made: tuple[int, int] | None = None
-        """Sequence number and time, ns, of the last checked line, until `settle` is called."""
+        """Sequence number of the last checked line, and the monotonic time at which it was made,
+        ns. None after `settle`."""
         self._pending: deque[tuple[int, int]] = deque(maxlen=WINDOW)
-        """Sequence numbers and times (ns) of the written lines that are not answered yet."""
+        """Sequence numbers of the written checked lines that are not answered yet, each with the
+        time at which the line was written, ns."""
         self._knows = False
         self._without = 0
         self._echo = EchoDetector()
@@ -271,13 +280,14 @@ class Negotiation:
     # Lines to the board.
 
     def seal(self, line: bytes, now_ns: int) -> bytes:
-        """Return the plain command line `line` in the present form, plain or checked."""
+        """Return the plain line `line` in the form that is in force now, plain or checked."""
         if not self.checked:
             return line
         return self._sealed(line, ASK_SAMPLE if self.state == "sampled" else b"", now_ns)
 
     def question(self, now_ns: int) -> bytes | None:
-        """Return the stop line to send while asking, or None if none is due."""
+        """Return the stop line to send while the daemon asks for the check, or None if none is
+        due."""
         waking = self.state == "waking"
         wait_ns = max(BLIND_PERIOD_NS, self._answer_ns) if waking else self._answer_ns
         if not self._asked.lets(now_ns, wait_ns):
@@ -314,7 +324,7 @@ class Negotiation:
     # Lines from the board.
 
     def echoed(self, line: bytes) -> bool:
-        """Return whether `line`, which has no line end, or an earlier line is an echo.
+        """Return whether `line` or an earlier line is an echo. `line` has no line end.
 
         After an echo, every received line is rejected until the port is reopened.
         """
@@ -334,11 +344,14 @@ class Negotiation:
         return self.echoes
 
     def heard_plain(self) -> None:
-        """Record a valid plain line while asking. From now on, unanswered questions are counted."""
+        """Record that a valid plain line came while the daemon asks for the check.
+
+        The board is awake then, so unanswered questions are counted from now on.
+        """
         self._sign("heard")
 
     def answered(self, reply: Checked, at_ns: int) -> int:
-        """Process a correct reply, and return when its line was written, monotonic ns.
+        """Process a correct reply. Return the monotonic time at which its command was written, ns.
 
         `at_ns` is the monotonic time at which the reply was read. Raises `FrameError` unless the
         reply answers a line that was written within `LATE_NS` and is not answered yet.

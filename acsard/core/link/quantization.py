@@ -1,9 +1,11 @@
-"""Measures how coarsely encoders quantize the reported speeds, and adds whole counts to lines.
+"""Measures how coarsely encoders quantize the reported speeds, and adds the counted angles to
+lines.
 
 If the counts per turn are configured, `whole_counts.py` recovers the counts from the speeds.
-Otherwise the pose uses speed times time. The speeds would show the counts per turn only if the
-firmware divided its counts by a fixed period. But then the time between the lines is known, so
-speed times time is wrong only by the rounding of the speeds.
+Otherwise the pose uses speed times time. The module does not derive the counts per turn from the
+speeds. This would be possible only if the firmware divided its counts by a fixed period. But then
+the time between the lines is known, so speed times time is wrong only by the rounding of the
+speeds.
 """
 
 from __future__ import annotations
@@ -20,12 +22,13 @@ FLICKER = 0.0105
 """Smallest change of a wheel's reported speed that is more than rounding, rad/s."""
 
 BLOCK = 64
-"""Number of steps of a reported speed that form a block, from which `Steps.size` is learned. Even
-if counts are rare and the firmware filters the speeds, at least three counts fall into a block."""
+"""Number of steps (changes of a reported speed) that form a block, from which `Steps.size` is
+learned. Even if counts are rare and the firmware filters the speeds, at least three counts fall
+into a block."""
 
 FIRST = 24
-"""Number of steps of a reported speed after which `Steps.size` gets its first value. This value may
-still grow until the end of the block."""
+"""Number of steps (changes of a reported speed) after which `Steps.size` gets its first value. This
+value may still grow until the end of the block."""
 
 RECUR = 3
 """`Steps.size` is the third largest step of a block, because a single damaged line causes two large
@@ -115,10 +118,11 @@ class CountRecovery:
     """Adds the counted angles and the quantization steps to each good line of one port."""
 
     def __init__(self, counts: int = 0) -> None:
-        """Start. `counts` is the configured number of counts per turn, 0 if unknown."""
+        """Start. `counts` is the configured number of counts per wheel turn, 0 if unknown."""
         self._configured, self._whole = counts, WholeCounts(counts)
         self.coarse_lines = 0
-        """Number of lines whose speeds jump as with coarse encoders, if the counts are unknown."""
+        """Number of lines whose speeds jump as with coarse encoders. They are counted only if the
+        counts per turn are not configured."""
         self.forget()
 
     def forget(self) -> None:
@@ -127,7 +131,8 @@ class CountRecovery:
         self._coarseness = Coarseness()
         self._wheels = tuple(Steps() for _ in NOTHING)
         self._reported, self._steps = NOTHING, NOTHING
-        """Learned quantization steps of the wheels, rad/s, without and with the bound `ALIKE`."""
+        """Learned quantization step of each wheel, rad/s. `ALIKE` limits the steps in `_steps`, but
+        not those in `_reported`."""
 
     @property
     def counts(self) -> tuple[int, ...]:

@@ -2,10 +2,10 @@
 
 The time at which the host reads a line is not the time of its sample: an adapter, the scheduler or
 a stall of the host may have held the line back. `FreeRunningTimes` finds the period of a board that
-reports by its own clock. For a board that answers each command line, `PromptedTimes` uses the times
-at which the command lines were written. Each class is a clock. For each read of the port, call
-`read` on both classes. Then `place` returns the time of each line of the read. `feedback.py`
-chooses the better clock for each line.
+reports by its own clock. For a board that answers each command, `PromptedTimes` uses the times at
+which the commands were written. Each class is a clock. For each read of the port, call `read` on
+both classes. Then `place` returns the time of each line of the read. `feedback.py` chooses the
+better clock for each line.
 """
 
 from __future__ import annotations
@@ -22,10 +22,12 @@ from msgspec import Struct
 from acsard.core.values import NS_PER_S
 
 Read = tuple[int, int]
-"""A read of the port: the time at which its last line was complete, ns, and its number of lines."""
+"""A read of the port, as a pair: the monotonic time at which the last line of the read was
+complete, ns, and the number of lines in the read."""
 
 BRIDGED_S = 1.0
-"""Longest time without lines that the odometry fills, s. Later the board may have been reset."""
+"""Longest time without lines that the odometry fills, s. After a longer time, the board may have
+been reset."""
 
 
 class Placed(Struct, frozen=True, gc=False):
@@ -41,10 +43,11 @@ class Placed(Struct, frozen=True, gc=False):
     dt: float | None = None
     """Time since the previous line with this clock, s. None for the first line and for "reads"."""
     bridged: float = 0.0
-    """The part of `dt` whose lines were lost, s."""
+    """The part of `dt` in which lines were lost, s."""
     early: bool = False
-    """Whether the line came before the clock expected it. Then `due_ns` is the time of its arrival.
-    The `dt` of the next line is not valid then: subtract the two `due_ns` instead."""
+    """Whether the line came before the clock expected it. If so, `due_ns` is the time at which the
+    line arrived, and the `dt` of the next line is not valid. The difference of the `due_ns` of the
+    next line and of this line replaces that `dt`."""
 
 
 # A free-running board. A slot is one period of its clock, in which the board sends one line.
@@ -55,8 +58,8 @@ one window, `FreeRunningTimes` finds or corrects the clock of the board."""
 
 LOOP_GAIN = 0.2
 """Final value of the gain g with which `FreeRunningTimes` corrects its clock. The gain starts at 1
-and falls during the first windows. The reads of one window show the error of the clock to a few
-hundredths of a period."""
+and falls during the first windows. One window shows the error of the clock only to a few hundredths
+of a period, so a small gain averages over several windows."""
 
 DRIFT = 0.01
 """Largest relative error of a board's clock. A ceramic resonator reaches half of it."""
@@ -66,8 +69,8 @@ EXACT = 0.001
 share. The share covers the error of a quartz and of the measurement."""
 
 LONE = 0.7
-"""If at least this share of the reads of the port contains a single line, lines are treated as read
-one by one, and otherwise as batches of an adapter."""
+"""If at least this share of the reads of the port contains a single line, the lines are treated as
+read one by one. Otherwise they are treated as batches of an adapter."""
 
 LATE_ALONE, LATE_BATCHED = 0.6, 1.3
 """Largest lateness of a line, in periods of the board, with which `FreeRunningTimes` accepts a
@@ -81,9 +84,10 @@ so `FreeRunningTimes` finds no clock. It also finds none for a slow board whose 
 than this time."""
 
 EARLY_ALONE, ALONE = 0.55, 12
-"""`FreeRunningTimes` refuses a clock if only a few reads come within `EARLY_ALONE` periods of their
-slots: the earliest read, and at most one more for each `ALONE` reads. These few reads probably
-answer commands that were sent between two periods, so the clock is too early for all other
+"""`FreeRunningTimes` refuses a clock that too few reads confirm. A read confirms the clock if it
+comes at most `EARLY_ALONE` periods after its slot. The earliest read always does. Besides that
+read, more than one in `ALONE` reads must confirm the clock. Otherwise the few early reads probably
+answer commands that were sent between two periods, and the clock is too early for all other
 lines."""
 
 JUMP = 1.4
@@ -95,10 +99,12 @@ SURE = 0.15
 limit by more than one period and the margin, a line before it is missing."""
 
 EARLY = 0.25
-"""If a line is early by more than this number of periods, `FreeRunningTimes` drops its clock."""
+"""If a line comes before its slot by more than this number of periods, `FreeRunningTimes` gives up
+its clock as wrong."""
 
 LOSSY_READS = 0.45
-"""If more than this share of the reads in two windows follow missing lines, the period is wrong."""
+"""If lines are missing before more than this share of the reads in two windows, the period of the
+clock is wrong."""
 
 
 class FreeRunningTimes:
@@ -143,8 +149,8 @@ class FreeRunningTimes:
         """Number of slots that were recently counted as missing lines. They may be taken back."""
         self._lag = self._batch = self._gain = self._share = 0.0
         """`_lag` is the usual lateness x of a read, and `_batch` the usual time between two reads,
-        both in slots. `_gain` is the gain g. `_share` is the share of reads in the last window
-        after missing lines."""
+        both in slots. `_gain` is the gain g. `_share` is the share of the reads in the last window
+        before which lines were missing."""
         self._batched: bool = False
         self._alone: bool = False
         self._least: float
@@ -160,11 +166,11 @@ class FreeRunningTimes:
         """Slot of the last line that the present clock has placed. None before the first one."""
 
     def read(self, at_ns: int, lines: int, drained: bool) -> int:
-        """Process a read, and return the number of lines that were lost before its last line.
+        """Process a read of the port, and return the number of lines lost before its last line.
 
-        The result is -1 if one slot too many had been counted as missing. `at_ns` is the monotonic
-        time at which the last line was complete. `drained` says whether the read took all data that
-        the kernel held.
+        The result is -1 if earlier reads counted one slot too many as missing. `at_ns` is the
+        monotonic time at which the last line of the read was complete. `drained` says whether the
+        read took all data that the kernel held.
         """
         self._stretch = 1.0
         since, self._before = at_ns - self._before, at_ns
@@ -201,7 +207,10 @@ class FreeRunningTimes:
         return self._lag * self.usual
 
     def place(self, behind: int) -> Placed | None:
-        """Return the time of the line `behind` lines before the last, or None without a clock."""
+        """Return the time of a line of the last read, or None without a clock.
+
+        `behind` is the number of lines that follow the line in the read.
+        """
         period, last = self.period, self._last
         if period is None:
             return None
@@ -269,11 +278,11 @@ class FreeRunningTimes:
 
         - Configured periods come first. For jittery lines they are more reliable than half a second
           of data.
-        - Configured periods without missing lines come before measured periods with missing lines.
-          Lines that are read one by one may still come from an adapter that batches lines, because
-          they may fill its packets one by one.
-        - In batches, a measured period is left out if a configured period is within `DRIFT` of it,
-          because half a second cannot distinguish the two.
+        - Configured periods that assume no missing lines come before measured periods that assume
+          missing lines. Lines that are read one by one may still come from an adapter that batches
+          lines, because they may fill its packets one by one.
+        - If an adapter batches the lines, a measured period is left out if a configured period is
+          within `DRIFT` of it. Half a second of data cannot distinguish these two periods.
         """
         plain, known = _slots(reads), [period * NS_PER_S for period in self._known]
         alone = [gap for gap, (_, lines) in zip(gaps, reads[1:], strict=True) if lines == 1]
@@ -293,7 +302,7 @@ class FreeRunningTimes:
             yield own, LATE_BATCHED, slope
 
     def _begin(self, at_ns: int) -> None:
-        """Start a window. `_lossy` counts its reads before which lines are missing."""
+        """Start a window. `_lossy` counts the reads of the window that follow missing lines."""
         self._window_ns: int = at_ns
         self._least = math.inf
         self._count: int = 0
@@ -320,7 +329,8 @@ class FreeRunningTimes:
     def _nominal(self) -> float:
         """Return the nominal period of the firmware, s.
 
-        It is a configured period or a whole number of ms, if one is close. Else it is as measured.
+        It is a configured period if one is close to the measured period, else a whole number of ms
+        if one is close. Otherwise it is the measured period.
         """
         seconds = self.usual / NS_PER_S
         for known in self._known:
@@ -331,7 +341,10 @@ class FreeRunningTimes:
 
 
 def _slots(reads: list[Read], period: float = math.inf) -> list[int]:
-    """Return the slot of each read's last line. With a `period`, ns, missing lines count too."""
+    """Return the slot of each read's last line.
+
+    If `period`, ns, is finite, slots whose lines are missing are counted too.
+    """
     slots = [0]
     for (before, _), (at, lines) in pairwise(reads):
         slots.append(slots[-1] + max(lines, round((at - before) / period)))
@@ -361,11 +374,11 @@ def _latest(reads: list[Read], slots: list[int], period: float) -> tuple[float, 
 # A prompted board.
 
 MEMORY = 64
-"""Largest number of command lines that are remembered because their replies may still come."""
+"""Largest number of commands that are remembered because their replies may still come."""
 
 FAST = 0.05
-"""Gain of the filters for the usual reply delay and its spread, the usual time between command
-lines, the usual time between batches, and the share of batches among the reads."""
+"""Gain of the filters for the usual reply delay and its spread, the usual time between commands,
+the usual time between batches, and the share of batches among the reads."""
 
 SLOW = 0.0125
 """Gain per read of the filter that decides whether the board itself varies the reply delay."""
@@ -377,18 +390,18 @@ outdated least delay is forgotten after about 500 replies."""
 CREEP, CREEPS_FOR = 0.05, 3
 """The least delay of the last replies rises by the share `CREEP` of the time since the last read,
 so that older replies are forgotten. This time is limited to between 1 and `CREEPS_FOR` times the
-usual time between two command lines. The upper limit is for a board that stalls and then answers
-all lines."""
+usual time between two commands. The upper limit is for a board that stalls and then answers all
+lines."""
 
 LATE = 1.25
 """If the least delay of the last replies exceeds the long-term least delay by more than this,
-replies were lost. The unit is the usual time between two command lines. A limit of 1 is too low,
-because the delay may permanently rise by almost that much."""
+replies were lost. The unit is the usual time between two commands. A limit of 1 is too low, because
+the delay may permanently rise by almost that much."""
 
 RARE = 0.002
-"""Share of lost replies. After a host stall, two command lines are written close together, and the
-reply to the first one is late. If a smaller share of the replies was lost before, such a late reply
-does not prove a loss."""
+"""Share of lost replies, below which a late reply after a host stall does not prove a loss. After a
+host stall, two commands are written close together, so the reply to the first one is late even if
+no reply was lost."""
 
 JITTER_NS = 350_000
 """Mean deviation of the reply delay that USB and the scheduler cause, ns."""
@@ -405,7 +418,8 @@ LOSING = 0.005
 """Gain of the filter for the share of lost replies. With 1/20, two losses would reach `LOSSY`."""
 
 LOSSY = 0.03
-"""Share of lost replies above which a batched link counts as lossy: any line may lack its reply."""
+"""Share of lost replies above which a batched link counts as lossy, so that any line may lack its
+reply."""
 
 SEVERAL = 0.15
 """If more than this share of the reads of the port have several lines, an adapter batches lines.
@@ -420,12 +434,13 @@ BATCH_NS = 2_000_000
 
 
 class PromptedTimes:
-    """The sample times of a prompted board, from the command lines that its replies answer.
+    """The sample times of a prompted board, from the commands that its replies answer.
 
-    In this class, a line is a command line of the daemon. A plain reply does not say which line it
-    answers. However, a board that answers each line takes its sample when the line arrives. So the
-    sample times are the times at which the lines were written, plus a usual delay. The time between
-    two samples is the time between their lines, even if the host reads the replies late.
+    In this class, "line" always means a command that the daemon wrote. A plain reply does not say
+    which line it answers. However, a board that answers each line takes its sample when the line
+    arrives. So the sample times are the times at which the lines were written, plus a usual delay.
+    The time between two samples is the time between their lines, even if the host reads the replies
+    late.
 
     Replies come in the order of the lines. If a reply seems to be later than usual by more than
     half the time from its line to the next line, it answers the next line instead. The reply to the
@@ -439,12 +454,12 @@ class PromptedTimes:
         self.forget()
 
     def forget(self) -> None:
-        """Forget all command lines, because they are answered or will never be answered."""
+        """Forget all commands, because they are answered or will never be answered."""
         self._left.clear()
         self.restart()
 
     def restart(self) -> None:
-        """Forget which command line was answered last, and the usual delay of the replies.
+        """Forget which command was answered last, and the usual delay of the replies.
 
         The next reply is then assigned to the newest line that it can answer. The lines are kept,
         because replies to the last ones may still come.
@@ -458,17 +473,17 @@ class PromptedTimes:
         """Least delay of the last replies, ns."""
         self._sent: int | None = None
         self._apart = self._missing = 0.0
-        """The usual time between two command lines, ns, and the share of lost replies."""
+        """The usual time between two commands, ns, and the share of lost replies."""
         self._last: int | None = None
-        """Time at which the last answered command line was written, ns. If its reply came later or
-        sooner than usual because of the board, the time is shifted by the difference."""
+        """Time at which the last answered command was written, ns. If the board replied to that
+        command later or sooner than usual, the time is shifted by the difference."""
         self._passed = self._line = 0
-        """Times at which two command lines were written, ns. `_line` belongs to the last line that
-        was answered, and `_passed` to the last line that was answered or given up."""
+        """Times at which two commands were written, ns. `_line` belongs to the last line that was
+        answered, and `_passed` to the last line that was answered or given up."""
         self._lost = False
         """Whether the last read with a single reply showed that an earlier reply was lost."""
         self._given: list[int] = []
-        """The command lines that were given up at the last read of a batched link, as times in ns,
+        """The commands that were given up at the last read of a batched link, as times in ns,
         oldest first. An adapter that stalled may still deliver their replies."""
         self._at, self._alone, self._since = 0, False, 0
         self._base, self._batch, self._losses = 0.0, 2e7, 0.0
@@ -496,7 +511,7 @@ class PromptedTimes:
         return self._several > SEVERAL
 
     def left(self, at_ns: int) -> None:
-        """Record that a command line was written at `at_ns` on the monotonic clock."""
+        """Record that a command was written at `at_ns` on the monotonic clock."""
         if self._sent is not None:
             apart, usual = at_ns - self._sent, self._apart
             self._apart = usual + FAST * (min(apart, 2 * usual) - usual) if usual else apart
@@ -519,9 +534,10 @@ class PromptedTimes:
             self._base, self._losses = self._delay, 0.0
 
     def place(self, asked_ns: int | None = None) -> Placed | None:
-        """Return the time of the next reply, or None if no command line waits for a reply.
+        """Return the time of the next reply, or None if no command waits for a reply.
 
-        `asked_ns` is the monotonic time at which the answered line was written, if it is known.
+        `asked_ns` is the monotonic time at which the line that the reply answers was written, if it
+        is known.
         """
         left = self._left
         if asked_ns is not None:
@@ -559,12 +575,12 @@ class PromptedTimes:
         return Placed("prompts", due_ns, dt / NS_PER_S, bridged / NS_PER_S)
 
     def skip(self) -> None:
-        """Remove the command line that the next reply answers, because the reply was damaged."""
+        """Remove the command that the next reply answers, because the reply was damaged."""
         if self._left:
             self._passed = self._left.popleft()
 
     def _begin(self) -> None:
-        """Assign the first reply to the newest command line that was sent early enough for it."""
+        """Assign the first reply to the newest command that was sent early enough for it."""
         left = self._left
         while len(left) > 1 and left[1] + self._soonest <= self._at:
             self._passed = left.popleft()
@@ -589,7 +605,7 @@ class PromptedTimes:
             self._spread = 0.0
 
     def _weigh(self, lines: int, since: int, cut: bool) -> None:
-        """Give up the command lines whose replies a batched link has lost.
+        """Give up the commands whose replies a batched link has lost.
 
         The last reply of a batch shows the loss: it is too late for the line that it would answer.
         If many replies are lost, the first reply of the batch decides instead, because the board
@@ -627,10 +643,10 @@ class PromptedTimes:
         self._delay = self._base
 
     def _given_up_too_early(self, delay: float) -> bool:
-        """Return whether the present reply answers the command line that was given up last.
+        """Return whether the present reply answers the command that was given up last.
 
-        This method first gives up the command lines whose replies were lost. The present reply must
-        be the only one in its read. `delay` is the usual delay, ns.
+        This method first gives up the commands whose replies were lost. The present reply must be
+        the only one in its read. `delay` is the usual delay, ns.
         """
         left, at, wide = self._left, self._at, 4 * self._spread
         lost, self._lost = self._lost, False

@@ -12,7 +12,8 @@ from acsard.core.config.wire_time import wire_ns
 from acsard.core.values import Instant, Received
 
 Offered = Literal["sent", "superseded", "down"]
-"""The result for a line. "superseded" means that the line was dropped in favour of a newer one."""
+"""The result of `Port.offer`. "down" means that the port is closed. "superseded" means that the
+line was dropped or only partly written, so that a newer line must replace it."""
 
 
 class Port(Protocol):
@@ -36,14 +37,20 @@ class Port(Protocol):
         """
 
     def offer(self, line: bytes, now: Instant) -> Offered:
-        """Write a line that was made at `now`, at once or not at all, and return the result."""
+        """Write a line at once or drop it, and return the result.
+
+        `now` is the time at which the line was made.
+        """
 
 
 class SerialOutput:
     """The output of a serial port from its opening to its closing. It has no queue."""
 
     def __init__(self, baud_rate: int, stop: bytes, period_ns: int) -> None:
-        """Start. `stop` is the plain stop line. Only stops may be older than `period_ns` ns."""
+        """Start. `stop` is the plain stop line.
+
+        A line that is older than `period_ns` ns is dropped, unless it is a stop.
+        """
         self._baud_rate, self._stop, self._period_ns = baud_rate, stop, period_ns
         self._still = stop.removesuffix(b"\r\n")
         """The bytes with which every stop line begins, plain or checked."""

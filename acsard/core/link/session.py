@@ -40,7 +40,8 @@ BLOCKED_NS = int(WATCHDOG_S * NS_PER_S)
 has stopped the motors by itself."""
 
 IDENTITY = b"!acsard-mcu "
-"""First bytes of the line with which an MCU with our firmware identifies itself after booting."""
+"""First bytes of the line with which an MCU with acsard's firmware identifies itself after
+booting."""
 
 
 class McuSession:
@@ -77,7 +78,8 @@ class McuSession:
         self._wants_samples, self._longest_reply = mcu.wants_samples, longest_reply
         self.rejects: Counter[str] = Counter()
         self._rejected: dict[str, tuple[int, bytes]] = {}
-        """Number of lines that this update rejected, and the last of them, by reason."""
+        """Maps each reason to the number of lines that this `update` has rejected for it, and to
+        the last such line."""
         self.good_lines = 0
         self._heard_ns: int | None = None
         self.restarted = False
@@ -91,9 +93,10 @@ class McuSession:
         self._opened = 0
         self._blind, self._just_blind = Throttle(), False
         self._made: tuple[bytes, int] | None = None
-        """The last line and its time, ns, until it is known whether the port wrote the line."""
+        """The last line that `line()` returned, and the monotonic time at which it was made, ns.
+        None once it is known whether the port wrote the line."""
         self._left_ns = 0
-        """Monotonic time at which the port wrote the last line or was opened, ns."""
+        """Monotonic time at which the port last wrote a line or was opened, ns."""
         self._held_up = False
         """True if the port did not write the last line that was made."""
         self.blocked = False
@@ -261,7 +264,10 @@ class McuSession:
         self._rejected[reason] = (before + more, line)
 
     def _announce_rejects(self) -> None:
-        """Add one event per reason. After noise, one event per line would take too much time."""
+        """Add an event for each reason for which lines were rejected.
+
+        After noise, an event for each rejected line would take too much time.
+        """
         for reason, (count, line) in self._rejected.items():
             text = f"{line[:60]!r}" if line else ""
             self.events.append(
@@ -330,7 +336,9 @@ class McuSession:
 
     def _line(self, line: bytes, read_at: Instant, following: int) -> Feedback | None:
         if line.startswith(IDENTITY):
-            self._restart(f"has started: {line.decode('ascii', 'replace')}")
+            self._restart(
+                f"has restarted and sent its start line: {line.decode('ascii', 'replace')}"
+            )
             return None
         check = self.negotiation
         asking = check.asking
@@ -367,7 +375,10 @@ class McuSession:
         size: tuple[int, int],
         asked_ns: int | None,
     ) -> Feedback:
-        """Return the feedback of a good line. `size` is (`following`, `length`) as in `place`."""
+        """Return the feedback of a good line.
+
+        `size` is the pair of `following` and `length`, the arguments of `Timeline.place`.
+        """
         self.good_lines += 1
         before_ns, self._heard_ns = self._heard_ns, read_at.mono_ns
         if before_ns is not None and read_at.mono_ns - before_ns >= LONG_GAP_NS:

@@ -2,8 +2,8 @@
 
 Let a be the angle of one count in rad, and T the time in s in which a wheel made n counts. Firmware
 that divides counts by time reports the speed n a / T. T is the same for all four wheels, but the
-host knows it only to a few ms. With a coarse encoder, this error falsifies the heading. At 16
-counts a turn, one count is 0.4 rad of the wheel, and an error of 30 % in T is 30 % of that angle.
+host knows it only to a few ms. With a coarse encoder, this error makes the heading wrong. At 16
+counts a turn, the wheel rolls 0.4 rad per count, and an error of 30 % in T is 30 % of that angle.
 However, n is a whole number, so T can be found from the speeds:
 
 1. Each possible n of the fastest wheel implies a time T = n a / speed. The search starts at the n
@@ -34,15 +34,16 @@ import math
 from acsard.core.link.codec import Motors
 
 ROUNDING = 0.0052
-"""Largest rounding error of a speed with two decimals, rad/s."""
+"""Largest rounding error of a speed with two decimals (0.005 rad/s), with a small margin."""
 
 MOST_TRIES = 16
 """Largest number of different values of n, the counts of the fastest wheel, that are tried for a
 line. It bounds the time of a control step."""
 
 BY_CHANCE = 0.05
-"""Largest accepted probability that random speeds look like whole counts. It grows with each number
-of counts that is tried. Above the limit, speeds that look like whole counts prove nothing."""
+"""Largest accepted probability that random speeds look like whole counts. The probability grows
+with each number of counts that is tried for a line. Above the limit, speeds that look like whole
+counts prove nothing."""
 
 EXACT = 0.3
 """Largest accepted difference, in counts, between a whole number of counts and speed times host
@@ -98,8 +99,8 @@ class WholeCounts:
         self.covers_gap = False
         """Whether the counts of the last line include those of the missing line before it."""
         self._cover = 0.0
-        """Filtered share of the lines whose counts include those of a missing line before them.
-        Only lines that follow a missing line are used, and only if their speeds show the case."""
+        """Of the lines that follow a missing line, the filtered share whose counts include those of
+        the missing line. A line whose speeds do not show this is not used."""
         self._doubt = self._unsure = 0.0
         """`_doubt` is the filtered share of the lines whose speeds are not whole counts. `_unsure`
         is the filtered error of the host's time, in counts of the fastest wheel."""
@@ -120,8 +121,9 @@ class WholeCounts:
         time. Return None if the firmware does not report whole counts, or if the speeds are not all
         0 but none exceeds its rounding error.
 
-        `own` is the host's estimate of the time since the previous line, s. `gap` is the time from
-        the last good line to the missing previous line, s, 0 if none is missing.
+        `own` is the host's estimate of the time since the previous line, s. If the line before this
+        one is missing, `gap` is the time from the last good line to the missing line, s. Otherwise
+        it is 0.
         """
         self.covers_gap = False
         before, self._before = self._before, speeds

@@ -60,7 +60,10 @@ class Cdr(Generic[T]):
         return bytes(out)
 
     def decode(self, payload: bytes) -> T:
-        """Return the message in a payload, or raise only `CdrError`. Trailing bytes are ignored."""
+        """Return the message in a payload. Trailing bytes are ignored.
+
+        Raises `CdrError` and no other exception if the payload is not valid.
+        """
         order = _ORDERS.get(payload[:2])
         if order is None or len(payload) < 4:
             raise CdrError(
@@ -96,7 +99,7 @@ class _Source:
         start, self.at = self.at, self.at + layout.size
         if self.at > len(self.data):
             raise CdrError(
-                f"the payload ends after {len(self.data)} bytes, in the middle of a field"
+                f"the CDR payload ends after {len(self.data)} bytes, in the middle of a field"
             )
         return layout.unpack_from(self.data, start)
 
@@ -104,7 +107,10 @@ class _Source:
         """Read the length of a sequence whose items take at least `least` bytes each."""
         (count,) = self.take("I")
         if count * least > len(self.data) - self.at:
-            raise CdrError(f"a sequence of {count} items does not fit into {len(self.data)} bytes")
+            raise CdrError(
+                f"the CDR payload is too short for its sequence of {count} items: it has only "
+                f"{len(self.data)} bytes"
+            )
         return int(count)
 
     def text(self) -> str:
@@ -113,16 +119,16 @@ class _Source:
         self.at += count
         # Some writers encode an empty string as length 0, without the final zero byte.
         if raw[-1:] not in (b"\0", b""):
-            raise CdrError("a string does not end with a zero byte")
+            raise CdrError("a string in the CDR payload does not end with a zero byte")
         try:
             return raw[:-1].decode()
         except UnicodeDecodeError as error:
-            raise CdrError(f"a string is not UTF-8: {error.reason}") from None
+            raise CdrError(f"a string in the CDR payload is not UTF-8: {error.reason}") from None
 
 
 def _whole(code: str, value: Any) -> Any:
     if code == "?" and value > 1:
-        raise CdrError(f"a boolean must be 0 or 1, not {value}")
+        raise CdrError(f"a boolean in the CDR payload must be 0 or 1, not {value}")
     return bool(value) if code == "?" else value
 
 
@@ -161,7 +167,7 @@ Get = Callable[[Any], Any]
 
 
 class _Numbers:
-    """A part: neighbouring numbers of a message, which may belong to different nested structs."""
+    """Part of a message: neighbouring numbers, which may belong to different nested structs."""
 
     def __init__(self, run: list[tuple[str, inspect.Type]]) -> None:
         self._codes = "".join(number_code(kind) for _, kind in run)
@@ -201,7 +207,8 @@ class _Text:
 
 
 class _List:
-    """A part: a sequence of at most `most` items, or an array of `most` items if `fixed`."""
+    """Part of a message: a sequence of up to `most` items, or an array of `most` items if
+    `fixed`."""
 
     def __init__(self, get: Get, kind: inspect.Type, most: int | None, fixed: bool) -> None:
         self._get, self._most = get, most

@@ -16,7 +16,8 @@ SIZES = {"d": 8, "f": 4, "q": 8, "Q": 8, "i": 4, "I": 4, "B": 1, "?": 1}
 """Size and alignment of a number in CDR, in bytes, by its code in the struct module."""
 
 Build = Callable[[Iterator[object]], object]
-"""Function that builds a struct from the values of its fields, those of nested structs included."""
+"""Function that builds a struct. Its argument yields the values of the struct's fields in order,
+with the fields of each nested struct in place of that struct."""
 
 Limit = tuple[float, float]
 """Least and greatest value of a number."""
@@ -41,7 +42,7 @@ def leaves(info: inspect.StructType, path: str = "") -> Iterator[tuple[str, insp
 
 
 def builder(info: inspect.StructType) -> Build:
-    """Return a function that builds this struct from its fields' values, nested ones included."""
+    """Return the function that builds the struct from the values of its `leaves`, in order."""
     kinds = [plain(field.type) for field in info.fields]
     children = [builder(kind) if isinstance(kind, inspect.StructType) else next for kind in kinds]
     return lambda values: info.cls(*[child(values) for child in children])

@@ -80,9 +80,9 @@ def diagnostics(
 ) -> DiagnosticArray:
     """Return the message with all rows.
 
-    `certificate` is the level and the description that `expiry` returns. The description is ""
-    without a certificate, and then there is no row. `speed_limit` is the speed limit that lowers a
-    setting, in words; "" if none does.
+    `certificate` is the level and the description that `expiry` returns. Without TLS the
+    description is "", and the message has no row about the certificate. `speed_limit` is the speed
+    limit that lowers a setting, in words; "" if none does.
     """
     mode = {"mode": outputs.mode, "source": outputs.source}
     rows = [
@@ -248,7 +248,8 @@ def _routers(endpoints: Sequence[str], routers: RoutersStatus) -> list[Row]:
         words = NOT_YET
     if peers:
         words += (
-            f"; {', '.join(peers)} is not a router: clients that connect here see only this robot"
+            f"; {', '.join(peers)} is not a router: clients that connect to this daemon see only "
+            "this robot"
         )
     return [Row("router", WARN if missing or peers else OK, words, values)] if values else []
 

@@ -36,7 +36,8 @@ _text = msgspec.json.Encoder()
 
 
 class DecodeError(AcsardError):
-    """Error for a payload that cannot be decoded. `reason` is the end of its counter's name."""
+    """Error for a payload that cannot be decoded. `reason` is the last part of the name of the
+    counter that counts such errors."""
 
     def __init__(self, reason: str, text: str) -> None:
         super().__init__(text)

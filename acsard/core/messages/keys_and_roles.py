@@ -31,7 +31,7 @@ Direction = Literal["out", "in", "query", "service"]
 
 
 class Topic(Struct, frozen=True):
-    """One row of the table."""
+    """One row of the table of keys (`TOPICS`)."""
 
     key: str
     """The key below the robot's id, with placeholders such as `<source>`."""
@@ -66,7 +66,7 @@ class Topic(Struct, frozen=True):
 
 
 class Service(NamedTuple):
-    """One row of the table of services."""
+    """One row of the table of services (`SERVICES`)."""
 
     least: Role
     """Lowest role that may call the service."""
@@ -80,22 +80,26 @@ class Service(NamedTuple):
 
 
 SERVICES: dict[Verb, Service] = {
-    "stop": Service("viewer", "stop, and stay stopped until clear"),
+    "stop": Service("viewer", "stop the robot; it stays stopped until srv/clear is called"),
     "clear": Service(
         "operator",
-        "clear the fault if there is one, else the stop; the payload {latch} names it",
+        "clear the fault if there is one, else the stop; {latch} in the payload is the number of "
+        "the fault or stop",
         "Release",
         '{"latch": 1800000000000}',
         optional=True,
     ),
     "activate": Service(
         "operator",
-        "switch on, so that commands have an effect; the payload {latch} names the latch",
+        "switch the robot on, so that it follows commands; {latch} in the payload is the number "
+        "of the latch to release",
         "Release",
         '{"latch": 1800000000000}',
         optional=True,
     ),
-    "deactivate": Service("operator", "switch off: ramp to zero and ignore commands"),
+    "deactivate": Service(
+        "operator", "switch the robot off: it slows down to zero and ignores commands"
+    ),
     "reset_odometry": Service("operator", "set the pose to x 0, y 0, yaw 0"),
     "set_pose": Service(
         "maintainer",
@@ -105,7 +109,8 @@ SERVICES: dict[Verb, Service] = {
     ),
     "set": Service(
         "maintainer",
-        "change settings; the payload is {settings: {key: value}}; {keep: true} writes the file",
+        "change settings; the payload is {settings: {key: value}}; {keep: true} also writes them "
+        "to the configuration file",
         "Settings",
         '{"settings": {"limits.linear_speed": 0.8}}',
     ),
@@ -132,7 +137,7 @@ answer on a key proves that the client has at least this role."""
 
 
 def whoami_key(role: str) -> str:
-    """Return the key that answers only clients with at least this role."""
+    """Return the key that only clients with at least this role can query."""
     return WHOAMI.replace("<role>", role)
 
 
@@ -186,7 +191,7 @@ def _service(verb: Verb) -> Topic:
 
 
 TOPICS: tuple[Topic, ...] = (
-    _out("odom", "Odometry", "every feedback", "pose, twist, covariance of base in odom"),
+    _out("odom", "Odometry", "every feedback", "pose of base in odom, twist, covariances"),
     _out("tf", "TFMessage", "with odom", "transform odom -> base"),
     _out("tf_static", "TFMessage", "latched", "transform base -> lidar", latched=True),
     _out(
@@ -195,14 +200,17 @@ TOPICS: tuple[Topic, ...] = (
     ),
     _out("wheel_states", "JointState", "every feedback", "wheel angles and speeds"),
     _out("battery", "Battery", "1 Hz, on change", "voltage, current and state of charge"),
-    _out("cmd_vel_out", "TwistStamped", "every period", "the twist applied after limits"),
+    _out("cmd_vel_out", "TwistStamped", "every period", "the twist in force after all limits"),
     _out("state", "RobotState", "10 Hz, on change", "mode, reason, pose, link, counters"),
     _out("diagnostics", "DiagnosticArray", "1 Hz, on change", "health of every part"),
     _out("events", "Events", "on change", "the last 20 events with time, text and caller"),
-    _out("sim/pose", "PoseStamped", "100 Hz", "the true pose, simulated only", simulated=True),
-    _out(json_key("<key>"), "JSON", "as the key", "each key above as JSON, for subscribers"),
+    _out(
+        "sim/pose", "PoseStamped", "100 Hz", "the true pose, only with the simulator",
+        simulated=True,
+    ),
+    _out(json_key("<key>"), "JSON", "as the key", "each published key as JSON, for subscribers"),
     _command("cmd/<source>", "Twist or TwistStamped", "velocity command of a source", local=True),
-    _command("wheel_cmd/<source>", "JointState", "four wheel speeds of a source", local=True),
+    _command("wheel_cmd/<source>", "JointState", "wheel speeds that a source commands", local=True),
     _command("cmd/<source>/<certificate>", "Twist or TwistStamped", "cmd/<source> over TLS"),
     _command("wheel_cmd/<source>/<certificate>", "JointState", "wheel_cmd/<source> over TLS"),
     # A gyro changes the pose, as set_pose does, so it needs the same role. Clients may subscribe to
@@ -219,7 +227,8 @@ TOPICS: tuple[Topic, ...] = (
         "stop", "in", "anything", "any", "any PUT stops the robot like srv/stop", publish="viewer",
     ),
     Topic(
-        "gateway", "in", "GatewayState", "4 Hz", "status of the TLS gateway, on this machine only",
+        "gateway", "in", "GatewayState", "4 Hz",
+        "status of the TLS gateway; only for programs on the robot's machine",
         publish="maintainer", local=True,
     ),
     *(_service(verb) for verb in SERVICES),
@@ -227,10 +236,11 @@ TOPICS: tuple[Topic, ...] = (
     _query("config", "Config", "the effective configuration", "maintainer"),
     _query("interfaces", "Interfaces", "command and state interfaces"),
     _query("topics", "Topics", "this table"),
-    _query(WHOAMI, "WhoAmI", "role of the client that asks, one key per role", "<role>"),
+    _query(WHOAMI, "WhoAmI", "role of the client that asks; each role has its own key", "<role>"),
     _query("schema/<Type>", "JSON Schema", "the fields of a message type"),
     Topic(
-        "alive", "out", "liveliness token", "", "present while the daemon runs", subscribe="viewer"
+        "alive", "out", "liveliness token", "", "this token exists while the daemon runs",
+        subscribe="viewer",
     ),
 )  # fmt: skip
 
@@ -286,7 +296,10 @@ def source_keys(sources: Iterable[str], certificate: str = "") -> list[str]:
 
 
 def unknown(key: str) -> bool:
-    """Return whether no row matches a key. Every key below `json/` or of a command is known."""
+    """Return whether no row of the table of keys matches a key.
+
+    Keys below `json/` and all keys of commands always count as known.
+    """
     return row_of(key) is None and not key.startswith((JSON_TREE, "cmd/", "wheel_cmd/"))
 
 

@@ -81,4 +81,5 @@ SHORT: dict[type, Callable[[Any], list[str]]] = {
     PoseStamped: lambda message: _pose(message.pose),
     TwistStamped: lambda message: _twist(message.twist),
 }
-"""The types with a one-line form, each with the function that returns its parts."""
+"""The message types that have a one-line form. Each maps to the function that returns the parts of
+the line."""

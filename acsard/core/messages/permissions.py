@@ -20,7 +20,8 @@ USES: tuple[Use, ...] = get_args(Use)
 
 MAY: dict[Role, str] = {
     "viewer": "this role may read data and stop the robot, but not drive it",
-    "operator": "this role may stop, clear, and drive as a source that commands.sources lists",
+    "operator": "this role may stop the robot, clear a stop or a fault, and drive as a source that "
+    "commands.sources lists",
     "maintainer": "this role has every permission",
 }
 """The permissions of each role in words, for error messages."""

@@ -88,8 +88,8 @@ class Report:
     ) -> None:
         self.certificate_ends = dict(certificate_ends or {})
         """Expiry of each TLS certificate, wall-clock ns since 1970, by the name of its owner. The
-        robot's own certificate has the name "". The TLS gateway reports that time if the daemon may
-        not read it."""
+        robot's own certificate has the name "". If the daemon may not read the robot's own
+        certificate, the TLS gateway reports its expiry."""
         self.settings_differ = ""
         """Settings in force that differ from the configuration file, in words; "" if none does."""
         self.speed_limit = ""
@@ -287,7 +287,10 @@ class Report:
         return round((first(self.certificate_ends)[1] - now.wall_ns) / DAY_NS, 2)
 
     def _battery(self, outputs: Outputs, snapshot: Snapshot) -> Battery | None:
-        """Return the battery message, if any, as of the board's last report or else of the step."""
+        """Return the message about the battery, or None if no battery is reported.
+
+        Its stamp is the time of the board's last report, or of the step if there was no report.
+        """
         battery, now = snapshot.battery, outputs.now
         if battery is None:
             return None

@@ -28,11 +28,12 @@ MAX_NAME = 40
 
 DIGITS = 16
 """Number of hexadecimal digits of the hash in a public name. They are 64 bits, so nobody can find
-another sender id with the same hash."""
+another sender id with the hash of a given one."""
 
 MARKS = " @._-:/+"
 """Characters besides letters and digits that a public name may contain. All others become "?".
-Brackets and commas are not allowed, because they surround and separate names in the log."""
+Brackets and commas are not allowed, because the log puts brackets around the name of a certificate
+and commas between the names of senders."""
 
 
 class Signature(Struct, frozen=True, omit_defaults=True):
@@ -74,12 +75,13 @@ def unpack(attachment: bytes) -> Signature | None:
 def public_name(sender: str, certificate: str = "") -> str:
     """Return the public name of a sender, such as "joystick/0b5d6c1f22a94e37 [laptop]".
 
-    It is the name before the last "/" of the id, the first 16 hexadecimal digits of the SHA-256 of
-    the whole id, and the common name of the certificate. Parts that do not exist are left out.
+    It has up to three parts: the text of the id before its last "/", the first 16 hexadecimal
+    digits of the SHA-256 of the whole id, and the common name of the certificate in brackets. Parts
+    that do not exist are left out.
 
     Args:
-        sender: the sender id or, without one, the id of the Zenoh session that set the sample's
-            timestamp.
+        sender: the sender id. If the message has none, it is the id of the Zenoh session that set
+            the timestamp of the message.
         certificate: the common name of the sender's TLS certificate, or "".
     """
     digits = sha256(sender.encode("utf-8", "surrogatepass")).hexdigest()[:DIGITS]

@@ -1,8 +1,8 @@
 """Lists the warnings about a robot, such as a low battery.
 
-A robot in the mode `ready` may have warnings, too. The same words appear in `acsard fleet`, `acsard
-top`, `acsard echo --short`, `/metrics` and on the web page. Programs find the same facts in
-`state`.
+A robot in the mode `ready` may have warnings, too. `acsard fleet`, `acsard top`, `acsard echo
+--short`, `/metrics` and the web page show the warnings in the words of this module. Programs find
+the facts behind the warnings in the message `state`.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ What = Literal[
 ]  # fmt: skip
 
 WHATS: tuple[What, ...] = get_args(What)
-"""Every subject of a warning, from the most to the least urgent."""
+"""The subjects that a warning can have, from the most to the least urgent."""
 
 WARNING = "WARNING"
-"""Prefix of the warnings in a line of text."""
+"""The word before a list of warnings in a line of text."""
 
 ESTOP = {"pressed": "emergency stop pressed", "silent": "emergency stop not reported"}
 

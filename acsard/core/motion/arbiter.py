@@ -33,8 +33,8 @@ Objection = Literal["", "unknown_source", "not_finite", "too_many_senders", "unp
 """The reason to refuse a command, or "" if the arbiter accepts it."""
 
 LASTING_S = (3.0, 10.0, 60.0, 600.0, 3600.0)
-"""`state` reports for how long a sender has sent only zeros, or has sent without being armed. The
-time is rounded down to one of these durations, s."""
+"""`state` reports for how long a sender has sent only zeros, or has sent commands although it is
+not armed. `state` shows that duration rounded down to one of these values, s."""
 
 NOTHING, COMMAND = Wait("nothing"), Wait("command")
 
@@ -54,7 +54,8 @@ class Choice(Struct, frozen=True):
 
 
 IDLE = Choice()
-"""The choice while no source is live and no command is refused because of its stamp."""
+"""The choice if no command has arrived within the timeout of its source. A command that is refused
+because of its stamp counts as arrived."""
 
 
 class _Source:
@@ -65,7 +66,7 @@ class _Source:
         self.use(settings, pause)
 
     def use(self, settings: Source, pause: float) -> None:
-        """Apply new settings, also to the known senders. `pause` is in s."""
+        """Apply new settings, also to the known senders. `pause` is `neutral_pause`, s."""
         self.pause_ns = int(pause * NS_PER_S)
         self.timeout_ns = int(settings.timeout * NS_PER_S)
         self.proof = Wait("proof", settings.name, min(self.timeout_ns, LONGEST_PROOF_NS) / NS_PER_S)
@@ -90,7 +91,11 @@ class _Source:
         return armed and sender.live(now_ns), armed, sender.noticed_ns
 
     def doubt(self, name: str, was_set: bool) -> None:
-        """Disarm a sender whose clock was set, or that zeros with unproven stamps armed."""
+        """React to doubt about the sender's clock.
+
+        If the clock was set, the sender must send a zero again. Otherwise the clock is unproven,
+        and zeros with its stamps no longer arm the sender.
+        """
         sender = self.senders.get(name)
         if sender is None:
             return
@@ -100,7 +105,7 @@ class _Source:
             sender.unlearn()
 
     def live(self, now_ns: int) -> list[Sender]:
-        """Return the live senders: first the armed ones, each group in order of arrival."""
+        """Return the live senders: first the armed ones, each group in the order of `came_ns`."""
         live = [sender for sender in self.senders.values() if sender.live(now_ns)]
         if len(live) < 2:
             return live
@@ -116,7 +121,7 @@ class _Source:
             sender.require_neutral()
 
     def neutral(self, sender: Sender, lasts: float = 0.0) -> Wait:
-        """Return the `Wait` of a sender that must send a zero first. `lasts` is in s."""
+        """Return the `Wait` of a sender that must send a zero, and has waited for `lasts` s."""
         pause = self.pause_ns / NS_PER_S
         return Wait("neutral", self.name, pause, lasts=lasts, ros=sender.ros, shared=sender.shared)
 
@@ -156,8 +161,9 @@ class Arbiter:
     def require_neutral(self, since_ns: int = 0) -> None:
         """Forget all commands, and require a zero from each sender before it drives again.
 
-        Only a zero that arrives at the monotonic time `since_ns` or later arms a sender. For
-        example, a sender that sent a zero before a stop was cleared may command motion by now.
+        Only a zero that arrives at the monotonic time `since_ns` or later arms a sender. An older
+        zero, for example from before a stop was cleared, does not show that the sender wants the
+        robot to rest now.
         """
         self._since_ns = since_ns
         for source in self._ranking:
@@ -192,8 +198,9 @@ class Arbiter:
     def notice(self, source: str, sender: str, arrived_ns: int) -> None:
         """Record a lost or unusable message, which may have commanded motion.
 
-        A shared identity whose `commands.neutral_pause` is not over yet must then send a zero
-        again. If `sender` is "", the message may come from any sender of `source`.
+        If several programs share the identity of the sender, and `commands.neutral_pause` after
+        the zero is not over yet, this zero no longer counts. If `sender` is "", the message may
+        come from any sender of `source`.
         """
         known = self._sources.get(source)
         if known is None:
@@ -243,7 +250,7 @@ class Arbiter:
         return Choice(source.name, sender.twist, wait, sender.arrived_ns, sender.name)
 
     def _kept(self, holder: _Source, now_ns: int) -> str:
-        """Return the source whose speeds have no effect because `holder` sends zeros, or ""."""
+        """Return words for the source or sender that must wait because `holder` sends zeros."""
         for source in self._ranking:
             senders = (each for each in source.live(now_ns) if each is not self._followed)
             if any(sender.twist != REST for sender in senders):
@@ -252,7 +259,7 @@ class Arbiter:
 
     @property
     def forgiven_ns(self) -> int:
-        """Total rise of command delays, ns, accepted without a visible clock adjustment."""
+        """Sum of the delay rises, ns, that were trusted although no stamp showed an adjustment."""
         return self._freshness.forgiven_ns
 
     def sources(self, now_ns: int) -> tuple[SourceStatus, ...]:

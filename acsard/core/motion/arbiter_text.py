@@ -1,6 +1,7 @@
 """Creates the sentences and events about modes, commands and the senders that drive the robot.
 
-They go into `state`, `diagnostics` and the log. `event_throttle.py` limits the lines of the log.
+The sentences go into `state` and `diagnostics`, and the events into the log. `event_throttle.py`
+limits the number of lines in the log.
 """
 
 from __future__ import annotations
@@ -11,22 +12,22 @@ from acsard.core.motion.modes import Mode
 from acsard.core.values import Event, Refusal, Wait
 
 REFUSED = {
-    "unknown_source": "not one of commands.sources",
+    "unknown_source": "this source is not in commands.sources",
     "not_finite": "the command contains NaN or infinity",
     "too_many_senders": f"{MAX_SENDERS} other senders of this source are active; end one first",
-    "unproven": "the robot follows a new sender when its commands have arrived with steady "
-    "delays; this is not an error",
-    "stale": "the command is older than the source's timeout allows, or older than one that was "
-    "accepted: the network delayed it, or the sender's clock was set",
+    "unproven": "this sender is new: the robot follows a sender only after the sender's commands "
+    "have arrived with steady delays; this is not an error",
+    "stale": "the command is older than the source's timeout allows, or older than one that the "
+    "robot has already accepted: the network delayed it, or the sender's clock was set",
 }
 
 MAX_SENDER = 124
 """Largest number of characters of a sender's name in an event. A public name has up to 57, and a
-certificate adds up to 67. A name made from a key can be longer and is cut."""
+certificate adds up to 67. A name that is made from a Zenoh key can be longer and is cut."""
 
 ROS_NEVER = (
-    ' (`ros2 topic pub` of a speed never sends a zero; "After a clear" in deploy/ros2/README.md '
-    "lists tools that do)"
+    ' (`ros2 topic pub` with a speed never sends a zero; the section "After a clear" of '
+    "deploy/ros2/README.md lists tools that send one)"
 )
 
 
@@ -78,13 +79,13 @@ def waiting(wait: Wait) -> str:
 
 
 def missed(periods: int) -> Event:
-    """Return the event for `periods` control periods that ended without a step."""
+    """Return the event for `periods` control periods in which the robot made no step."""
     text = f"{periods} control periods in a row"
     return Event("missed_periods", text, "warning", kind="missed", count=periods, news=False)
 
 
 def refused(refusal: Refusal) -> Event:
-    """Return the event of a refusal: `new_sender` if `unproven`, otherwise `command_refused`."""
+    """Return the event `command_refused`, or `new_sender` if the sender's clock is unproven."""
     by, kind = refusal.sender[:MAX_SENDER], refusal.reason
     if kind == "unproven":
         return Event("new_sender", refusal.text, by=by, news=False)
@@ -92,7 +93,7 @@ def refused(refusal: Refusal) -> Event:
 
 
 class CommandEvents:
-    """Creates the events for changes of the mode, and of the source and sender that drive."""
+    """Creates the events for a new mode, or a new source or sender that drives the robot."""
 
     def __init__(self, mode: Mode) -> None:
         self._mode, self._commander = mode, ("", "")
@@ -103,8 +104,8 @@ class CommandEvents:
         """Return the events for changes since the last call.
 
         The events report a new mode, a new commander (the source and sender that drive the robot),
-        and speeds without effect. A commander that drives again after a pause is not new. `why` is
-        the reason of the mode, in words.
+        and a source whose speeds have no effect. A commander that drives again after a pause is not
+        new. `why` is the reason of the mode, in words.
         """
         drives, before, last = mode is Mode.DRIVING, self._mode, self._commander
         if drives:

@@ -1,9 +1,9 @@
-"""Follows the battery that the board reports, and decides when it stops the robot.
+"""Follows the battery that the board reports, and decides when an empty battery stops the robot.
 
-The thresholds in `[battery]` are compared with a mean over time, because the current of starting
-motors makes the voltage drop for some tenths of a second. An empty battery latches a stop, which
-`lifecycle.py` keeps. The call `clear` does not release the stop until the mean has risen above the
-threshold by `battery.hysteresis`.
+The thresholds in `[battery]` are compared with the mean of the voltage or the charge over time,
+because the current of starting motors makes the voltage drop for some tenths of a second. An empty
+battery latches a stop, which `lifecycle.py` keeps. The call `clear` does not release the stop until
+the mean has risen above the threshold by `battery.hysteresis`.
 
 If a board no longer reports its battery, the robot does not stop: a robot that stands still in the
 way is the greater danger, and the voltage falls slowly. The level is then "unknown".
@@ -23,22 +23,26 @@ TIME_CONSTANT_S = 10.0
 A battery takes minutes from one level to the next, so the robot reacts soon enough."""
 
 SETTLE_S = 3.0
-"""Time that the reports must cover after a silence before their mean decides the level, s. The time
-between two reports counts as at most `LONGEST_NS`. A motor start within this time lowers the mean
-by up to a tenth of the voltage drop."""
+"""Time that the reports of the battery must cover before their mean decides the level, s. The time
+starts again after each silence. The time between two reports counts as at most `LONGEST_NS`. A
+motor start within `SETTLE_S` lowers the mean by up to a tenth of the voltage drop."""
 
 SILENT_S = 5.0
-"""Age at which a value is dropped, s. At one report a second, four in a row may be lost."""
+"""Age at which a value of the battery is dropped, s. At one report a second, four reports in a row
+may be lost."""
 
 LONGEST_NS = 300_000_000
 """Largest weight of a report in the mean, ns: the duration of a motor start. The weight is the time
 since the previous report. Without this bound, a report during a motor start would weigh too much
-after a gap. At one report a second, the mean follows the voltage about three times as slowly."""
+after a gap. Because of the bound, a mean of one report a second follows the voltage about a third
+as fast as it otherwise would."""
 
 ORDER: tuple[BatteryLevel, ...] = get_args(BatteryLevel)[:4]
 """The battery levels without "unknown", from the best to the worst."""
 
-MISSING = "the board has not reported its battery, but [battery] has thresholds"
+MISSING = (
+    "the board has not reported its battery, but the configuration has thresholds in [battery]"
+)
 
 SILENT = f"the board has not reported its battery for {SILENT_S:g} s"
 
@@ -106,12 +110,12 @@ class Battery:
     def mend(self) -> str:
         """What the operator must do to end the level "stop", in words without measured values."""
         config = self._config
-        return f"charge it to {_with_unit(config, config.stop_below + config.hysteresis)}"
+        return f"charge the battery to {_with_unit(config, config.stop_below + config.hysteresis)}"
 
     def look(self, reports: Iterable[tuple[int, BoardStatus]], now_ns: int) -> list[Event]:
         """Process the status lines since the last step, and return an event if the level changed.
 
-        `reports` has each status line with its monotonic time of arrival, ns.
+        Each item of `reports` is the monotonic time of arrival, ns, and the status line.
         """
         self.stopped_now = False
         news = False
@@ -155,7 +159,7 @@ class Battery:
             self._mean_ns = at_ns
 
     def _level(self, now_ns: int) -> BatteryLevel | None:
-        """Update the level from the mean and return it, or None during the first `SETTLE_S`."""
+        """Update the level from the mean and return it; None until reports cover `SETTLE_S`."""
         measure, values = self._config.measure, self._values
         if measure not in values:
             self._mean = None
@@ -189,5 +193,5 @@ class Battery:
         if level == "stop":
             return Event("battery_stop", f"{text}; {self.mend}, then call srv/clear", "error")
         if before == "stop" and level != "unknown":
-            text = f"{text}; the robot stays stopped until srv/clear"
+            text = f"{text}; the robot stays stopped until srv/clear is called"
         return Event("battery", text, "info" if level == "ok" else "warning", kind=level)

@@ -1,13 +1,13 @@
 """Follows the bumpers that the board reports, and decides which motion they allow.
 
 A pressed bumper brings the robot to rest at once. With `safety.bumper = "stop"`, the press also
-latches a stop. With "away", each sender must send a zero before the robot moves again. Until the
-bumper is released, the robot then drives only straight away from it, at `AWAY_SPEED` or less. It
-may not turn, because a corner could sweep into the obstacle. No motion leads away from a bumper at
-the left or the right, because the robot cannot move sideways.
+latches a stop. With `safety.bumper = "away"`, each sender must send a zero before the robot moves
+again. Until the bumper is released, the robot then drives only straight away from the bumper, at
+`AWAY_SPEED` or less. The robot may not turn, because a corner could sweep into the obstacle. No
+motion leads away from a bumper at the left or the right, because the robot cannot move sideways.
 
-If a board has reported bumpers and no longer does, a stop is latched with "stop" and with "away". A
-bumper is not a safety function, because the status line may be lost or late.
+If a board has reported bumpers and no longer does, a stop is latched, whether `safety.bumper` is
+"stop" or "away". A bumper is not a safety function, because the status line may be lost or late.
 """
 
 from __future__ import annotations
@@ -74,7 +74,10 @@ class Bumpers(BoardInput):
 
     @property
     def latching(self) -> bool:
-        """Whether pressed bumpers latch a stop. With "away", only the silence of the board does."""
+        """Whether the present state latches a stop.
+
+        If the robot may drive away from bumpers, only the silence of the board latches a stop.
+        """
         return not self._away or self.state == "silent"
 
     @property
@@ -85,7 +88,8 @@ class Bumpers(BoardInput):
     def away(self, twist: Twist) -> Twist | None:
         """Return the part of a twist that the pressed bumpers allow, None if they allow none of it.
 
-        They allow rest, and the straight part of a twist away from all of them, up to `AWAY_SPEED`.
+        The pressed bumpers allow rest, and straight motion away from all of them at `AWAY_SPEED` or
+        less.
         """
         if twist == REST:
             return REST
@@ -105,9 +109,10 @@ class Bumpers(BoardInput):
     def read(self, status: BoardStatus) -> tuple[bool, ...] | None:
         """Return whether each bumper is pressed according to a status line.
 
-        Return None if the line reports no bumpers or an unexpected number, because it may lack a
-        pressed one. The expected number is that of the configured places. Without places, it is
-        that of the previous report, and a line that reports a press is accepted with any number.
+        Return None if the line reports no bumpers or an unexpected number of bumpers, because a
+        pressed bumper may be missing from the line. If `safety.bumpers` has places, the expected
+        number is that of the places. Otherwise it is the number in the previous report, but a line
+        that reports a press is accepted with any number of bumpers.
         """
         bumpers = status.bumpers
         if bumpers is None:
@@ -127,13 +132,16 @@ class Bumpers(BoardInput):
         return self.note().partition(": ")[2] if self.limiting else super().advice()
 
     def released(self, before: EstopState) -> str:
-        """Return the log text for a release or, if `before` is "", for the first report."""
+        """Return the log text for bumpers that are not pressed any more.
+
+        `before` is the state before the release; "" if this is the first report of the bumpers.
+        """
         if not before:
             count = len(self.pressed or ())
             return f"the board reports {many(count, 'bumper')}, and none is pressed"
         if self._away and before == "pressed":
-            return "released; the bumpers allow every direction again"
-        return "released; a stop stays latched until srv/clear"
+            return "the bumpers are released and allow every direction again"
+        return "the bumpers are released; a latched stop lasts until srv/clear is called"
 
     def _direction(self) -> int:
         pressed = zip(self._places, self.pressed or (), strict=True)

@@ -4,7 +4,8 @@
 
 - `wheel_faults.py` ignores a wheel whose encoder is faulty. If the wheels contradict each other or
   their commands for long, it reports a fault, which stops the robot.
-- `gyro.py` takes the heading from a gyro, and compares the gyro with the believed wheels.
+- `gyro.py` takes the heading from a gyro, and compares the gyro with the wheels that
+  `wheel_faults.py` does not ignore.
 - `learned_track.py` chooses the effective track (the distance between the wheels that makes turns
   come out right): the configured one, or one learned from the comparison with a gyro.
 
@@ -38,18 +39,24 @@ class ConsistencyChecks:
         encoder_counts: int,
         feedback: FeedbackConfig,
     ) -> None:
-        """Create the checks. `encoder_counts` is per wheel turn; 0 means unknown."""
+        """Create the checks.
+
+        `encoder_counts` is the number per revolution of a wheel, 0 if it is unknown.
+        """
         self._kinematics = kinematics
         self.wheels = WheelFaults(kinematics, encoder_counts, feedback)
         self.gyro = Gyro() if odometry.gyro else None
         multiplier = kinematics.multipliers[2]
         self._track = LearnedTrack(multiplier) if odometry.learned_track else None
         self._by_wheels = 0.0
-        """Turn of the robot during the last feedback line according to the wheels, rad."""
+        """Turn of the robot that the wheels show for the last feedback line, rad."""
         self.turn: Turn | None = None
-        """Turn during the last feedback line by the gyro; None if the wheels provide it."""
+        """Turn of the robot that the gyro measured for the last feedback line.
+
+        None if the wheels provide the turn of this line.
+        """
         self.on_trial = False
-        """Whether the last turn came from the wheels because the gyro is not proven yet."""
+        """Whether the wheels provided the turn of the last line because the gyro is not proven."""
         self.slips = False
         """Whether the wheels slip: they contradict each other or the gyro."""
         self.events: list[Event] = []
@@ -67,15 +74,15 @@ class ConsistencyChecks:
             self.gyro.hear(samples)
 
     def forgive(self) -> None:
-        """Cancel the pending correction of the pose by the gyro, because the pose has been set."""
+        """Drop the correction that the gyro owes to the heading, because a new pose was set."""
         if self.gyro is not None:
             self.gyro.forgive()
 
     def look(self, line: Feedback, rolled: Rolled) -> bool:
-        """Check a feedback line and `rolled`, the wheel angles since the line before.
+        """Check a feedback line. `rolled` contains the angles of the wheels since the line before.
 
-        Return whether the check has just found a faulty wheel. The caller must then recompute the
-        pose from the earlier lines without this wheel.
+        Return whether this line has proved a wheel faulty. The caller must then recompute the pose
+        from the earlier lines without this wheel.
         """
         wheels, gyro, turn, by_gyro = self.wheels, self.gyro, None, None
         if gyro is not None:
@@ -93,11 +100,15 @@ class ConsistencyChecks:
         return found
 
     def taken_back(self, turn: float) -> float:
-        """Account for recomputed `on_trial` lines; see `Gyro.taken_back`."""
+        """Tell the gyro that recomputing the pose has changed the heading by `turn` rad.
+
+        Only lines with `on_trial` are included. Return the angle that the caller must
+        subtract from the heading, rad.
+        """
         return 0.0 if self.gyro is None else self.gyro.taken_back(turn)
 
     def learn(self, turned: float) -> Track | None:
-        """Finish a feedback line, which turned the pose by `turned` rad, and collect its events.
+        """Learn from a feedback line that turned the pose by `turned` rad; collect its events.
 
         Return the effective track for the next lines, None if no track is learned from a gyro.
         """

@@ -32,20 +32,22 @@ TABLE: dict[tuple[EstopState, Sign], EstopState] = {
     ("silent", "ok"): "released",
     ("silent", "pressed"): "pressed",
 }
-"""Maps (state, sign) to the next state. The sign is `silence` if the board has not reported the
-input for `SILENT_S`. A pair without an entry does not change the state."""
+"""Maps (state, sign) of a safety input to its next state. The sign is `ok` or `pressed` if a status
+line reports the input. It is `silence` if no line has reported the input for `SILENT_S`. A pair
+without an entry does not change the state."""
 
 SILENT_S = 0.5
-"""Time without a report after which an input counts as pressed, s: five lines at 10 Hz."""
+"""Time without a report after which an input counts as pressed, s: five status lines at 10 Hz."""
 
 LATE_NS = 150_000_000
-"""If two steps are further apart than this, ns, this computer was late. The longest control period
-that can be configured is 100 ms."""
+"""If more time than this, ns, passes between two steps of the control loop, this computer was late.
+The longest control period that can be configured is 100 ms."""
 
 EXCUSE_NS = 100_000_000
 """If this computer was late, the board counts as silent only after this further time, ns. In this
-time the daemon reads the lines that have arrived meanwhile. It grants the extra time only once
-between two reports, so a computer that is always late does not delay the stop forever."""
+time the daemon reads the lines that arrived while the computer was late. The daemon grants the
+extra time only once between two reports, so a computer that is always late does not delay the stop
+forever."""
 
 PRESSED = "emergency stop pressed at the robot"
 SILENT = (
@@ -103,7 +105,7 @@ class BoardInput(ABC):
     def look(self, reports: Iterable[tuple[int, BoardStatus]], now_ns: int) -> list[Event]:
         """Process the status lines since the last step, and return the events of the changes.
 
-        `reports` has each status line with its monotonic time of arrival, ns.
+        Each item of `reports` is the monotonic time of arrival, ns, and the status line.
         """
         self.pressed_now = ""
         if self.use == "off":
@@ -132,7 +134,10 @@ class BoardInput(ABC):
 
     @abstractmethod
     def released(self, before: EstopState) -> str:
-        """Return the log text for a release or, if `before` is "", for the first report."""
+        """Return the log text for inputs that are not pressed any more.
+
+        `before` is the state before the release; "" if this is the first report of the inputs.
+        """
 
     def advice(self) -> str:
         """Return what the operator must do after a press, for the log."""
@@ -157,7 +162,7 @@ class EmergencyStop(BoardInput):
     silent, events = SILENT, ("emergency_stop", "emergency_stop_released")
 
     def read(self, status: BoardStatus) -> tuple[bool, ...] | None:
-        """Return `status.estop` in a tuple, or None if the status line does not report it."""
+        """Return `(status.estop,)`, or None if the status line does not report `estop`."""
         return None if status.estop is None else (status.estop,)
 
     def words(self) -> str:
@@ -165,10 +170,13 @@ class EmergencyStop(BoardInput):
         return PRESSED
 
     def released(self, before: EstopState) -> str:
-        """Return the log text for a release or, if `before` is "", for the first report."""
+        """Return the log text for an emergency stop that is not pressed any more.
+
+        `before` is the state before the release; "" if this is the first report of the input.
+        """
         if not before:
             return "the board reports an emergency-stop input, which is released"
-        return "released; the robot stays stopped until srv/clear"
+        return "the emergency stop is released; the robot stays stopped until srv/clear is called"
 
 
 _SILENT_NS = int(SILENT_S * NS_PER_S)

@@ -1,10 +1,10 @@
 """The error model of the odometry: noise of a step, errors of parameters, and errors of the twist.
 
-In a step, the left and the right side of the robot roll the distances dl and dr, m. The errors of
-these distances are independent and have the variances k |dl| and k |dr|, where k is in m (Siegwart,
-Nourbakhsh & Scaramuzza, Introduction to Autonomous Mobile Robots, 5.2.4). The step has the distance
-d = (dl + dr) / 2 and the turn dyaw = (dr - dl) / L, where L is the effective track, m. The errors
-of d and dyaw therefore have
+A step is the motion from one feedback line to the next. In a step, the left and the right side of
+the robot roll the distances dl and dr, m. The errors of these distances are independent and have
+the variances k |dl| and k |dr|, where k is in m (Siegwart, Nourbakhsh & Scaramuzza, Introduction to
+Autonomous Mobile Robots, 5.2.4). Let L be the effective track, m. The step has the distance
+d = (dl + dr) / 2 and the turn dyaw = (dr - dl) / L. The errors of d and dyaw therefore have
 
     var(d) = k (|dl| + |dr|) / 4
     var(dyaw) = k (|dl| + |dr|) / L^2
@@ -30,7 +30,7 @@ from acsard.core.motion.learned_track import CONFIGURED, Track
 from acsard.core.values import Twist, TwistVariances
 
 Column = tuple[float, float, float, float]
-"""The error of a step if one parameter, such as a wheel radius, is off by one standard deviation.
+"""The error of an odometry step if one parameter, such as a wheel radius, is off by one sigma.
 
 The first two numbers are the error of the distance per m of distance and per rad of turn (m/m,
 m/rad). The last two are the error of the turn per m and per rad (rad/m, rad/rad).
@@ -52,8 +52,8 @@ PERIOD = 0.01
 """Period of the feedback lines that is assumed before one is measured, s."""
 
 SMOOTHED = 0.05
-"""Weight of the newest period in the mean period of the feedback lines. It is small because several
-lines may be read at the same time."""
+"""Weight of the newest period in the mean period of the feedback lines. It is small because periods
+vary: several lines may be read at the same time."""
 
 
 class Noise:
@@ -79,7 +79,8 @@ class Noise:
         Args:
             distance: the distance of the step, m.
             turn: the turn of the step, rad.
-            turned: the part of |turn| that is not encoder noise, rad. Only this part skids.
+            turned: the part of |turn| that is not encoder noise, rad. The wheels skid only in this
+                part.
         """
         left, right = abs(distance - self._half * turn), abs(distance + self._half * turn)
         path, sides = abs(distance), left + right
@@ -91,7 +92,7 @@ class Noise:
 
 
 class ErrorModel:
-    """The noise of a step and the effects of parameter errors, for the track in use."""
+    """The noise of a step and the effects of parameter errors, for the effective track in use."""
 
     def __init__(self, odometry: OdometryConfig, kinematics: Kinematics) -> None:
         """Start with the configured track."""
@@ -102,7 +103,7 @@ class ErrorModel:
         self.turn_by(CONFIGURED if odometry.learned_track else None)
 
     def use(self, odometry: OdometryConfig) -> None:
-        """Use the noise of these settings from now on, but the same errors of parameters."""
+        """Use the noise of these settings from now on. The errors of parameters do not change."""
         self.settings = odometry
         self.noise = Noise(odometry, self.track)
 
@@ -123,7 +124,8 @@ def columns(
 
         dl = r m_l phi_l,   dr = r m_r phi_r,   dyaw = (dr - dl) / (m_L b)
 
-    where r is `wheel_radius`, b is `wheel_separation`, and phi_l and phi_r are the wheel angles.
+    where r is `wheel_radius`, b is `wheel_separation`, and phi_l and phi_r are the angles that the
+    wheels rolled.
     The parameters are the multipliers m_l, m_r and m_L, the ratio m_r / m_l, a scale that
     multiplies all lengths, and the fraction of each distance that the wheels lose by slip. The
     scale and the slip share one column. A parameter with a standard deviation of 0 has no column.
@@ -177,7 +179,7 @@ class TwistUncertainty:
     """
 
     def __init__(self, model: ErrorModel, counts: int) -> None:
-        """Start. `counts` are the encoder counts per wheel turn, 0 if unknown."""
+        """Start. `counts` are the encoder counts per revolution of a wheel, 0 if unknown."""
         self._model = model
         self._count = math.tau / counts if counts else 0.0
         # The errors of the four wheels are independent, and each side is the mean of two wheels.
@@ -195,8 +197,8 @@ class TwistUncertainty:
         Args:
             twist: the twist.
             dt: the time since the line before, s; 0 if it is unknown.
-            step: the quantization step of the wheel speeds that the lines show, rad/s; 0 if
-                unknown.
+            step: the quantization step of the wheel speeds in the feedback lines, rad/s; 0 if it
+                is unknown.
         """
         if dt > 0.0:
             # A late line, or one after lost lines, does not mean a longer period.
@@ -239,5 +241,5 @@ class TwistUncertainty:
         )
 
     def with_gyro(self, variances: TwistVariances, angular: float) -> TwistVariances:
-        """Return the variances, with `angular` (rad2/s2, from a gyro) as that of the turn rate."""
+        """Return the variances, but with `angular` (from a gyro, rad2/s2) for the turn rate."""
         return TwistVariances(variances.linear, variances.lateral, min(max(LEAST, angular), MOST))

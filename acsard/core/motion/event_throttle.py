@@ -1,8 +1,8 @@
 """Limits how many log lines the events of one name cause: at most one per second on average.
 
-A few lines of one name may be written at once, and after that one per second. The next line reports
-the number of events in between. So neither a client that floods the bus nor a serial line with a
-loose contact can flood the log.
+A few lines of one name may be written at once, and after that one per second. Each line reports the
+number of events since the previous line. So neither a client that floods the bus nor a serial line
+with a loose contact can flood the log.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ BURST = 5
 """Log lines of one name that may be written at once: enough for a person who presses buttons."""
 
 MOST = 8
-"""Largest number of event kinds, and of client names, in one log line. The rest are "others"."""
+"""Largest number of event kinds, and also of client names, that one log line lists. The line calls
+all further kinds or names "others"."""
 
 LEVELS: tuple[Level, ...] = get_args(Level)
 
@@ -53,8 +54,8 @@ class EventThrottle:
     def __init__(self) -> None:
         self._held: dict[EventName, _Held] = {}
         self._free_ns: dict[EventName, int] = {}
-        """For each event name, the monotonic time, ns, until which the written lines have used the
-        rate of one line per second. Each written line adds one second."""
+        """For each event name, the end of the time that its lines have used up, monotonic ns. Each
+        written line uses up one second. The lines of a burst use up seconds in advance."""
 
     def lines(self, events: list[Event], now_ns: int) -> tuple[Event, ...]:
         """Add new events, and return the events to log now, which may combine several events."""
@@ -66,7 +67,10 @@ class EventThrottle:
         return tuple([self._held.pop(name).line() for name in told])
 
     def _may(self, name: EventName, news: bool, now_ns: int) -> bool:
-        """Return whether a line of this name may be written now; if so, count it as written."""
+        """Return whether a line of this name may be written now; if so, count it as written.
+
+        If `news` is true, the line may be one of the `BURST` lines that are written at once.
+        """
         free_ns = self._free_ns.get(name, now_ns)
         if free_ns > now_ns + (BURST - 1 if news else 0) * NS_PER_S:
             return False

@@ -6,9 +6,9 @@ delay. The offset cancels out in a comparison with the minimum of all delays. A 
 its delay exceeds the minimum by more than the timeout of its source, or if its stamp is earlier
 than that of an accepted command. The clock of a sender is in one of two states:
 
-    new      the minimum is not known: a test of several commands, the proof, must first show that
-             the delays no longer fall, as they do while a backlog arrives
-    known    the minimum is trusted, until a proof shows another one
+    new      The minimum is not known. Delays fall while a backlog arrives. Therefore a test of
+             several commands (the proof) must first show that the delays no longer fall.
+    known    The minimum is trusted until a proof shows another one.
 
 There are two kinds of clocks. A *steady* clock is never adjusted. Our client, tools and web page
 declare that with `"steady": true`. If a command with such a stamp looks late, the command is really
@@ -32,24 +32,27 @@ from typing import Literal
 from acsard.core.values import NS_PER_S, Command
 
 DRIFT = 5000
-"""Two clocks may drift apart by one part in this number: twice the error of a bad crystal."""
+"""Two clocks may drift apart by 1 s in this number of seconds: twice the error of a bad crystal."""
 
 FORGET_NS = 250 * NS_PER_S
-"""Pause of a sender, ns, after which its clock counts as new: it may have drifted by 50 ms. If only
-the arrivals show the pause, the network held commands back, and the clock stays known."""
+"""Pause of a sender, ns, after which its clock counts as new, because the clock may have drifted by
+50 ms. If the arrivals show the pause but the stamps do not, the network held commands back, and the
+clock stays known."""
 
 KEEP_NS = 3600 * NS_PER_S
 """Silence of a sender, ns, after which its clock is forgotten to save memory."""
 
 EARLY_NS = NS_PER_S // 20
-"""A larger fall of the delay, ns, is not jitter: a backlog has ended, or a clock was set."""
+"""Largest fall of the delay that can be jitter, ns. A larger fall means that a backlog has ended or
+that a clock was set."""
 
 WAVER_NS = NS_PER_S
-"""A larger rise of the delay, ns, is not jitter: the network held commands back."""
+"""Largest rise of the delay that can be jitter, ns. A larger rise means that the network held
+commands back."""
 
 EVEN, CREPT = 200, 20
 """A proof (a test whether the delay is constant) compares the minimum delays of its two halves.
-They may differ by the duration of the proof divided by `EVEN`, or divided by `CREPT` if the delay
+The minima may differ by the duration of the proof divided by `EVEN`, or by `CREPT` if the delay
 creeps (see `CREEP`). So the delay may change by 10 ms per second, or by 100 ms per second if it
 creeps. NTP slews a clock by up to 83 ms per second."""
 
@@ -78,8 +81,9 @@ APART_NS = NS_PER_S // 500
 """Commands that arrive within this time of each other, ns, may have been sent together."""
 
 TOGETHER_NS = NS_PER_S // 2000
-"""Commands that arrive within this time of each other, ns, come from one queue, the oldest first. A
-test of the delay waits for the last one. No sender may send more than 1000 commands a second."""
+"""Commands that arrive within this time of each other, ns, come from one queue. A test of the delay
+waits for the last command of the queue, which has the smallest delay. No sender may send more than
+1000 commands a second."""
 
 FORGIVE_NS, FORGIVE_RATE = NS_PER_S, 60
 """Budget, ns, for delay rises of a foreign clock (one that may be adjusted) that are trusted
@@ -93,11 +97,12 @@ State = Literal["new", "known"]
 Verdict = Literal["fresh", "first", "unproven", "stale", "set"]
 """The verdict on a command.
 
-- `fresh`: it is accepted.
-- `stale`: it is refused, because it is late or superseded by a newer one.
-- `first`: the test of a new clock begins with it, so it does not drive the robot.
-- `unproven`: the test of a new clock is not over, so it does not drive the robot.
-- `set`: it is accepted, but the clock seems to have been set. The sender must send a zero first.
+- `fresh`: the command is accepted.
+- `stale`: the command is refused, because it is late or superseded by a newer one.
+- `first`: the command begins the test of a new clock, and does not drive the robot.
+- `unproven`: the test of a new clock is not over, so the command does not drive the robot.
+- `set`: the command is accepted, but the clock seems to have been set. The sender must send a zero
+  before it drives the robot.
 """
 
 
@@ -125,7 +130,7 @@ class _Proof:
         """Add a command, and return whether the delays are proven constant.
 
         "failed" means that a new test must begin with this command. A command whose delay exceeds
-        the lowest one by more than the timeout cannot complete the test.
+        the lowest delay by more than the timeout cannot complete the test.
         """
         if not -EARLY_NS <= delay - self._first <= WAVER_NS:
             return "failed"
@@ -161,14 +166,14 @@ class _Proof:
 
 
 class _Clock:
-    """One clock of a sender, and the estimated minimum delay of the commands with its stamps."""
+    """One clock of a sender, and the estimated minimum delay of the commands that it stamped."""
 
     def __init__(self, at_ns: int) -> None:
         self.state: State = "new"
         self.at_ns = at_ns
         """Arrival of the last command, monotonic ns."""
         self.forgiven_ns = 0
-        """Rise of the delay, ns, that no visible adjustment explains, at the last verdict `set`."""
+        """Part of the last trusted rise of the delay that no adjustment of stamps explains, ns."""
         self._stamp_ns = 0
         self._delay = 0
         self._number: int | None = None
@@ -176,16 +181,18 @@ class _Clock:
         self._least = 0
         """Minimum of the trusted delays, ns. It rises with time by the largest possible drift."""
         self._early = 0
-        """Amount by which the minimum has fallen recently, ns."""
+        """Recent fall of `_least`, ns. It decreases by a tenth of the time that passes."""
         self._floor: int | None = None
-        """Lowest delay of a steady clock, ns, plus the possible drift; None for a foreign clock."""
+        """Lowest delay, ns, plus the possible drift; None if the clock may be adjusted."""
         self._before: int | None = None
-        """Delay before the first visible adjustment since the last command that was on time, ns."""
+        """Delay before the clock's first adjustment that stamps have shown, ns; None without one.
+        Adjustments before the last command that was on time do not count."""
         self._shown = 0
-        """Sum of the clock's visible adjustments since the last command that was on time, ns."""
+        """Sum of the adjustments that stamps have shown since the last command on time, ns."""
         self._doubted: tuple[int, int, int] | None = None
         """An adjustment that the next command must confirm, because the network may have swapped or
-        repeated a command: the delay before it, its amount, and the stamp before it, ns."""
+        repeated a command. The tuple has the delay before the adjustment, the size of the
+        adjustment, and the stamp before the adjustment, all in ns."""
         self._paused = False
         """Whether the sender paused since its last timely command. Its clock may have been set."""
         self._budget, self._budget_at_ns = FORGIVE_NS, at_ns
@@ -294,7 +301,8 @@ class _Clock:
     def _forgive(self, proof: _Proof, at_ns: int) -> Verdict:
         """Trust the proven delay if that is allowed, and return the verdict.
 
-        A rise is allowed after a visible adjustment or a pause, or within the budget.
+        A rise of the delay is allowed after a pause of the sender, after an adjustment that stamps
+        have shown, or within the budget.
         """
         self._accrue(at_ns, FORGET_NS)
         hidden = proof.least - self._least
@@ -327,14 +335,14 @@ class Freshness:
     def __init__(self) -> None:
         self._clocks: dict[str, _Clock] = {}
         self._newcomers: dict[str, _Clock] = {}
-        """Foreign clocks without an accepted command, forgotten after `GAP_NS` of silence."""
+        """Clocks that may be adjusted and have no accepted command, forgotten after `GAP_NS`."""
         self._unproved: dict[str, _Clock] = {}
-        """Steady clocks without an accepted command. They are kept for `KEEP_NS` of silence,
-        because their lowest delay is valid from the first command on."""
+        """Clocks that are never adjusted and have no accepted command. They are kept for `KEEP_NS`
+        of silence, because their lowest delay is valid from the first command on."""
         self._numbers: dict[str, tuple[int, int]] = {}
         """Last number and monotonic arrival, ns, of each sender with numbers but without stamps."""
         self.forgiven_ns = 0
-        """Total rise of command delays, ns, accepted without a visible clock adjustment."""
+        """Sum of the delay rises, ns, that were trusted although no stamp showed an adjustment."""
 
     def judge(self, command: Command, timeout_ns: int) -> Verdict:
         """Return the verdict on a command, and remember its stamp and sequence number.
@@ -391,5 +399,5 @@ class Freshness:
 
 
 def _oldest(held: dict[str, _Clock]) -> _Clock:
-    """Return the first clock. It was silent for longest, as commands move clocks to the end."""
+    """Return the first clock of the dictionary, which has been silent for the longest time."""
     return next(iter(held.values()))

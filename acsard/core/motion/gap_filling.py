@@ -1,12 +1,12 @@
-"""Fills gaps in the feedback: estimates the wheel angles in a gap, and their uncertainty.
+"""Fills gaps in the feedback: estimates the motion of the wheels in a gap, and its uncertainty.
 
-`Rolling` computes the wheel angles since the last plausible feedback line. It uses the first of
-these sources that exists: the encoder counts in the line, whole counts that are recovered from its
-speeds, or its speeds times the time. It uses each moment and each count exactly once. In a gap that
-no line covers, it assumes the speed before the gap for the first half of the gap, and the speed
-after the gap for the second half. If the daemon commanded rest during the gap, it assumes the speed
-before the gap only until that command. The motion during implausible lines is computed with the
-next plausible line.
+`Rolling` computes the angles that the wheels rolled since the last plausible feedback line. It uses
+the first of these sources that exists: the encoder counts in the line, whole counts that are
+recovered from the speeds in the line, or these speeds times the time. It uses each moment and each
+count exactly once. In a gap that no line covers, it assumes the speed before the gap for the first
+half of the gap, and the speed after the gap for the second half. If the daemon commanded rest
+during the gap, it assumes the speed before the gap only until that command. The motion during
+implausible lines is computed with the next plausible line.
 """
 
 from __future__ import annotations
@@ -20,40 +20,42 @@ from acsard.core.link.feedback import Feedback
 from acsard.core.values import REST, Twist, WheelSpeeds
 
 MAX_LOST_S, MAX_LOST = 0.05, 1
-"""If implausible lines in a row without encoder counts last at most `MAX_LOST_S` s, or are at most
-`MAX_LOST`, the robot is assumed to have moved at the speed of the next plausible line. Otherwise,
-its motion during them is unknown."""
+"""Largest total duration, s, and largest number of implausible lines in a row. If these lines have
+no encoder counts and stay within one of these limits, the robot is assumed to have moved at the
+speed of the next plausible line. Otherwise, the motion during these lines is unknown."""
 
 NOWHERE = (0.0, 0.0, 0.0, 0.0)
 
 GUESS = Twist(0.125, 0.5)
-"""Standard deviation of the acceleration that is assumed before any measurement, m/s2 and rad/s2.
-It is an eighth of the default acceleration limits. Random driving rarely exceeds it."""
+"""Standard deviation of the acceleration that is assumed until the acceleration is measured, m/s2
+and rad/s2. It is an eighth of the default acceleration limits. Random driving rarely exceeds it."""
 
 SPAN = 0.2
 """Time over which the deviation from constant acceleration is measured, s."""
 
 FIRST, MOST = 4.0, 300.0
-"""Weight of `GUESS`, and largest weight of the mean of all measurements, in numbers of spans
-(`SPAN`). A minute of driving has 300 spans."""
+"""Weights in the mean of the squared deviations, in which each measured span of `SPAN` s has the
+weight 1. `GUESS` has the weight `FIRST`. All values together have at most the weight `MOST` (a
+minute of driving)."""
 
 GROWTH = 5
 """Exponent in the growth of a gap's variance with the duration of the gap (`Gaps`)."""
 
 
 class Rolled(Struct, frozen=True, gc=False):
-    """Wheel angles since the last plausible line, rad, in the order of `WHEELS`."""
+    """Angles that the wheels rolled since the last plausible line, rad, in `WHEELS` order."""
 
     pieces: tuple[Motors, ...]
-    """Angles from speeds, rad, in the order of time. Each is an arc of the path and not zero."""
+    """Angles from the speeds, rad, in the order of time. Each item is one arc of the path, and has
+    at least one angle that is not zero."""
     turned: Motors
     """Angles from encoder counts, rad. This motion came before that of `pieces`."""
     seen: Motors
-    """Angles during `seconds` according to the last line, rad, with its rounding errors."""
+    """Angles in the last `seconds` s, rad. They have the rounding errors of the last line."""
     seconds: float
     """Duration of the motion `seen`, s."""
     bridged: float
-    """Part of `seconds` that no line covers, and for which the speeds were assumed, s."""
+    """Part of `seconds`, s, that no line covers, so that the wheel speeds in it were assumed."""
     unknown: float
     """Time in addition to `seconds` in which the motion of the robot is unknown, s."""
     known: float
@@ -61,7 +63,7 @@ class Rolled(Struct, frozen=True, gc=False):
 
 
 class Rolling:
-    """Computes by how much the wheels turned from one plausible feedback line to the next."""
+    """Computes the angles that the wheels rolled from one plausible line to the next."""
 
     def __init__(self, quiet: float = math.inf) -> None:
         """Start. The daemon commands rest after `quiet` s without feedback."""
@@ -82,7 +84,7 @@ class Rolling:
             self._turned = plus(self._turned, line.turned)
 
     def take(self, line: Feedback, before: WheelSpeeds) -> Rolled:
-        """Return the angles up to a plausible line, and forget the implausible lines before it.
+        """Return the angles that the wheels rolled from the last plausible line to this one.
 
         `before` contains the wheel speeds of the last plausible line, rad/s.
         """
@@ -121,12 +123,12 @@ def _some(*pieces: Motors) -> tuple[Motors, ...]:
 
 
 def plus(a: Motors, b: Motors) -> Motors:
-    """Return the sum of two sets of wheel angles."""
+    """Return the sums, wheel by wheel, of two sets of angles."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3]
 
 
 def times(a: Motors, factor: float) -> Motors:
-    """Return wheel angles or speeds times a factor."""
+    """Return the angles or speeds of all wheels times a factor."""
     return a[0] * factor, a[1] * factor, a[2] * factor, a[3] * factor
 
 
@@ -140,10 +142,10 @@ class Gaps:
 
     `follow` measures s while lines arrive without gaps. In each span of a fifth of a second, it
     compares the motion with the motion at the mean of the first and the last speed. The configured
-    acceleration limits are not used, because few drives come near them.
+    acceleration limits are not used, because robots seldom accelerate that much.
 
-    The deviation is limited to the motion at the faster of the two known speeds. A robot that stood
-    before and after a gap has therefore not moved.
+    The deviation is at most the motion at the higher one of the speeds before and after the gap.
+    Therefore a robot that stood before and after a gap counts as not moved.
     """
 
     def __init__(self) -> None:
@@ -180,8 +182,8 @@ class Gaps:
     def bridge(self, seconds: float, before: Twist, after: Twist) -> tuple[float, float]:
         """Return the variances of distance (m2) and turn (rad2) that a filled gap adds.
 
-        The gap lasts `seconds` s. Gaps that directly follow each other count as one longer gap, and
-        the result is then only the increase.
+        The gap lasts `seconds` s. If it directly follows another gap, both count as one longer gap,
+        and the result is the increase of the variances since the earlier gap.
         """
         bridged, given = self._bridged + seconds, self._given
         along, yaw = self.unseen(bridged, before, after)

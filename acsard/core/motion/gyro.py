@@ -31,10 +31,12 @@ REST_S = 0.2
 """Time for which all four wheels must report zero speed before the robot counts as standing, s."""
 
 SILENT_NS = NS_PER_S // 5
-"""Age of the last sample, ns, at which the gyro counts as silent. Its rate holds until then."""
+"""Age of the last sample, ns, at which the gyro counts as silent. Up to this age, the robot is
+assumed to go on turning at the rate of the sample."""
 
 LATEST_NS = NS_PER_S // 4
-"""If the delay of a sample exceeds the least one by more than this, ns, its clock was set."""
+"""If the delay of a sample exceeds the smallest delay of earlier samples by more than this, ns, the
+clock of its sender was set."""
 
 SET_BACK_NS = NS_PER_S // 50
 """A stamp earlier than the previous one by more than this, ns, shows that the sender's clock was
@@ -51,10 +53,11 @@ SLIP_S = 0.5
 """Seconds for which the wheels count as slipping after they last contradicted the gyro."""
 
 MOST_SLIP_S = 5.0
-"""Longest slip of the wheels, s. A gyro that contradicts them for longer is not believed."""
+"""Longest slip of the wheels, s. A gyro that contradicts the wheels for longer is not believed."""
 
 ENOUGH_BLOCKS = 20.0
-"""Number of blocks of turning, 0.1 s each, after which the ratio of the turns is trusted."""
+"""Number of blocks of turning, 0.1 s each, after which the measured ratio of the gyro's turn to the
+wheels' turn is trusted."""
 
 WORDS: dict[GyroDoes, str] = {
     "off": "",
@@ -63,8 +66,8 @@ WORDS: dict[GyroDoes, str] = {
     "used": "the heading comes from the gyro",
     "silent": "the gyro is silent: the heading comes from the wheels alone",
     "disagrees": "the wheels slip: the gyro measures a different turn than the wheels",
-    "reversed": "the gyro is not used, because it turns in the opposite direction to the wheels: "
-    "check its mounting",
+    "reversed": "the gyro is not used, because it reports a left turn of the robot as a right "
+    "turn: check how the gyro is mounted",
     "in degrees": "the gyro is not used, because its rate is 57 times too high: it sends degrees "
     "per second, and must send radians per second",
     "dead": "the gyro is not used, because it measures no turn while the wheels turn the robot: "
@@ -84,12 +87,14 @@ class Turn(Struct, frozen=True, gc=False):
     angle: float
     variance: float
     rate: float
-    """Turn rate according to the gyro, rad/s. `angle` may also include late samples."""
+    """Turn rate according to the last sample of the gyro, rad/s. In contrast to this rate, `angle`
+    may include samples that arrived late."""
     rate_variance: float
     wheels: float | None = None
-    """Turn that sound wheels would report, rad. Wheels that skid report more than `angle`."""
+    """Turn that wheels without a fault would report, rad. It is usually larger than `angle`,
+    because wheels skid in a turn."""
     slips: bool = False
-    """Whether the wheels reported another turn than the gyro within the last half second."""
+    """Whether the turns of wheels and gyro have contradicted each other in the last `SLIP_S` s."""
 
 
 class Gyro:
@@ -100,7 +105,8 @@ class Gyro:
         self._learned: Track | None = None
         """The effective track that was learned with an earlier gyro, None without one."""
         self.owes = False
-        """Whether the wheels provided the last turn because the gyro is not proven yet."""
+        """Whether the wheels provided the turn of the last line because the gyro is not proven. The
+        heading is corrected later by the difference to the gyro's turn."""
         self._does: GyroDoes = "silent"
         self.events: list[Event] = []
         """Events of the last `turn`, for the log."""
@@ -137,7 +143,7 @@ class Gyro:
 
     @property
     def learned(self) -> Track | None:
-        """The effective track learned from the gyro; None until the robot has turned enough."""
+        """The effective track learned from this gyro or an earlier one, None without one."""
         match = self._match
         if match.blocks < ENOUGH_BLOCKS or match.ratio <= 0.0:
             return self._learned
@@ -154,11 +160,11 @@ class Gyro:
             self._heard.append((self._time_of(sample), sample))
 
     def turn(self, at_ns: int, dt: float, wheels: float, still: bool) -> Turn | None:
-        """Return the robot's turn since the last line, None if the wheels must provide it.
+        """Return the robot's turn since the line before; None if the wheels must provide it.
 
         Args:
             at_ns: Monotonic time of this line, ns.
-            dt: Time since the last line, s; 0 after a gap. The result then covers the whole gap.
+            dt: Time since the line before, s; 0 after a gap. The result then covers the whole gap.
             wheels: The turn in `dt` according to the wheels, rad.
             still: Whether all wheels that are not ignored report zero speed.
         """
@@ -193,16 +199,17 @@ class Gyro:
         return Turn(angle, variance, self._rate, noise, rolled, self._does == "disagrees")
 
     def forgive(self) -> None:
-        """Cancel the pending correction of the pose by the gyro, because the pose has been set."""
+        """Drop the correction that the gyro owes to the heading, because a new pose was set."""
         self._owed = self._owed_variance = 0.0
         """The gyro's turn minus the wheels' turn while the gyro was not proven, rad, and its
         variance, rad2. The difference is added to the heading once the gyro is proven."""
 
     def taken_back(self, turn: float) -> float:
-        """Account for recomputed lines with `owes`, whose total turn has changed by `turn` rad.
+        """Record that recomputing lines with `owes` has changed their total turn by `turn` rad.
 
-        Return the angle that the caller must subtract from the heading, rad. It is `turn` if the
-        gyro is proven by now and has corrected the heading, otherwise 0.
+        Return the angle that the caller must subtract from the heading, rad. If the gyro is proven
+        by now, the heading of these lines is already that of the gyro. The change must then be
+        undone, so the result is `turn`. Otherwise the result is 0.
         """
         verdict = self._trial.verdict
         if verdict == "none yet":
@@ -223,7 +230,7 @@ class Gyro:
         return sample.at_ns - max(0, int(late))
 
     def _take(self, until_ns: int, resting: bool) -> None:
-        """Add the samples until `until_ns` to the angle, or learn the bias from them at rest."""
+        """Process the samples until `until_ns`: learn the bias at rest, or add to the angle."""
         bias, heard = self._bias, self._heard
         until_ns += self._delay_ns
         while heard and heard[0][0] <= until_ns:
@@ -247,7 +254,7 @@ class Gyro:
     def _try(self, wheels: float, angle: float, variance: float, dt: float, resting: bool) -> bool:
         """Test the gyro if it is not proven yet, and return whether the wheels provide this turn.
 
-        At rest the gyro provides it, because the wheels do not show that a person turns the robot.
+        While the wheels rest, the gyro provides the turn, because a person may turn the robot.
         """
         trial, known = self._trial, self._bias.known
         if not trial.open or resting:
@@ -274,7 +281,7 @@ class Gyro:
         self._slipped_s = self._slipped_s + dt if self._slip_s > 0.0 else 0.0
 
     def _shift(self) -> None:
-        """Correct the assumed delay. Only for use at rest: elsewhere the heading would jump."""
+        """Correct the assumed delay of the gyro. Call this only at rest, or the heading jumps."""
         delay = self._match.delay()
         if delay is not None and abs(delay) >= LEAST_DELAY_S:
             earliest, latest = DELAYS_NS

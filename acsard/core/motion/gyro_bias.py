@@ -18,18 +18,20 @@ WALK = 1e-4
 """Random walk of a cheap gyro's bias with temperature, rad/s per square root of a second."""
 
 UNLIKELY = 5.0
-"""A sample at rest that differs from the bias by more standard deviations is not noise."""
+"""Largest difference of a sample at rest from the bias that counts as noise, in standard
+deviations. `SLACK` comes in addition."""
 
 SLACK = 0.01
-"""Further allowed difference of a sample from the bias, rad/s. A robot that stands may vibrate."""
+"""Difference of a sample from the bias, rad/s, that is allowed in addition to `UNLIKELY` standard
+deviations. A robot that stands may vibrate."""
 
 LEAST_NOISE = 1e-5
 """Smallest assumed standard deviation of a sample, rad/s. Coarse gyros may repeat one value."""
 
 ANEW_S = 1.0
-"""If the reading at rest differs from the bias but stays constant for this time, s, it becomes the
-new bias. The gyro may have restarted or warmed up, or the robot may have turned while the first
-bias was learned."""
+"""If the reading at rest differs from the bias but stays constant for this time, s, the reading
+becomes the new bias. The gyro may have restarted or warmed up, or the robot may have turned while
+the first bias was learned."""
 
 LEARNING = 0.02
 """Weight of a new sample in the estimate of the noise. About the last fifty samples count."""
@@ -61,8 +63,8 @@ class Bias:
     def rest(self, rate: float, variance: float, dt: float) -> bool:
         """Learn from a sample while the wheels stand; return False if it shows a turning robot.
 
-        `rate` is in rad/s, `dt` is the time since the sample before, s, and `variance` is the one
-        that the gyro declares, rad2/s2; 0 if it declares none.
+        `rate` is in rad/s, and `dt` is the time since the sample before, s. `variance` is the
+        variance of the rate that the gyro declares, rad2/s2; 0 if it declares none.
         """
         if not self.known:
             return self._average(rate, variance, dt)

@@ -21,7 +21,8 @@ from collections import deque
 from msgspec import Struct
 
 BLOCK_S = 0.1
-"""Duration of a block of mean rates, s. A single line has too few encoder counts."""
+"""Duration of a block of mean rates, s. A single line has too few encoder counts for a precise
+rate."""
 
 LEAST_RATE = 0.05
 """Smallest turn rate according to the wheels, rad/s, at which the robot counts as turning."""
@@ -31,15 +32,16 @@ LEAST_CHANGE = 0.3
 changes more slowly, the change of the wheels' rate counts as 0."""
 
 MEMORY = 0.995
-"""Factor by which each block of turning reduces the weight of earlier ones: 20 s of memory."""
+"""Factor by which each block of turning reduces the weight of all earlier blocks, so that the fit
+remembers 200 blocks (20 s of turning)."""
 
 ROUGH, FINE = 0.5, 0.1
 """Standard deviation of the ratio of the gyro's turn to the wheels' turn. `ROUGH` is assumed before
 any data. `FINE` is the smallest one assumed, because floor and turn rate change the ratio."""
 
 STRETCH = 1.0
-"""Turn to one side, rad, called a stretch. Each stretch measures the error of the ratio once. The
-delay of the gyro hardly matters over such a turn."""
+"""Size of a stretch: a turn of the robot to the left or to the right, rad. Each stretch measures
+once how far the ratio is wrong. The delay of the gyro hardly matters over such a turn."""
 
 KEPT, PRIOR = 0.9, 0.1
 """`KEPT` is the factor by which each new stretch (a turn of `STRETCH`) reduces the weight of the
@@ -59,7 +61,8 @@ BLOCK_NOISE, BLOCK_SHARE = 0.01, 0.03
 """Standard deviation of a block's mean rate: a constant, rad/s, plus a fraction of the rate."""
 
 LAG_S = 0.05
-"""Standard deviation of the gyro's delay that `contradiction` assumes until it is measured, s."""
+"""Standard deviation of the gyro's delay that `contradiction` assumes before the delay is known,
+s."""
 
 CERTAIN_S = 0.004
 """`Match.delay` returns a delay only if its standard deviation is below this, s."""
@@ -72,11 +75,12 @@ LEAST_SLIP = 0.015
 without slip. Encoder counts and vibration cause it."""
 
 CERTAIN = 3.0
-"""Turns over `WINDOW_S` that differ by more standard deviations contradict each other."""
+"""If the turns of gyro and wheels over `WINDOW_S` differ by more than this number of standard
+deviations, gyro and wheels contradict each other."""
 
 
 class Block(Struct, frozen=True, gc=False):
-    """Turns in one block by wheels and gyro, rad, and change of the wheels' turn rate, rad/s2."""
+    """One block: turns by wheels and by gyro, rad, and change of the wheels' turn rate, rad/s2."""
 
     wheels: float
     gyro: float
@@ -95,10 +99,12 @@ class Match:
         """Least-squares sums. They start with a ratio of 1 and its standard deviation `ROUGH`."""
         self._wd, self._dg, self._dd = NO_DELAY
         self._off = self._way = 0.0
-        """In this stretch: the gyro's turn minus the fitted one, and the wheels' turn, rad."""
+        """Sums over the present stretch, rad: the gyro's turn minus the turn that the fit expects
+        of the gyro, and the turn of the wheels."""
         self._ways = PRIOR * STRETCH**2
+        """Weighted sum of `_way` squared over the completed stretches, rad2."""
         self._offs = ROUGH**2 * self._ways
-        """Weighted sums of `_way` squared and `_off` squared over the completed stretches, rad2."""
+        """Weighted sum of `_off` squared over the completed stretches, rad2."""
         self._lag = LAG_S
         self.blocks = 0.0
         """Number of blocks in which the robot turned; older blocks count less (`MEMORY`)."""
@@ -151,7 +157,7 @@ class Match:
     def contradiction(self, variance: float) -> bool:
         """Return whether gyro and wheels contradict each other in the last `WINDOW_S` s.
 
-        `variance` is that of the gyro's turn, rad2.
+        `variance` is the variance of the gyro's turn in this time, rad2.
         """
         wheels, gyro, time = self._sums
         if time < WINDOW_S * 0.95:

@@ -11,39 +11,44 @@ from __future__ import annotations
 from typing import Literal
 
 LEAST_RATE = 0.1
-"""Turn rate according to the wheels, rad/s, from which a line in the opposite direction begins a
-new turn: a lower rate may come from a single encoder count. A gyro that reads zero is called dead
-only above this rate, because unequal tyres report a slow turn on a straight drive."""
+"""Turn rate according to the wheels, rad/s. A feedback line in the opposite direction begins a new
+turn only from this rate on, because a lower rate may come from a single encoder count. A gyro that
+reads zero is called dead only from this rate on, because wheels with unequal tyres report a slow
+turn while the robot drives straight."""
 
 SLOWEST, STRETCH_S = 0.05, 0.5
-"""Least mean turn rate by the wheels that counts as a turn, rad/s, and time of the mean, s."""
+"""Smallest mean turn rate according to the wheels that counts as a turn, rad/s, and the time over
+which the mean is taken, s."""
 
 PROPORTIONS = (0.25, 2.5)
 """Range of the robot's true turn divided by the turn according to the wheels, on any floor."""
 
 PROVED, REFUTED = 0.1, 0.4
-"""Turn to one side according to the wheels, rad, after which a gyro is proven or refuted. Refuting
-takes a larger turn, because the gyro may be late."""
+"""Turns to the left or to the right according to the wheels, rad, after which a gyro is proven
+(`PROVED`) or refuted (`REFUTED`). Refuting takes a larger turn, because the gyro may be late."""
 
 REFUTED_S = 0.3
-"""Least time of turning before a gyro is refuted, s. No gyro has a delay as long as this."""
+"""Shortest time for which the robot must turn before a gyro is refuted, s. No gyro has a delay as
+long as this."""
 
 DEGREES = (15.0, 150.0)
-"""Range of the gyro's turn divided by the wheels' turn if the gyro reads degrees: near 57."""
+"""Range of the gyro's turn divided by the wheels' turn if the gyro reads degrees. The exact value
+would be 57."""
 
 Verdict = Literal["none yet", "good", "reversed", "in degrees", "dead", "not believed"]
 
 
 class Trial:
-    """Compares a gyro with the wheels until the gyro is proven, even if it was refuted before."""
+    """Compares a gyro with the wheels until the gyro is proven, even after it was refuted."""
 
     def __init__(self) -> None:
         self.verdict: Verdict = "none yet"
         self._wheels = self._gyro = self._seconds = 0.0
         self._stretch = self._stretch_s = self._stretch_gyro = 0.0
-        """The present stretch: turn of the wheels, rad; duration, s; and turn of the gyro, rad."""
+        """Values of the present interval of `STRETCH_S`: the turn according to the wheels, rad; the
+        duration, s; and the turn according to the gyro, rad."""
         self._fast = self._fast_gyro = 0.0
-        """Turns of wheels and gyro, rad, over the stretches fast enough to call a gyro dead."""
+        """Turns according to wheels and gyro, rad, over the intervals faster than `LEAST_RATE`."""
 
     @property
     def open(self) -> bool:
@@ -51,10 +56,11 @@ class Trial:
         return self.verdict != "good"
 
     def add(self, wheels: float, gyro: float, dt: float, certain: bool = True) -> None:
-        """Add the turn in one feedback line by wheels and gyro, rad, and update the verdict.
+        """Add a feedback line of `dt` s, and update the verdict.
 
-        If `certain` is false, the gyro's bias is unknown, and the only new verdict can be "in
-        degrees".
+        `wheels` and `gyro` are the turns of the robot in this line according to wheels and gyro,
+        rad. If `certain` is false, the bias of the gyro is unknown. Then the verdict can only
+        change to "in degrees".
         """
         self._stretch += wheels
         self._stretch_gyro += gyro
@@ -101,7 +107,7 @@ class Trial:
 
 
 def _named(ratio: float) -> Verdict:
-    """Return the fault of a gyro. `ratio` is its turn divided by the turn of the wheels."""
+    """Return the fault of a gyro. `ratio` is the gyro's turn divided by the wheels' turn."""
     least, most = PROPORTIONS
     if DEGREES[0] <= abs(ratio) <= DEGREES[1]:
         return "in degrees"

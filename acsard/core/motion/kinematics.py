@@ -52,10 +52,10 @@ class Kinematics:
         return Twist(linear, angular)
 
     def moved(self, wheels: tuple[float, float, float, float]) -> tuple[float, float]:
-        """Return the distance (m) and the turn (rad) of the base for these wheel angles (rad).
+        """Return the distance (m) and the turn (rad) of the base after the wheels have rolled.
 
-        `wheels` is in the order of `WHEELS`. For wheel speeds (rad/s), the result is in m/s and
-        rad/s.
+        `wheels` are the angles that the wheels rolled (rad), in `WHEELS` order. If they are wheel
+        speeds (rad/s) instead, the result is in m/s and rad/s.
         """
         front_right, front_left, rear_left, rear_right = wheels
         left = self._left_radius * (front_left + rear_left) / 2
@@ -63,10 +63,11 @@ class Kinematics:
         return (right + left) / 2, (right - left) / self.track
 
     def opposite(self, left: float, right: float, turn: float) -> tuple[float, float]:
-        """Compute the wheel angles (left, right), each from the other side and the turn, rad.
+        """Return the angles that the left and the right wheels rolled, rad (from equation (3)).
 
-        `left` and `right` are the mean wheel angles of the sides, and `turn` is the turn of the
-        base, rad (equation (3) of the module).
+        The left angle follows from `right` and `turn`, and the right angle from `left` and `turn`.
+        `left` and `right` are the means of the two wheels on each side, and `turn` is the turn of
+        the base, all in rad.
         """
         across = turn * self.track
         return (

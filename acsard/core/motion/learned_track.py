@@ -14,19 +14,21 @@ from acsard.core.values import Event, GyroStatus, Level, TrackUse
 
 LEAST = 0.05
 """Smallest relative standard deviation of a learned track, because floor and turn rate may change.
-It is half of `gyro_match.FINE`: the mean error of a drive is smaller than that of a moment."""
+It is half of `gyro_match.FINE`, because the mean error over a whole drive is smaller than the error
+at one moment."""
 
 CERTAIN, UNCERTAIN = 0.1, 0.2
-"""Relative standard deviations. An uncertain track becomes certain below `CERTAIN`, and a certain
-track becomes uncertain above `UNCERTAIN`."""
+"""Limits of the learned track's relative standard deviation. An uncertain track becomes certain
+below `CERTAIN`, and a certain track becomes uncertain above `UNCERTAIN`."""
 
 BOUNDS = (0.5, 2.5)
 """Range of the learned track, divided by the configured one. The effective track is 1.4 to 1.9
 times the wheel separation on most floors, and 2.5 times on slippery ones."""
 
 INWARDS = 1.05
-"""A learned track comes into use only if it is inside `BOUNDS` by this factor. Otherwise a track
-near a bound could go in and out of use again and again."""
+"""Margin for a learned track that is not in use. It comes into use only above the lower bound times
+this factor and below the upper bound divided by this factor. Without the margin, a track near a
+bound could go in and out of use again and again."""
 
 NOTES: dict[TrackUse, str] = {
     "shown": "(only shown)",
@@ -68,7 +70,7 @@ class LearnedTrack:
         self.used = learned if learned is not None and self.use == "used" else CONFIGURED
         if learned is not None and self.use != before:
             told = (
-                "effective track, as wheel_separation_multiplier: "
+                "effective track, given as a value of wheel_separation_multiplier: "
                 f"{beside(learned, self._multiplier, self.use)}"
             )
             level: Level = "warning" if self.use == "too far off" else "info"
@@ -87,7 +89,8 @@ def _use(learned: Track | None, before: TrackUse) -> TrackUse:
 def beside(learned: Track, multiplier: float, use: TrackUse) -> str:
     """Return the learned and the configured track in words, and which of them is in use.
 
-    Both tracks are given as multiples of the wheel separation. `multiplier` is the configured one.
+    The text gives both tracks as multiples of the wheel separation. `multiplier` is the multiple of
+    the configured track.
     """
     value = learned.share * multiplier
     configured = "" if use == "used" else " (in use)"

@@ -1,8 +1,8 @@
 """Holds the latches and the other facts that determine the mode, and derives the mode from them.
 
 A latch is set by a stop, a fault or `deactivate`. Only `clear` releases a stop or a fault, one at a
-time, and only `activate` releases `inactive`. Neither request may release a stop or a `deactivate`
-that its sender has not seen, even if the network delivers the request late:
+time, and only `activate` releases the latch of a `deactivate`. Neither request may release a stop
+or a `deactivate` that its sender has not seen, even if the network delivers the request late:
 
 - A request that names a number releases the latch with exactly this number.
 - A request without a number is refused if less than `LOOK_FIRST_S` has passed since the last stop
@@ -29,7 +29,7 @@ LOOK_FIRST_S = 2.0
 name the number of the latch. The network seldom takes longer to deliver a packet."""
 
 LONG_AGO_NS = -(2**62)
-"""Monotonic time before every other one, ns."""
+"""A monotonic time that is earlier than every real one, ns. It stands for "never"."""
 
 _DAYS_TO_1970 = 719_468
 """Days from 0000-03-01 to 1970-01-01. Years start in March, so they end with the leap day."""
@@ -41,7 +41,7 @@ class Lifecycle:
     """Latches and mode of one robot. A request that is not allowed raises `RefusedError`."""
 
     def __init__(self, active: bool, latches: Latches = Latches()) -> None:  # noqa: B008
-        """Start with these latches. If not `active`, the robot is also switched off."""
+        """Start with these latches. If `active` is false, the robot waits for a call `activate`."""
         self.latches = latches
         self.mode = Mode.WAITING
         self._shutting_down = self._linked = self._commanded = False
@@ -50,7 +50,7 @@ class Lifecycle:
         found = (latches.stop, latches.fault, latches.inactive)
         self._number = max([latch.number for latch in found if latch is not None], default=0)
         self._numbered = False
-        """Whether this run has set a latch. The first one gets a number that is not used yet."""
+        """Whether this run has set a latch (see `number_after_restart` for its first number)."""
         self._stopped_ns = self._faulted_ns = LONG_AGO_NS
         """Monotonic times at which the last stop and the last fault were latched, ns."""
         self._cleared_ns = LONG_AGO_NS
@@ -62,8 +62,8 @@ class Lifecycle:
         self._held = self._mend = ""
         """Why the call `clear` is refused, and what to do about it; "" while it is permitted."""
         self._freed_ns = LONG_AGO_NS
-        """Monotonic time, ns, of the last step that ended or repeated the cause of a latch. Earlier
-        calls `clear` are refused."""
+        """Monotonic time, ns, of the last step in which the cause of a latch ended or came again. A
+        call `clear` from before that step is refused."""
         self._began_ns: int | None = None
         """Monotonic time of the first step, ns; None before that step."""
         self._derive()
@@ -76,7 +76,10 @@ class Lifecycle:
             self._began_ns = now.mono_ns
 
     def link(self, up: bool) -> None:
-        """Record whether the link to the board is up, and derive the mode."""
+        """Record whether the board is ready to drive the robot, and derive the mode.
+
+        The board is ready if its link is up and it reports all required inputs.
+        """
         if up is not self._linked:
             self._linked = up
             self._derive()
@@ -88,18 +91,21 @@ class Lifecycle:
             self._derive()
 
     def press(self, why: str, now: Instant) -> None:
-        """Latch a stop that the board causes, under a new number. `why` is a whole sentence."""
+        """Latch a stop that the board causes, under a new number. `why` names the cause."""
         self._stopped_ns = self._stop_asked_ns = now.mono_ns
         self._latch(stop=self._made(now, "", why))
 
     def hold(self, why: str, mend: str, now_ns: int) -> None:
-        """Record why the board forbids `clear`, and what to do; "" if `clear` is allowed."""
+        """Record why the state of the board forbids the call `clear` now.
+
+        `mend` tells the operator what to do about it. Both texts are "" if the call is allowed.
+        """
         if self._held and not why:
             self._freed_ns = now_ns
         self._held, self._mend = why, mend
 
     def caused_again(self, now_ns: int) -> None:
-        """Record that the cause of the fault came again. Earlier calls `clear` are then refused."""
+        """Record that the cause of the fault came again. Refuse calls `clear` from before that."""
         self._freed_ns = now_ns
 
     def leave(self) -> None:
@@ -118,7 +124,7 @@ class Lifecycle:
     # requests
 
     def stop(self, by: str, asked_ns: int, now: Instant) -> str:
-        """Latch a stop under a new number, and return the answer for the client.
+        """Latch a stop under a new number, and return a text for the client.
 
         If the latched stop was requested at the same time as this one or later, keep that latch.
         `asked_ns` is the monotonic time at which the request arrived. `by` is "" if the client is
@@ -135,10 +141,11 @@ class Lifecycle:
         return "stopped and latched; srv/clear releases it"
 
     def clear(self, number: int | None, asked_ns: int, now: Instant) -> str:
-        """Release the fault if one is latched, otherwise the stop, and return the answer.
+        """Release the fault if one is latched, otherwise the stop; return a text for the client.
 
-        The answer is "" if neither is latched. `number` is that of the latch that the sender has
-        seen, None without one. `asked_ns` is the monotonic time at which the request arrived.
+        The text is "" if neither a fault nor a stop is latched. `number` is the number of the latch
+        that the client has seen; None if the request names none. `asked_ns` is the monotonic time
+        at which the request arrived.
         Raises `RefusedError`.
         """
         require_allowed(self.mode, "clear")
@@ -150,7 +157,10 @@ class Lifecycle:
         if asked_ns <= self._freed_ns:
             # This call may have arrived before the button was released, because a press may be
             # shorter than a step.
-            raise RefusedError("this call came before the release: call srv/clear again")
+            raise RefusedError(
+                "this call came before the cause of the stop or fault had ended: call srv/clear "
+                "again"
+            )
         if number is None:
             self._require_seen_stop(asked_ns)
             set_ns = max(self._stopped_ns, self._faulted_ns)
@@ -161,7 +171,8 @@ class Lifecycle:
             set_ns = self._stopped_ns if latches.fault is None else self._faulted_ns
         if asked_ns <= set_ns or now.mono_ns == set_ns:
             raise RefusedError(
-                "a stop or a fault came at the time of this call or later: call srv/clear again"
+                "a stop or a fault came at the same time as this call or after it: call srv/clear "
+                "again"
             )
         if latches.fault is None:
             self._latch(stop=None)
@@ -177,9 +188,9 @@ class Lifecycle:
     def activate(self, number: int | None, asked_ns: int, now: Instant) -> bool:
         """Switch the robot on; return True if it was off.
 
-        `number` is that of the latch that the sender has seen, None without one. 0 stands for a
-        robot that is off only because `auto_activate` is False. Raises `RefusedError` if the mode
-        refuses the request, or if its sender may not know the latch.
+        `number` is the number of the latch that the client has seen; None if the request names
+        none. 0 stands for a robot that is off only because `auto_activate` is False. Raises
+        `RefusedError` if the mode refuses the request, or if the client may not know the latch.
         """
         require_allowed(self.mode, "activate")
         if not self._off:
@@ -193,21 +204,25 @@ class Lifecycle:
                 self._require_seen(latch, self._off_ns, asked_ns, "srv/activate")
             if asked_ns <= self._off_ns or now.mono_ns == self._off_ns:
                 raise RefusedError(
-                    f"{latch.why} at the time of this call or later: call srv/activate again"
+                    f"{latch.why} at the same time as this call or after it: call srv/activate "
+                    "again"
                 )
         self._dormant = False
         self._latch(inactive=None)
         return True
 
     def deactivate(self, by: str, now: Instant) -> str:
-        """Switch the robot off under a new number, even if it is off; return the answer."""
+        """Switch the robot off, and return a text for the client.
+
+        If the robot is already off, a latch with a new number replaces the old latch.
+        """
         require_allowed(self.mode, "deactivate")
         self._off_ns = now.mono_ns
         self._latch(inactive=self._made(now, by, f"switched off by {by or 'request'}"))
         return "inactive: the robot ramps to zero; srv/activate switches it on"
 
     def lower(self, limits: dict[str, float]) -> None:
-        """Store the lowered keys of `[limits]` with their values, to survive a restart."""
+        """Store the settings of `[limits]` that `set` has lowered. They must survive a restart."""
         if limits != self.latches.lowered:
             self.latches = replace(self.latches, lowered=limits)
 
@@ -269,7 +284,7 @@ class Lifecycle:
             # The network may have delivered one call twice.
             raise RefusedError(
                 f"a latch was cleared less than {LOOK_FIRST_S:g} s ago; the robot is still "
-                f"{_stopped(stop)}: look at it, then call srv/clear again"
+                f"{_stopped(stop)}: look at the robot, then call srv/clear again"
             )
         self._require_seen(stop, self._stopped_ns, asked_ns, "srv/clear")
 
@@ -298,10 +313,10 @@ class Lifecycle:
 def number_after_restart(kept: int, now: Instant) -> int:
     """Return a latch number that no earlier run of the daemon has used.
 
-    The number is the wall-clock time in ms. If that is not above `kept`, the largest number in the
-    latch file, the wall clock was set back. The number is then `kept` + 1 plus the time since the
-    computer started in ms: `kept` + 1 alone could be a released latch, for which a late call
-    `clear` may come.
+    `kept` is the largest number in the latch file. The result is the wall-clock time in ms if that
+    is above `kept`. Otherwise the wall clock was set back, and the result is `kept` + 1 plus the
+    time since the computer started, ms. `kept` + 1 alone is not safe: a latch that was released
+    may have had that number, although the file has it no longer, and a late `clear` may carry it.
     """
     number = now.wall_ns // 1_000_000
     return number if number > kept else kept + 1 + now.mono_ns // 1_000_000
@@ -309,8 +324,8 @@ def number_after_restart(kept: int, now: Instant) -> int:
 
 def _not_in_force(number: int, still: str, call: str) -> str:
     return (
-        f"latch {number} is not in force; the robot is still {still}: look at it, then call {call} "
-        "again"
+        f"this call names latch {number}, which is not the latest one; the robot is still {still}: "
+        f"look at the robot, then call {call} again with the latest number"
     )
 
 
@@ -324,7 +339,7 @@ def _when(latch: Latch) -> str:
 
 
 def _asked_for(latch: Latch) -> bool:
-    """Return whether a client asked for the latch. Otherwise its reason is a whole sentence."""
+    """Return whether a client asked for the latch. Otherwise its `why` names another cause."""
     return latch.why.endswith(f" by {latch.by or 'request'}")
 
 

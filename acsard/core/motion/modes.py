@@ -4,11 +4,11 @@
     fault     a fault is latched until `clear`
     stopped   a stop is latched until `clear`
     inactive  the robot is switched off until `activate`
-    waiting   the robot is active, but it has no link to the board
+    waiting   the robot is active, but its board is not linked or does not report a required input
     driving   the robot follows a fresh command
-    ready     the robot is active and linked, and it follows no command
+    ready     the robot could drive, but there is no command to follow
 
-The first mode whose condition holds is the robot's mode, so the mode itself needs no memory.
+The first mode of this list whose condition holds is the robot's mode. No mode is stored.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ REFUSALS: dict[tuple[Mode, Verb], str] = {
     (Mode.STOPPED, "activate"): "the robot is stopped: call srv/clear first",
     (Mode.STOPPED, "deactivate"): "the robot is stopped and cannot move: call srv/clear first",
 }
-"""The requests that each mode refuses, and the reason that the caller gets as the answer."""
+"""The requests that each mode refuses, with the reason that the client gets."""
 
 
 def require_allowed(mode: Mode, verb: Verb) -> None:

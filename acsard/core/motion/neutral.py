@@ -25,7 +25,11 @@ class Sender:
         self._neutral_first = neutral_first
         self._armed = self._proven_armed = not neutral_first
         self._zero_ns: int | None = None
-        """Arrival of a shared identity's zero, monotonic ns; None if a speed has arrived since."""
+        """Arrival of the zero after which `commands.neutral_pause` runs, monotonic ns.
+
+        None if there is no such zero or a speed has followed it. Only a shared identity needs this
+        value.
+        """
         self._proven_zero_ns: int | None = None
         self.name = ""
         self.twist = REST
@@ -72,7 +76,7 @@ class Sender:
         self._armed, self._zero_ns = self._proven_armed, self._proven_zero_ns
 
     def notice(self, at_ns: int) -> None:
-        """Record a refused message, which has the same effect as a lost one (see `missed`)."""
+        """Record a refused message. Like a lost message, it cancels a zero (see `missed`)."""
         self._settle(at_ns)
         self._zero_ns = self._proven_zero_ns = None
         self.noticed_ns = at_ns
@@ -80,8 +84,8 @@ class Sender:
     def missed(self) -> None:
         """Record that messages of this sender were lost. They may have commanded motion.
 
-        They prevent an earlier zero from arming a shared identity whose `commands.neutral_pause` is
-        not over yet.
+        If several programs share the identity of the sender, and `commands.neutral_pause` after
+        the last zero is not over yet, this zero no longer arms the sender.
         """
         self._zero_ns = self._proven_zero_ns = None
 
@@ -94,8 +98,8 @@ class Sender:
         """Process a command that was not refused. `verdict` is the verdict on its stamp.
 
         A command from an unproven clock ("first", "unproven") does not drive the robot yet, but a
-        zero arms the sender until `unlearn`. A zero that arrived before `since_ns`, the time of the
-        last `require_neutral`, does not arm the sender.
+        zero with such a verdict arms the sender until `unlearn`. A zero that arrived before the
+        monotonic time `since_ns` does not arm the sender (see `Arbiter.require_neutral`).
         """
         now_ns, zero = command.arrived_ns, is_zero(command)
         self._settle(now_ns)
@@ -133,7 +137,7 @@ class Sender:
         self._doubted_ns, self.doubt, self.ros = command.arrived_ns, why, command.ros
 
     def _settle(self, now_ns: int) -> None:
-        """Arm a shared identity if no speed has followed its zero for `commands.neutral_pause`."""
+        """Arm a sender with a shared identity if no speed came for `commands.neutral_pause`."""
         if self._zero_ns is not None and now_ns - self._zero_ns >= self._pause_ns:
             self._armed = True
             if self._proven_zero_ns == self._zero_ns:

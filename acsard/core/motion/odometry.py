@@ -51,7 +51,7 @@ class Step(Struct, frozen=True, gc=False):
     pose: Pose
     """The pose before the line."""
     pieces: tuple[Motors, ...]
-    """Angles by which the wheels turned in the line, rad, one set for each arc."""
+    """Angles that the wheels rolled since the line before, rad, one set for each arc."""
     gyro: Turn | None
     """The turn that a gyro measured, None if the wheels provided it."""
     speeds: WheelSpeeds
@@ -64,7 +64,7 @@ class Step(Struct, frozen=True, gc=False):
 
 
 class Odometry:
-    """The odometry: pose, covariance and wheel angles, integrated from feedback."""
+    """The odometry: pose, covariance and angles of the wheels, integrated from feedback."""
 
     def __init__(
         self,
@@ -76,14 +76,15 @@ class Odometry:
     ) -> None:
         """Start at the origin.
 
-        `encoder_counts` is per wheel turn, 0 if unknown. After `quiet` s of silence, the daemon
-        commands rest.
+        `encoder_counts` is the number per revolution of a wheel, 0 if unknown. After `quiet` s
+        without feedback, the daemon commands rest.
         """
         self._kinematics, self._track = kinematics, CONFIGURED
         self._positions = NOWHERE
         self._rolling = Rolling(quiet)
         self._held = NOWHERE
-        """Wheel angles at rest, rad, that are added to the pose once their direction is clear."""
+        """Angles that the wheels have rolled at rest, rad. They are not added to the pose until
+        they exceed two encoder counts or the robot drives (see `_unsettled`)."""
         self._steps_of, self._coarsest = NOWHERE, 0.0
         """Quantization steps of the speeds in the last line, and the largest known one, rad/s."""
         self._path = Path()
@@ -103,13 +104,16 @@ class Odometry:
         self.speeds = STILL
         """Wheel speeds in the last feedback line, rad/s."""
         self.gaps, self.unseen, self.bridged = 0, 0.0, 0.0
-        """Number and duration, s, of the gaps in which the robot moved but the pose stood still,
-        and the time, s, that gap filling covered."""
+        """Number and duration, s, of the gaps in the feedback in which the robot moved but the pose
+        could not follow, and the duration, s, of the gaps that were filled."""
         self.travelled = 0.0
-        """Distance since the start, forwards and backwards, m."""
+        """Distance driven since the start of the daemon, forwards plus backwards, m."""
 
     def use(self, odometry: OdometryConfig) -> None:
-        """Use these variances from now on. Those of the initial pose wait for `set_pose`."""
+        """Use these variances from now on.
+
+        The variances of the initial pose apply from the next `set_pose` on.
+        """
         self._errors.use(odometry)
 
     def turn_by(self, track: Track) -> None:
@@ -135,8 +139,8 @@ class Odometry:
     def missed(self) -> dict[str, int]:
         """Return counters of the gaps in the feedback, without counters that are 0.
 
-        `gaps` is the number of gaps in which the robot moved but the pose stood still, and `gap_ms`
-        is their duration. `gaps_filled_ms` is the time that gap filling covered.
+        `gaps` is the number of gaps in which the robot moved but the pose could not follow, and
+        `gap_ms` is their total duration. `gaps_filled_ms` is the total duration of filled gaps.
         """
         ms = {"gap_ms": round(1e3 * self.unseen), "gaps_filled_ms": round(1e3 * self.bridged)}
         return {name: count for name, count in ({"gaps": self.gaps} | ms).items() if count}
@@ -144,17 +148,17 @@ class Odometry:
     def skip(self, feedback: Feedback) -> None:
         """Ignore the speeds of an impossible feedback line.
 
-        The next possible line adds the motion of both lines to the pose. It uses the encoder counts
-        of this line if there are any.
+        The next possible line adds the motion of both lines to the pose. If the impossible line has
+        encoder counts, these counts are used.
         """
         self._rolling.skip(feedback)
 
     def fold(self, feedback: Feedback) -> Estimate:
         """Advance the pose by one feedback line, and return the new estimate.
 
-        - The wheel angles come from the encoder counts of the line if it has any, otherwise from
-          its speeds times dt. After a gap without counts, only the uncertainty grows.
-        - At rest, a single count is added only when its direction is clear.
+        - The angles that the wheels rolled come from the encoder counts of the line. Without counts
+          they are the speeds times dt. After a gap without counts, only the uncertainty grows.
+        - While the robot rests, motion of up to two encoder counts does not change the pose yet.
         - If a gyro provides the turn since the line before, the wheels provide only the distance.
         - If a wheel proves faulty, the other wheel of its side replaces it, also in the earlier
           lines in which the faulty wheel was wrong.
@@ -197,7 +201,7 @@ class Odometry:
         )
 
     def _settled(self, rolled: Rolled, at_rest: bool) -> tuple[Motors, ...]:
-        """Return the wheel angles by which to advance the pose, one set for each arc, rad."""
+        """Return the angles of the wheels by which to advance the pose, rad, a set for each arc."""
         turned = rolled.turned
         if self._held != NOWHERE:
             turned = plus(self._held, turned)
@@ -211,7 +215,7 @@ class Odometry:
         return (turned, *rolled.pieces)
 
     def _take_back(self) -> None:
-        """Recompute the pose from the recent lines in which a wheel, now found faulty, was wrong.
+        """Recompute the pose from the recent lines in which the newly faulty wheel was wrong.
 
         If a gyro on trial has already corrected the turns, the heading keeps that correction.
         """
@@ -234,7 +238,7 @@ class Odometry:
     def _arcs(
         self, pieces: tuple[Motors, ...], gyro: Turn | None, share: float
     ) -> list[tuple[float, float]]:
-        """Return the arcs, each as distance (m) and turn (rad), for these wheel angles in rad.
+        """Return the arcs, each as distance (m) and turn (rad), for these angles of the wheels.
 
         If a gyro provides the turn, the result is one arc for all pieces. Otherwise it is one arc
         for each piece, with an effective track of `share` times the configured one.
@@ -252,7 +256,7 @@ class Odometry:
         speeds: WheelSpeeds,
         slips: bool,
     ) -> float:
-        """Advance the pose by the wheel angles of a line, and return the turn of the pose, rad."""
+        """Advance the pose by the angles of the wheels; return the turn of the pose, rad."""
         path, turned = self._path, 0.0
         pose, variance = path.pose, None if turn is None else turn.variance
         for piece in pieces:

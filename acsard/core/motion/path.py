@@ -2,8 +2,9 @@
 
 An arc of length d through the angle a, from a pose with the heading yaw, has a chord of length d
 sin(a / 2) / (a / 2) in the direction yaw + a / 2. The rounding error of each sum is kept and added
-to the next sum (Kahan, Further Remarks on Reducing Truncation Errors, 1965). A whole turn is 2 pi,
-and not the double nearest to it, so that many turns cause no error either.
+to the next sum (Kahan, Further Remarks on Reducing Truncation Errors, 1965). When yaw is wrapped,
+exactly 2 pi is subtracted and not the double nearest to 2 pi (`TAU_REST`), so that many revolutions
+cause no error either.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ class Path:
 
 
 def plus(a: float, b: float) -> tuple[float, float]:
-    """Return a + b as the nearest double, and its exact rounding error (Knuth)."""
+    """Return the double nearest to a + b, and the exact rounding error of this sum (Knuth)."""
     total = a + b
     of_b = total - a
     return total, (a - (total - of_b)) + (b - of_b)
@@ -75,7 +76,7 @@ def arc(pose: Pose, distance: float, turn: float) -> Pose:
 
 
 def _wrapped(yaw: float, turn: float) -> tuple[float, float]:
-    """Return yaw + turn within [-pi, pi], and its rounding error."""
+    """Return yaw + turn within [-pi, pi], and the rounding error of this sum."""
     total, rest = plus(yaw, turn)
     wrapped = math.remainder(total, math.tau)
     if wrapped != total:

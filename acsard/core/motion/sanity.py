@@ -2,8 +2,8 @@
 
 `Sanity` rejects a line in which a wheel turns, or changes its speed, faster than any wheel can. The
 daemon does not use such a line, and several in a row are a fault. If more than one line in a
-hundred is impossible, it logs a warning: either the wire damages lines, or a bound is too low and
-true lines are rejected. `wheel_faults.py` checks whether the wheels obey their commands.
+hundred is impossible, the daemon logs a warning: either the wire damages lines, or a bound is too
+low and true lines are rejected. `wheel_faults.py` checks whether the wheels obey their commands.
 """
 
 from __future__ import annotations
@@ -19,21 +19,24 @@ REPEATED = 3
 """Number of impossible lines in a row that latch a fault: 30 ms at 100 Hz."""
 
 WINDOW = 1000
-"""Number of lines in a window, in which the impossible ones are counted: 10 s at 100 Hz."""
+"""Number of lines in a window. The impossible lines of each window are counted. A window lasts 10 s
+at 100 Hz."""
 
 SHARE = 0.01
-"""If more than this share of a window's lines is impossible, a warning is logged once."""
+"""If more than this share of the lines in a window is impossible, one warning is logged."""
 
 SLACK = 2.0
 """Allowed change of a speed, rad/s, beyond `feedback.wheel_acceleration`. Coarse encoders and a
 robot at rest can cause changes of this size."""
 
 STEPS = 2
-"""Encoder counts by which two reports of a steady wheel may differ: each may be wrong by one."""
+"""Encoder counts by which two reports of a wheel at constant speed may differ, because each report
+may be wrong by one count."""
 
 SHORTEST_S = 0.004
-"""Shortest time that is expected between two lines, s. Lines follow each other this quickly while a
-host catches up after a stall, and a single count in so short a time looks like a high speed."""
+"""Shortest time that is expected between two lines, s. Lines follow each other this quickly while
+this computer catches up after a stall. A single encoder count in so short a time looks like a high
+speed."""
 
 
 class Sanity:
@@ -44,8 +47,8 @@ class Sanity:
         self._last: WheelSpeeds | None = None
         self._since = 0.0
         self._longest = 0.0
-        """Longest time that a recent line covers, s. After a pause, a line reports the mean speed
-        of the pause, and is recent until the same time has passed again."""
+        """Longest time over which a recent line reports the mean speed, s. A line that covers a
+        pause of t s counts as recent for t s."""
         self._impossible = 0
         self._lines = self._dropped = 0
         """Numbers of all lines and of impossible lines in the present window."""
@@ -62,9 +65,9 @@ class Sanity:
         return self._impossible >= REPEATED
 
     def impossible(self, feedback: Feedback) -> str:
-        """Return why no wheel can do what this line reports, "" if the line is possible.
+        """Return why no wheel can have the speeds in this line; "" if the line is possible.
 
-        The change of each speed is compared with the time since the last possible line, so a real
+        The allowed change of each speed grows with the time since the last possible line, so a real
         jump is accepted after enough time. Each speed is a mean over the time of its line, so the
         change may have lasted from the middle of one line to the middle of the next.
         """

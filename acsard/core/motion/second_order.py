@@ -72,7 +72,7 @@ class SecondOrder:
         does not change them, because they have no yaw (`se2.seen_from`)."""
 
     def widen(self) -> None:
-        """Add a parameter that has had no effect on the pose so far."""
+        """Add one more parameter. The pose does not depend on it so far: its derivatives are 0."""
         self._with_x.append((ORIGIN, ORIGIN))
         i = len(self._with_x) - 1
         self._bent |= {(i, k): (0.0, 0.0) for k in range(i + 1)}

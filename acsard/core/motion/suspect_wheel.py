@@ -2,11 +2,11 @@
 
 A faulty encoder shows one of three signs. It is dead (reports no turn), reversed (reports the
 opposite of the other wheel) or stuck (repeats one speed). A wheel with such a sign is faulty if an
-independent reference differs more from it than from the other wheel of its side. The reference is
-the turn according to a gyro or, without one, the command. The speed of a healthy wheel lies between
-its command and the speed that a wheel with `feedback.response_time` has reached by now. Without a
-reference, only a stuck wheel is found, because a person who pushes the robot may turn one wheel and
-not the other.
+independent reference differs more from this wheel than from the other wheel of its side. The
+reference is the turn according to a gyro or, without a gyro, the command. The speed of a healthy
+wheel lies between its command and the speed that a wheel with `feedback.response_time` has reached
+by now. Without a reference, only a stuck wheel is found, because a person who pushes the robot may
+turn one wheel and not the other.
 
 `Suspect` tests a wheel that contradicts the other one of its side. `Stuck` tests every wheel,
 because a stuck encoder agrees with the other wheel until the command changes.
@@ -20,22 +20,24 @@ from typing import Literal
 from acsard.core.motion.wheel_witness import Expected
 
 FAULT_S, FAULT_LINES = 0.025, 2
-"""Shortest time, s, and smallest number of lines for which a sign of a fault must last. At 100 Hz
-the time takes three lines, so one bad reading is not enough."""
+"""Shortest time, s, and smallest number of lines for which a sign of a fault must last. At 100 Hz,
+`FAULT_S` takes three lines, so one bad reading is not enough."""
 
 FAULT_COUNTS, FAULT_ANGLE = 3.5, 0.05
-"""Least difference of two wheels for calling one faulty: encoder counts plus an angle in rad."""
+"""Smallest difference of the angles of two wheels at which one of them can be called faulty: this
+number of encoder counts plus this angle in rad."""
 
 FOLLOWED_COUNTS, FOLLOWED_ANGLE = 2.5, 0.01
-"""After a new command, a wheel is called stuck only if the expected angle of a healthy wheel
-differs from its angle at the old speed by this number of encoder counts plus this angle in rad."""
+"""After a new command, a wheel that repeats its old speed is called stuck only if a healthy wheel
+would have turned further or less by this number of encoder counts plus this angle in rad."""
 
 LEAVES = 0.05
 """Least change of the command, rad/s, after which a healthy wheel must report another speed."""
 
 VOTE = 1 / 3
-"""A reference (a gyro or the command) decides which of two wheels is faulty only if one wheel is
-nearer to it than the other by at least this share of the difference between the wheels."""
+"""A reference (a gyro or the command) decides which of two wheels is faulty only if it is clearly
+nearer to one of them. The two distances from the reference must differ by at least this share of
+the difference between the wheels."""
 
 HAND_S = 0.3
 """Time for which a wheel must repeat one speed without a command before it is called stuck, s. A
@@ -47,8 +49,9 @@ the share `DEAD`. It is reversed if it turns in the opposite direction, and the 
 turns differ by less than the share `REVERSED`."""
 
 STUCK = 0.3
-"""Least difference between the two wheels for calling one stuck, as a share of the faster wheel's
-turn. A smaller difference may be slip of the other wheel while this one turns steadily."""
+"""Smallest difference between the two wheels of a side at which one can be called stuck, as a share
+of the faster wheel's angle. If the difference is smaller, the wheel with the constant speed may be
+healthy while the other wheel slips."""
 
 WheelFault = Literal["dead", "reversed", "stuck"]
 
@@ -60,7 +63,8 @@ WORDS: dict[WheelFault, str] = {
 
 
 class _Ballot:
-    """Sums over lines, rad: turns of two wheels, and bounds of the true turn by a reference."""
+    """Sums over feedback lines, rad: the angles that two wheels rolled, and the lowest and the
+    highest angle that a healthy wheel rolled according to a reference."""
 
     def __init__(self) -> None:
         self._own = self._other = self._low = self._high = 0.0
@@ -108,9 +112,11 @@ class Suspect:
         """Whether the command could serve as a reference in any line of the test."""
 
     def looks(self, own: float, other: float, same: bool, dt: float, count: float) -> bool:
-        """Add a line, and return whether the wheel shows a sign of a fault.
+        """Take in a line of feedback, and return whether the wheel now shows a sign of a fault.
 
-        All angles are in rad. `same` is true if this wheel repeats the speed of the line before.
+        `own` and `other` are the angles that this wheel and the other wheel of its side rolled, and
+        `count` is the angle of an encoder count, rad. `same` is true if this wheel repeats the
+        speed of the line before.
         """
         sign = self._sign(own, other, same, count)
         if sign != self.sign:
@@ -122,7 +128,7 @@ class Suspect:
         return sign is not None
 
     def _sign(self, own: float, other: float, same: bool, count: float) -> WheelFault | None:
-        """Return the sign of a fault in this line. At rest and near zero, the old sign stays."""
+        """Return the sign of a fault in this line, None without one."""
         if self.sign == "stuck" and same:
             return "stuck"
         if reverses(own, other, count) or (self.sign == "reversed" and own * other == 0.0):
@@ -157,7 +163,10 @@ class Suspect:
             self._gyro.add(own, other, gyro, gyro)
 
     def is_faulty(self, count: float) -> bool:
-        """Return whether this wheel, and not the other one, is faulty. `count` is in rad."""
+        """Return whether this wheel, and not the other one, is faulty.
+
+        `count` is the angle of an encoder count, rad.
+        """
         enough = FAULT_COUNTS * count + FAULT_ANGLE
         if self._lines < FAULT_LINES or self._seconds < FAULT_S or abs(self._apart) < enough:
             return False
@@ -175,10 +184,10 @@ class Suspect:
 class Stuck:
     """The test of one wheel for a speed that stays the same although it must change.
 
-    At a steady speed, nothing can detect a stuck encoder, and it does not harm the pose. After a
-    change of the command, a healthy wheel must report another speed as soon as its expected angle
-    differs by a few counts from the angle at the old speed. If only the other wheel of the side
-    does so, this encoder is stuck.
+    While the robot drives at a constant speed, nothing can detect a stuck encoder, but it does not
+    harm the pose either. After a new command, a healthy wheel must report another speed as soon as
+    its expected angle differs by a few counts from the angle at the old speed. If only the other
+    wheel of the side reports another speed, this encoder is stuck.
     """
 
     def __init__(self) -> None:
@@ -189,14 +198,15 @@ class Stuck:
         self._seconds = self._followed = self._other = 0.0
 
     def left_by(self, command: float) -> bool:
-        """Return whether `command`, rad/s, changed since the wheel began to repeat its speed."""
+        """Return whether `command`, rad/s, changed since the wheel first reported this speed."""
         return abs(command - self._command) >= LEAVES
 
     def says(self, same: bool, apart: float, dt: float, count: float, expected: Expected) -> bool:
         """Add a line, and return whether the encoder is stuck.
 
         `same` is true if the wheel turns and repeats the speed of the line before. `apart` is the
-        angle by which the other wheel turned further, and `count` is that of an encoder count, rad.
+        angle by which the other wheel of the side turned further than this one, rad. `count` is the
+        angle of an encoder count, rad.
         """
         slow, command = expected.speed, expected.commanded
         leaves = command - self._command
@@ -221,7 +231,10 @@ def stands(own: float, other: float) -> bool:
 
 
 def reverses(own: float, other: float, count: float) -> bool:
-    """Return whether `own` is about the opposite of `other`. All arguments are in rad."""
+    """Return whether a wheel that turned `own` rad turned about as far as the other, but backwards.
+
+    The other wheel turned `other` rad. `count` is the angle of an encoder count, rad.
+    """
     return own * other < 0.0 and abs(own + other) <= REVERSED * abs(other) + FAULT_COUNTS * count
 
 

@@ -54,13 +54,14 @@ MAX_VARIANCE = 1e9
 """Largest variance of the pose, m2 or rad2. A variance of this size means "unknown"."""
 
 COARSE_COUNTS = 400
-"""Encoder counts per wheel turn that are assumed without a setting. Few encoders have fewer."""
+"""Encoder counts per revolution of a wheel that are assumed if the configuration has no number. Few
+encoders have fewer."""
 
 NOWHERE = PoseCovariance(MAX_VARIANCE, 0.0, 0.0, MAX_VARIANCE, 0.0, MAX_VARIANCE)
 
 GYRO_SCALE = 0.004
-"""Relative standard deviation of a gyro's scale. It causes a heading error of 1.4 degrees after one
-turn, and no error after as many turns to the left as to the right."""
+"""Relative standard deviation of a gyro's scale. An error of this size changes the heading by 1.4
+degrees in one revolution. It has no effect after equal turns to the left and to the right."""
 
 NO_EFFECT: Column = (0.0, 0.0, 0.0, 0.0)
 
@@ -72,18 +73,22 @@ class PoseUncertainty:
     """Computes the covariance of the pose, in plain floats because it is updated at 100 Hz."""
 
     def __init__(self, model: ErrorModel, counts: int) -> None:
-        """Start at the origin. `counts` is the encoder counts per wheel turn, 0 if unknown."""
+        """Start at the origin. `counts`: encoder counts per wheel revolution, 0 if unknown."""
         self._model = model
         self._parameters = self._effects = model.columns
         self._counted = counts > 0
         self._count = 0.0
         self._stand_within(math.tau / (counts or COARSE_COUNTS))
         self._dx = self._dy = self._rolled = 0.0
-        """Motion in odom and rolled distance since the last update of the second-order terms, m."""
+        """Displacement in odom, and distance that the wheels rolled, since the last update of the
+        second-order terms, m."""
         self.set(0.0)
 
     def bend(self) -> None:
-        """Use the present track and columns of the error model, whose number must be unchanged."""
+        """Use the present track and columns of the error model from now on.
+
+        The number of columns must not have changed.
+        """
         beside = self._effects[len(self._parameters) :]
         self._parameters = self._model.columns
         self._effects = (*self._parameters, *beside)
@@ -92,8 +97,8 @@ class PoseUncertainty:
     def _stand_within(self, angle: float) -> None:
         """Set the angle of one encoder count, rad, and compute two effects of this angle.
 
-        One is the dead band of the heading. The other is the uncertainty of the pose, because each
-        wheel may stand anywhere between two counts.
+        The first effect is the dead band of the heading. The second effect is an uncertainty of the
+        pose, because each wheel may stand anywhere between two counts.
         """
         self._count, count, track = angle, self._model.radius * angle, self._model.track
         self._play = count / track
@@ -108,9 +113,11 @@ class PoseUncertainty:
             self._p = added(self._p, *self._phase, self._cos, self._sin)
         self._effects = self._parameters
         self._columns: list[Vector] = [ORIGIN for _ in self._effects]
-        """The columns of J. Those for the gyro's scale and for gaps are added when needed."""
+        """The columns of the matrix J of the module. The columns for the gyro's scale and for gaps
+        are added when needed."""
         self._of_gyro = self._of_gaps = -1
-        """Indices in `_columns` for the gyro's scale and for motion in gaps; -1 without one."""
+        """Indices in `_columns` for the gyro's scale and for motion in gaps; -1 if there is no such
+        column."""
         self._columns_before = self._columns
         self._turned = self._middle = 0.0
         self._second = SecondOrder(len(self._effects))
@@ -127,9 +134,9 @@ class PoseUncertainty:
         """Update the covariance after a step, which is an arc of `distance` m through `turn` rad.
 
         `dx` and `dy` are the displacement in odom, m, and `heading` is the direction of the chord,
-        rad. If a gyro measured the turn, `variance` is its variance, rad2, and `scale` is the
-        relative standard deviation of the gyro's scale. The errors of the parameters then affect
-        only the distance.
+        rad. If a gyro measured the turn, `variance` is the turn's variance, rad2, and `scale` is
+        the relative standard deviation of the gyro's scale. The errors of the parameters then
+        affect only the distance.
         """
         if self._lost:
             self._forget_where(distance, turn)
@@ -183,7 +190,7 @@ class PoseUncertainty:
         self._publish()
 
     def _widen(self) -> int:
-        """Add a column of zeros to J, for an error without an effect so far; return its index."""
+        """Add a column of zeros to J for a further source of error; return the column's index."""
         self._effects = (*self._effects, NO_EFFECT)
         self._columns = [*self._columns, ORIGIN]
         self._columns_before = [*self._columns_before, ORIGIN]

@@ -41,20 +41,23 @@ RECUR, SOUGHT = 3, 1000
 of lines within which it must do so. A single small angle may come from a damaged line."""
 
 LEAST = 0.005
-"""A commanded wheel speed below this, rad/s, counts as zero: a line shows it as 0.00."""
+"""A commanded wheel speed below this, rad/s, counts as zero, because the line to the board has two
+decimals and shows the speed as 0.00."""
 
 ROLLED_S, REPEATED_S = 0.2, 1.0
-"""Time for which wheels must turn without a command before the daemon reports that, and least time
-between two such reports, s. A shorter turn may be the rocking of a robot that comes to rest."""
+"""Time for which wheels must turn without a command before the daemon logs this motion, and
+shortest time between two such log lines, s. A shorter motion may be the rocking of a robot that
+comes to rest."""
 
 SLIP_S = 0.5
 """Time after the last contradiction for which a side still counts as slipping, s."""
 
 SLIP_REPORTED_S = 0.1
-"""Duration of a contradiction between two wheels of a side after which it is logged as slip, s."""
+"""If the two wheels of a side contradict each other for this time, s, the daemon logs slip."""
 
 BACK_S = 0.5
-"""An ignored wheel that agrees for this time of rolling, s, is used for the pose again."""
+"""If an ignored wheel and the other wheel of its side agree while they roll for this time, s, the
+pose uses the ignored wheel again."""
 
 Same = tuple[bool, bool, bool, bool]
 """Whether each wheel reports the same speed as in the line before, in `WHEELS` order."""
@@ -92,7 +95,7 @@ class _Side:
 
     @property
     def text(self) -> str:
-        """Words for the ignored wheel or for the slip of this side, "" without any."""
+        """A text about the ignored wheel or the slip of this side, "" if there is neither."""
         if self.out is not None:
             return (
                 f"{self.left_out} wheel is left out of the pose: it {WORDS[self._fault]}; check "
@@ -104,7 +107,10 @@ class _Side:
 
     @property
     def slow(self) -> list[str]:
-        """Names of the wheels that turn too slowly, each with its ratio, except an ignored one."""
+        """Names of the wheels that turn too slowly, each with the percentage of its expected speed.
+
+        An ignored wheel is not included.
+        """
         return [
             f"{WHEELS[self.wheels[i]]} {witness.ratio:.0%}"
             for i, witness in enumerate(self.witnesses)
@@ -184,7 +190,7 @@ class _Side:
         """Process a line in which the two wheels contradict each other.
 
         Return whether this line has proved a wheel faulty, so that the pose now ignores this wheel.
-        `by_gyro` is the angle of this side according to a trusted gyro, rad.
+        `by_gyro` is the angle that this side rolled according to a trusted gyro, rad.
         """
         self._agreed_s, fault = 0.0, None if self.out is None else self._fault
         if self.out is not None and self.expected.clear:
@@ -241,12 +247,13 @@ class WheelFaults:
     """Checks all wheels, and decides which to ignore and whether any slips."""
 
     def __init__(self, kinematics: Kinematics, counts: int, feedback: FeedbackConfig) -> None:
-        """Start. `counts` are the encoder counts per wheel turn, 0 if unknown."""
+        """Start. `counts` are the encoder counts per revolution of a wheel, 0 if unknown."""
         self._kinematics, self._settings = kinematics, feedback
         self._count = math.tau / counts if counts else COARSEST
         self._seeking, self._period = not counts, PERIOD
         self._least, self._looked = [COARSEST] * RECUR, 0
-        """The `RECUR` smallest angles of a front wheel in the last `_looked` lines, rad."""
+        """The `RECUR` smallest angles that a front wheel rolled in the last `_looked` lines, rad,
+        and the number of these lines."""
         self._sides = self._left, self._right = _Side("left", LEFT), _Side("right", RIGHT)
         self._last = STILL
         self._busy = self._leaves_out = self._stands = False
@@ -274,10 +281,11 @@ class WheelFaults:
         )
 
     def believed(self, wheels: Motors) -> Motors:
-        """Return the wheel values without those of faulty wheels, for the pose.
+        """Return the values of all wheels, with the values of faulty wheels replaced.
 
-        The value of a faulty wheel is replaced by that of the other wheel of its side, times the
-        learned ratio of the two. The values are angles (rad) or speeds (rad/s) in `WHEELS` order.
+        The value of a faulty wheel becomes the value of the other wheel of its side, times the
+        learned ratio of these wheels. The values are angles (rad) or speeds (rad/s) in `WHEELS`
+        order.
         """
         if not self._leaves_out:
             return wheels
@@ -295,7 +303,7 @@ class WheelFaults:
             side.forget()
 
     def watch(self, commanded: WheelSpeeds | None, seen: WheelSpeeds, dt: float) -> str:
-        """Compare the wheel speeds in a line with their commands. The caller then calls `look`.
+        """Compare the wheel speeds in a line with their commands. The caller must then call `look`.
 
         If a wheel has contradicted its command for `feedback.fault_time`, return the reason of the
         fault, which names the wheel. Otherwise return "". `commanded` is None if the motors have no
@@ -344,9 +352,10 @@ class WheelFaults:
     ) -> bool:
         """Compare the wheels of each side, and return whether this line proves a wheel faulty.
 
-        The pose then ignores this wheel, and the caller must find the earlier lines in which it was
-        wrong (`was_faulty`). `turned` contains the wheel angles in the line, rad. `turn` is the
-        turn that the wheels should show according to a gyro, rad; None without a trusted one.
+        The pose then ignores the faulty wheel, and the caller must find the earlier lines in which
+        this wheel was wrong (`was_faulty`). `turned` contains the angles that the wheels rolled in
+        the line, rad. `turn` is the turn that the wheels should show according to a gyro, rad; None
+        without a trusted gyro.
         """
         slow = self._left.late or self._right.late
         if self.events or slow != self._late:
@@ -398,7 +407,8 @@ class WheelFaults:
             return Event("wheel_fault", "every wheel follows its command again", kind="again")
         text = (
             f"wheels slower than commanded: {', '.join(self.status.slow)} of the expected speed; "
-            "check load and battery, limits.wheel_speed and feedback.response_time"
+            "check the load, the battery, and the settings limits.wheel_speed and "
+            "feedback.response_time"
         )
         return Event("wheel_fault", text, "warning", kind="slow")
 
@@ -407,7 +417,7 @@ class WheelFaults:
         return self._found is not None and self._found.was_faulty(before, self._last)
 
     def _seek(self, speeds: WheelSpeeds, dt: float) -> None:
-        """Learn the encoder count: the smallest angle that a wheel often turns in a line."""
+        """Learn the angle of an encoder count: the smallest angle that often occurs in a line."""
         self._period += SMOOTHED * (dt - self._period)
         self._looked += 1
         if self._looked > SOUGHT:
@@ -420,9 +430,10 @@ class WheelFaults:
                 self._seeking = self._count > FINEST
 
     def _by_gyro(self, i: int, turned: Motors, turn: float) -> float:
-        """Return the angle of one side, rad, from the gyro and the other side.
+        """Return the angle that side `i` rolled, computed from the gyro and the other side, rad.
 
-        `i` is 0 for the left side and 1 for the right one. The wheels of the other side must agree.
+        `i` is 0 for the left side and 1 for the right one. The wheels of the other side must agree
+        with each other.
         """
         front_right, front_left, rear_left, rear_right = turned
         return self._kinematics.opposite(

@@ -10,8 +10,8 @@ harmless effects explains the difference:
 - One motor reacts later than the other.
 - The speeds in a feedback line have two decimals.
 
-The comparison uses sums of recent wheel angles, in which older angles have less weight
-(`MEMORY_S`). The wheels contradict each other if
+The comparison uses sums of the angles that the wheels rolled recently. Older angles have less
+weight (`MEMORY_S`). The wheels contradict each other if
 
     |D - r A| > SHARE A + COUNTS c + LEAST
 
@@ -35,10 +35,11 @@ MEMORY_S = 0.14
 """Time after which the weight of an angle in the sums has fallen to 1 / e, s."""
 
 SHARE = 0.05
-"""Allowed fraction by which two wheels differ: half of 10 %, the slip that must be found."""
+"""Allowed fraction by which two wheels differ: half of the slip of 10 % that must be found."""
 
 COUNTS = 1.2
-"""Allowed difference of two wheels in encoder counts. Wheels without slip rarely exceed it."""
+"""Allowed difference of the angles of two wheels, in encoder counts. Wheels without slip rarely
+differ by more."""
 
 LAG_S = 0.03
 """Allowed delay of one motor relative to the other, s."""
@@ -69,14 +70,16 @@ class Residual:
         """Learned fraction by which the front wheel turns further than the rear one."""
         self.learns = True
         self.slips = False
-        """Whether the wheels differ by more than a late motor causes. Valid if `add` was False."""
+        """Whether the wheels differ by more than a late motor can cause. The value is valid only
+        after a call of `add` that returned False."""
         self._off = self._way = self._net = 0.0
 
     def add(self, front: float, rear: float, keep: float, dt: float, count: float) -> bool:
         """Add a feedback line, and return whether the wheels agree.
 
-        `keep` is the factor by which the line reduces the weight of the earlier angles. `front`,
-        `rear` and the encoder count `count` are angles in rad.
+        `front` and `rear` are the angles that the wheels rolled in the line, and `count` is the
+        angle of an encoder count, rad. `keep` is the factor by which the line reduces the weight of
+        the earlier angles.
         """
         mean = (front + rear) / 2
         size = abs(mean) if front * rear >= 0.0 else (abs(front) + abs(rear)) / 2
@@ -96,7 +99,7 @@ class Residual:
         return True
 
     def stand_in(self, front: bool) -> float:
-        """Return the ratio of the wheel angles: front / rear, or its inverse if not `front`."""
+        """Return the ratio of the angles front / rear, or rear / front if `front` is false."""
         more = 1.0 + self.ratio / 2, 1.0 - self.ratio / 2
         return more[0] / more[1] if front else more[1] / more[0]
 

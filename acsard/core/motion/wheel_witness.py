@@ -17,35 +17,37 @@ import math
 from typing import Literal
 
 SLACK = 2.0
-"""Speed below which coarse encoders and a robot at rest can look like any fault, rad/s."""
+"""Smallest speed at which a fault can be recognized, rad/s. Below it, coarse encoders and a robot
+at rest can look like any fault."""
 
 COMMANDED = 0.3
-"""Smallest command that shows which wheel is right, rad/s."""
+"""Smallest commanded speed that can show which of two wheels is right, rad/s."""
 
 SLOWEST = 3.0
 """Response time of a slow robot's wheels, as a multiple of `feedback.response_time`."""
 
 CLEAR = 1.0
-"""Speed that sets the smoothing of the measured speed, rad/s. The time constant is the time in
-which a wheel at this speed turns by one encoder count."""
+"""Wheel speed, rad/s, that determines the smoothing of the measured speed. The time constant of the
+smoothing is the time in which a wheel at this speed turns by one encoder count."""
 
 NEARER = 1.0
 """A wheel counts as obeying if its speed has approached the command by more than this, rad/s."""
 
 RATIO_S = 2.0
-"""Duration of driving over which a wheel's angle is compared with the expected one, s."""
+"""Time of driving, s, after which the angle that a wheel rolled is compared with the angle that it
+should have rolled."""
 
 TOO_SLOW, FAST_ENOUGH = 0.7, 0.8
 """Ratios of measured to expected speed. Below `TOO_SLOW`, a wheel is too slow. Above `FAST_ENOUGH`,
-it no longer is."""
+it is not too slow any more."""
 
 FaultKind = Literal["dead", "reversed", "runaway", "stuck"]
 
 FAULTS: dict[FaultKind, str] = {
     "dead": "does not turn, or its encoder is dead: check cable, motor and encoder, and for "
-    "motor d also mcu.trailing_comma",
-    "reversed": "turns against its command: check the motor's leads, the A and B lines of its "
-    "encoder, and its sign in mcu.wheels",
+    "motor d also the setting mcu.trailing_comma",
+    "reversed": "turns against its command: check the leads of its motor, the wires A and B of its "
+    "encoder, and the wheel's sign in mcu.wheels",
     "runaway": "turns faster than commanded: check the motor driver and the encoder",
     "stuck": "reports a speed that never changes: its encoder is stuck",
 }
@@ -59,7 +61,7 @@ class Expected:
         self._begins = self.settled = self.clear = False
 
     def forget(self) -> None:
-        """Start over with the speed in the next line, because the wheels may still coast."""
+        """Start over: expect the next reported speed, because the wheels may still coast."""
         self.commanded, self._begins, self.clear = 0.0, True, False
 
     def follow(self, commanded: float, front: float, rear: float, dt: float, lag: float) -> None:
@@ -86,9 +88,9 @@ class Witness:
 
     def __init__(self) -> None:
         self.driven = False
-        """Whether any wheel is commanded to turn, or this one still turns after such a command."""
+        """Whether any wheel is commanded to turn, or this wheel still turns after that command."""
         self.ratio = 1.0
-        """Angle turned in the last `RATIO_S` s of driving, divided by the expected one."""
+        """Angle that the wheel rolled in `RATIO_S` of driving, divided by the expected angle."""
         self.slow = False
         """Whether the wheel turns in the right direction, but too slowly."""
         self.forget()
@@ -105,8 +107,9 @@ class Witness:
         # already too fast would never count as slowing down: slow motors latched "runaway" that
         # way.
         self._nearest = math.inf
-        """Deviation from the command when the wheel last approached it, rad/s. It is the speed of a
-        wheel that is too fast, otherwise the speed of the wheel against the commanded direction."""
+        """Deviation from the command when the wheel last approached its command, rad/s. For a wheel
+        that is too fast, the deviation is its speed. Otherwise it is the speed of the wheel in the
+        direction opposite to the command."""
         self._wrong = False
         """Whether the wheel was too fast, stood, or turned against its command in the last line."""
         self._seconds = self._went = self._way = 0.0
@@ -116,7 +119,7 @@ class Witness:
     ) -> bool:
         """Check a line that reports `seen` rad/s; return whether it is evidence of a fault.
 
-        `most` is the longest time for which one line counts as evidence, s. `count` is the angle of
+        `most` is the longest time that one line can add to the evidence, s. `count` is the angle of
         an encoder count, rad. `still` is true if all wheels are commanded to stand.
         """
         goal, command = expected.speed, expected.commanded

@@ -34,15 +34,19 @@ def unpack(data: bytes) -> Attachment:
     """Return the attachment in these bytes. Raises `DecodeError` if it is missing or not valid."""
     if not data:
         raise DecodeError(
-            "no_attachment", "the message has no attachment, but rmw_zenoh adds one to each"
+            "no_attachment",
+            "the message has no attachment, but rmw_zenoh adds one to every message",
         )
     if len(data) != _LAYOUT.size:
         raise DecodeError(
             "bad_attachment",
-            f"an attachment of {len(data)} bytes instead of {_LAYOUT.size}: "
+            f"the message has an attachment of {len(data)} bytes instead of {_LAYOUT.size}: "
             "is the sender's rmw_zenoh older than Jazzy 0.2.4?",
         )
     sequence, stamp_ns, length, gid = _LAYOUT.unpack(data)
     if length != GID_BYTES:
-        raise DecodeError("bad_attachment", f"a GID of {length} bytes instead of {GID_BYTES}")
+        raise DecodeError(
+            "bad_attachment",
+            f"the attachment has a GID of {length} bytes instead of {GID_BYTES}",
+        )
     return Attachment(sequence, stamp_ns, gid)

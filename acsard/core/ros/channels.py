@@ -198,14 +198,16 @@ LOG = Channel("log", "events", "rcl_interfaces/msg/Log", Log, Qos(1000))
 """The topic of the robot's events. Each event is one log message."""
 
 CMD_VEL_IN = Channel(f"cmd_vel_in/{SOURCE}", f"cmd/{SOURCE}", TWIST_STAMPED, TwistStamped)
-"""The topics of the commands, one for each source. The stamp of a message is its arrival time."""
+"""The topics of the commands, one for each source. The stamp of a message is the time at which the
+command arrived."""
 
 BY_KEY: dict[str, Channel] = {**_published(), STATE.native: STATE}
-"""The channels of the messages that `Report` (`messages/report.py`) builds, by native key."""
+"""Maps the native Zenoh key to the channel, for all messages that `Report` (`messages/report.py`)
+builds."""
 
 CHANNELS: tuple[Channel, ...] = (*BY_KEY.values(), CMD_VEL_IN, LOG)
 
 
 def published_channels(silent: Container[str]) -> tuple[Channel, ...]:
-    """Return the channels on which a robot publishes, except the native keys in `silent`."""
+    """Return the channels that a robot publishes, except those with a native key in `silent`."""
     return tuple(channel for channel in CHANNELS if channel.native not in silent)

@@ -66,12 +66,15 @@ def full_name(namespace: str, name: str) -> str:
 
 
 def bridge_key(name: str) -> str:
-    """Return the key of a topic or service with zenoh-bridge-ros2dds. `name` is fully qualified."""
+    """Return the Zenoh key that zenoh-bridge-ros2dds uses for a topic or service.
+
+    `name` is the fully qualified name.
+    """
     return name.removeprefix("/")
 
 
 def rmw_key(domain: int, name: str, type_name: str) -> str:
-    """Return the key of a topic or service with rmw_zenoh_cpp.
+    """Return the Zenoh key that rmw_zenoh_cpp uses for a topic or service.
 
     `name` is fully qualified. `type_name` is the type as `pkg/msg/Name`.
     """
@@ -120,8 +123,8 @@ class Node(Struct, frozen=True):
     def endpoint_token(self, number: int, kind: Kind, name: str, type_name: str, qos: Qos) -> str:
         """Return the liveliness token of an endpoint.
 
-        `number` is that of the endpoint in its session, from 1. `name` is fully qualified, and
-        `type_name` is the type as `pkg/msg/Name`.
+        `number` identifies the endpoint in its session and starts at 1. `name` is fully qualified,
+        and `type_name` is the type as `pkg/msg/Name`.
         """
         return (
             f"{self._head}/{number}/{kind}/%/{_mangled('/' + self.namespace)}/{self.name}"
@@ -134,7 +137,7 @@ class Node(Struct, frozen=True):
 
 
 def rmw_qos(qos: Qos) -> str:
-    """Return a QoS profile as rmw_zenoh_cpp writes it. Default values are left out."""
+    """Return a QoS profile as rmw_zenoh_cpp writes it in a token. Default values are left out."""
     depth = "" if qos.depth == RMW_DEFAULT_DEPTH else qos.depth
     reliability = "2" if qos.best_effort else ""
     return f"{reliability}:{'1' if qos.transient else ''}:,{depth}:,:,:,,"

@@ -57,7 +57,10 @@ class ParameterDescriptor(Struct, frozen=True):
 
 
 def described(name: str, type_of: int) -> ParameterDescriptor:
-    """Return the descriptor of a parameter. `type_of` is its ROS type, 0 if it does not exist."""
+    """Return the descriptor of the parameter `name`.
+
+    `type_of` is the ROS type of the parameter, or 0 if there is no such parameter.
+    """
     if not type_of:
         return ParameterDescriptor(name, type_of)
     return _described(name, type_of)
@@ -79,7 +82,7 @@ def _described(name: str, type_of: int) -> ParameterDescriptor:
         name,
         type_of,
         words if row is None else f"{row.what}: {words}",
-        "only in acsard.toml, with a restart" if row is None else WHEN[row.when],
+        "only in acsard.toml, then restart the daemon" if row is None else WHEN[row.when],
         read_only=row is None,
         floating_point_range=floats,
         integer_range=whole,
@@ -89,7 +92,8 @@ def _described(name: str, type_of: int) -> ParameterDescriptor:
 def kind_of(name: str) -> inspect.Type:
     """Return the declared type of the setting with the dotted key `name`.
 
-    The key of a command source contains its name. Raises `KeyError` for the name of a table.
+    The key of a setting of a command source contains the name of the source, as in
+    `commands.sources.app.timeout`. Raises `KeyError` for the key of a table.
     """
     cls: type[Struct] = Config
     parts = iter(name.split("."))
@@ -109,13 +113,14 @@ def kind_of(name: str) -> inspect.Type:
 
 T = TypeVar("T")
 Some = Annotated[list[T], Meta(max_length=128)]
-"""List of at most 128 parameters to set. A robot has fewer. Decoding a longer list would take too
-much of the time of a control step."""
+"""List with at most 128 items, for the parameters that a request sets. The robot has fewer
+parameters. To decode a longer list would take too much of the time of a control step."""
 Many = Annotated[list[T], Meta(max_length=256)]
-"""List of at most 256 names. It may be longer than `Some`, because names are decoded faster."""
+"""List with at most 256 items, for names of parameters. The limit is higher than that of `Some`,
+because a name is decoded faster than a parameter with its value."""
 
 MAX_REQUEST_BYTES = 16384
-"""Largest size of a request, bytes. A list of all names fits."""
+"""Largest size of a request, bytes. A request that lists the names of all parameters fits."""
 
 NOT_SET, BOOL, INTEGER, DOUBLE, STRING = range(5)
 INTEGER_ARRAY, DOUBLE_ARRAY, STRING_ARRAY = 7, 8, 9
@@ -183,7 +188,7 @@ class Values(Struct, frozen=True):
 
 
 class Types(Struct, frozen=True):
-    """Reply of `get_parameter_types`: the number of the type of each parameter."""
+    """Reply of `get_parameter_types`: the number that ROS gives to the type of each parameter."""
 
     types: list[Unsigned8]
 
@@ -213,15 +218,16 @@ class SetAtomicallyReply(Struct, frozen=True):
 
 
 SETTING = ("set_parameters", "set_parameters_atomically")
-"""The services that set parameters. `Parameters` only reads, so it does not answer them."""
+"""The services that set parameters. The class `Parameters` does not answer these services, because
+it answers only those that read parameters."""
 
 
 def failure(service: str, why: str, request: bytes = b"") -> bytes:
     """Return the reply to a request that is refused.
 
-    Without a reply, the client would wait for ever. A reply to a request that sets parameters gives
-    the reason for each of them. Other replies have no field for a reason, so they are empty, as in
-    rclcpp.
+    Without a reply, the client would wait for ever. If the request sets parameters, the reply gives
+    the reason `why` for each parameter. Other replies have no field for a reason, so they are
+    empty, as in rclcpp.
     """
     refused = SetParametersResult(False, why)
     if service in SETTING:
@@ -240,7 +246,10 @@ def failure(service: str, why: str, request: bytes = b"") -> bytes:
 
 
 class Parameters:
-    """Answers the services that only read parameters, from `tables` as `effective` returns them."""
+    """Answers the services that only read parameters.
+
+    `tables` is the configuration in the form that `core.config.parsing.effective()` returns.
+    """
 
     def __init__(self, tables: Mapping[str, object]) -> None:
         self._values = {name: _value(value) for name, value in flat(tables)}
@@ -252,7 +261,10 @@ class Parameters:
         }
 
     def answer(self, service: str, payload: bytes) -> bytes:
-        """Return the reply to a request, both in CDR. Raises `CdrError` if it is not valid."""
+        """Return the reply to the request `payload`, both in CDR.
+
+        Raises `CdrError` if the request is not valid.
+        """
         return self._services[service](payload)
 
     def _list(self, asked: ListRequest) -> ListReply:
@@ -280,7 +292,10 @@ class Parameters:
 
 
 def wished(payload: bytes) -> dict[str, Plain]:
-    """Return the new values by parameter in a request. Raises `CdrError` if it is not valid."""
+    """Return the values that a request to set parameters contains, by parameter name.
+
+    Raises `CdrError` if the request is not valid.
+    """
     asked = Cdr(SetRequest).decode(payload)
     wishes: dict[str, Plain] = {}
     for parameter in asked.parameters:
@@ -293,8 +308,8 @@ def wished(payload: bytes) -> dict[str, Plain]:
 def outcome(service: str, payload: bytes, successful: bool, reason: str) -> bytes:
     """Return the reply to a request to set parameters.
 
-    The robot sets all or none, so each has the same result. Raises `CdrError` for a request to
-    `set_parameters` that is not valid.
+    The robot sets all parameters of a request or none, so each parameter has the same result.
+    Raises `CdrError` for a request to `set_parameters` that is not valid.
     """
     result = SetParametersResult(successful, reason)
     if service == "set_parameters_atomically":

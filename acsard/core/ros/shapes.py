@@ -79,7 +79,10 @@ class Counter(Struct, frozen=True):
 
 
 class Source(Struct, frozen=True):
-    """A source of commands. `age` is in s, or null before the first command."""
+    """A command source.
+
+    `age` is the time since the last accepted command of the source, s; None before the first one.
+    """
 
     name: str
     priority: Whole

@@ -42,9 +42,9 @@ class RosName(Struct, frozen=True):
     """A ROS topic or service, with the native key (acsard's own) for the same messages."""
 
     name: str
-    """Name relative to the namespace."""
+    """ROS name relative to the robot's namespace."""
     native: str
-    """Native key, below the robot's id."""
+    """Native key without its beginning `acsard/<robot.id>/`."""
     direction: Direction
     """Direction of the native key. In ROS, both "query" and "service" are services."""
     type: str
@@ -94,8 +94,8 @@ PARAMETER_SERVICES = {
 }
 
 PARAMETERS = "parameters/"
-"""Beginning of `RosName.native` for a ROS parameter service, which has no native key of its own.
-The native key `config` returns the same settings."""
+"""Beginning of `RosName.native` for the ROS services that read and set parameters. No such native
+key exists; native clients read the same settings with the key `config`."""
 
 PUBLISHED = (
     RosName("odom", "odom", "out", "nav_msgs/msg/Odometry"),
@@ -115,10 +115,11 @@ SOURCES = {
     "cmd_vel_teleop": "teleop",
     "joint_commands": "ros2_control",
 }
-"""The command source of each topic that commands the robot."""
+"""The command source of each ROS topic that commands the robot."""
 
 URDF = RosName(DESCRIPTION, DESCRIPTION, "out", "std_msgs/msg/String", Qos(1, transient=True))
-"""The topic of the robot's URDF. It is not recorded, so it is not in `PUBLISHED`."""
+"""The topic of the robot's URDF. It is not in `PUBLISHED`, because only the topics in `PUBLISHED`
+are recorded."""
 
 SLOWER = RosName(SPEED_LIMIT, SPEED_LIMIT, "in", "nav2_msgs/msg/SpeedLimit")
 """Subscription to the speed limits of Nav2's speed filter."""
@@ -200,9 +201,9 @@ def endpoints(ros: RosConfig, zid: str, silent: Container[str] = ()) -> tuple[En
 
 
 def node_tokens(ros: RosConfig, zid: str) -> tuple[str, ...]:
-    """Return the tokens that announce the node and the bridge to ROS.
+    """Return the tokens that announce the daemon to ROS: as a bridge, as a node, or as both.
 
-    `zid` is the id of the Zenoh session.
+    `zid` is the id of the daemon's Zenoh session.
     """
     tokens = []
     if ros.bridge and ros.announce:
@@ -234,9 +235,9 @@ def _node(ros: RosConfig, zid: str) -> Node:
 
 
 def _bridge(ros: RosConfig, zid: str, names: tuple[RosName, ...]) -> Iterator[Endpoint]:
-    """Yield one endpoint for each name.
+    """Yield one endpoint of the transport "bridge" for each ROS name.
 
-    A topic with two types is not announced, because a DDS reader has only one type.
+    The endpoint of a topic with two types is not announced, because a DDS reader has only one type.
     """
     for row in names:
         twins = [other for other in names if other.name == row.name]

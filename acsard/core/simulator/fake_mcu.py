@@ -29,8 +29,8 @@ RESET_NS = 2 * NS_PER_S
 """Time for which a board with a bootloader ignores its input after a reset, ns."""
 
 SHORTEST_WINDOW_NS = 4 * MS
-"""Shortest time over which the board computes speeds from encoder counts, ns. A reply that follows
-sooner repeats the last speeds."""
+"""Shortest time over which the board computes speeds from encoder counts, ns. If less time has
+passed since the last computation, a reply repeats the speeds of that computation."""
 
 OUTPUT_BYTES = 255
 """Size of the board's output buffer. The board drops a line that does not fit, as the firmware in
@@ -53,11 +53,15 @@ current lowers the battery voltage by 2 V."""
 NEVER_NS = 2**62
 
 PROCESSING_MS = (2.1, 1.3, 3.7, 1.0, 4.9, 2.6, 1.8, 3.2)
-"""Times from the end of a line to the start of its answer, ms. The board uses them in turn."""
+"""Times from the end of a line from the host to the start of the board's reply, ms. The board uses
+these times in turn."""
 
 
 class FakeMcu(Faults):
-    """The simulated board. Call `advance` at the times that `next_ns` returns, to get its bytes."""
+    """The simulated board.
+
+    Call `advance()` at the times that `next_ns()` returns, to get the bytes that the board sends.
+    """
 
     def __init__(self, config: Config, now_ns: int = 0) -> None:
         super().__init__()
@@ -66,7 +70,8 @@ class FakeMcu(Faults):
         self._counts = config.sim.encoder_counts
         self._wiring = _wiring(config.mcu.wheels)
         self._now_ns = self._moved_ns = now_ns
-        """Monotonic times of the last `advance`, and of the vehicle's present state, ns."""
+        """Monotonic time of the last event or call of `advance()`, and monotonic time up to which
+        the vehicle is simulated, ns."""
         self._events: list[tuple[int, int, str, bytes]] = []
         self._order = count()
         self._processing = cycle(PROCESSING_MS)
@@ -77,20 +82,22 @@ class FakeMcu(Faults):
         self._on_ns = self._boot_until_ns
         self._angles: list[float] = []
         self._seen: list[int] = []
-        """The encoder counts that belong to the wheel angles in `_angles`."""
+        """Encoder counts of the motors a to d at the wheel angles in `self._angles`."""
         self._window = (now_ns, self._encoders())
         self._measured = [0.0] * 4
         self._moved = [0] * 4
         self._counted = [0.0] * 4
         self._replied_ns = now_ns - NS_PER_S
         self.heard: deque[tuple[int, bytes]] = deque(maxlen=4096)
-        """The last received lines, valid or not, each with the monotonic time of its end, ns."""
+        """The last received lines, valid or not, each with the monotonic time, ns, at which its
+        last byte arrived."""
         self.valid_lines = 0
         self._watchdog_trips = 0
         self._checks = False
-        """Whether the host has sent a checked line. Status lines then have a checksum too."""
+        """Whether the host has sent a line with a checksum. If it has, the board adds a checksum to
+        its status lines too."""
         self._bumpers = "." * (len(config.safety.bumpers) or 4)
-        """Field `bumpers` of a status line while none is pressed: a dot for each bumper."""
+        """Field `bumpers` of a status line while no bumper is pressed: a dot for each bumper."""
         self._inputs: tuple[tuple[int, int, str, str], ...] = ()
         """The faults of the inputs: begin (ns), end (ns), field of the status line, and its value.
         The value `silent` leaves the field out of the line. If several faults of one field are on,
@@ -100,7 +107,8 @@ class FakeMcu(Faults):
         self._charge = self._capacity = 1.0
         """State of charge of the battery, 0 to 1, and its capacity, ampere seconds."""
         self._drained_ns = self._rested_ns = now_ns
-        """Times of the last computation of the charge, and of the last zero set points, ns."""
+        """Monotonic times at which the charge was computed last, and at which all set points were
+        zero last, ns."""
         if config.sim.boot_time:
             self._schedule(self._boot_until_ns, "booted", b"")
         self._lasting = ExitStack()
@@ -109,7 +117,10 @@ class FakeMcu(Faults):
 
     @property
     def vehicle(self) -> Vehicle:
-        """The robot at the time of the last `advance`. Its motion is computed only when needed."""
+        """The simulated robot at the time of the last call of `advance()`.
+
+        Its motion up to that time is computed only when this property is read.
+        """
         self._catch_up()
         return self._vehicle
 
@@ -135,7 +146,10 @@ class FakeMcu(Faults):
         self._in_free_ns = start + wire_ns(len(data), self.baud_rate)
 
     def next_ns(self) -> int | None:
-        """Return the monotonic time of the next event, ns, or None if there is none."""
+        """Return the monotonic time, ns, at which to call `advance()` next.
+
+        Returns None if the board has nothing to do until the next call of `receive()`.
+        """
         return self._events[0][0] if self._events else None
 
     def advance(self, now_ns: int) -> bytes:
@@ -263,7 +277,11 @@ class FakeMcu(Faults):
         self._schedule(self._out_free_ns, "sent", data)
 
     def _handed_over(self, now_ns: int, what: str, data: bytes) -> bytes:
-        """Return the bytes that the USB adapter passes on now. `what` is "batch" for its timer."""
+        """Return the bytes that the USB adapter passes on to the host at `now_ns`.
+
+        `what` is "batch" if the timer of the adapter has expired, and "sent" if `data` has arrived
+        from the board.
+        """
         until_ns = self._stalled_until(now_ns)
         if until_ns > now_ns:
             self._schedule(until_ns, what, data)
@@ -337,7 +355,7 @@ class FakeMcu(Faults):
             self._send(now_ns, self._damaged(protocol.status(fields, self._checks)))
 
     def _tell_battery(self, now_ns: int) -> None:
-        """Drain the battery for the time since the last call, and send a status line about it."""
+        """Drain the battery for the time since the last call, and send its values to the host."""
         seconds, self._drained_ns = (now_ns - self._drained_ns) / NS_PER_S, now_ns
         turning = sum(map(abs, self.vehicle.set_points))
         if not turning:
@@ -362,36 +380,49 @@ class FakeMcu(Faults):
         return self._input("estop", "ok")
 
     def estop_pressed(self, after_s: float, length_s: float) -> Fault:
-        """Press the emergency stop after `after_s` s for `length_s` s (0 s: for ever)."""
+        """Press the emergency stop `after_s` s after this fault is switched on.
+
+        The stop is released `length_s` s later. If `length_s` is 0, the stop stays pressed.
+        """
         return self._input("estop", "pressed", after_s, length_s)
 
     def estop_silent(self, after_s: float, length_s: float) -> Fault:
-        """Make the board report a released emergency stop, and then no longer report it.
+        """Make the board report a released emergency stop, and then omit these reports.
 
-        The reports end after `after_s` s, and begin again `length_s` s later. If `length_s` is 0,
-        they do not begin again.
+        The reports end `after_s` s after this fault is switched on, and begin again `length_s` s
+        later. If `length_s` is 0, they do not begin again.
         """
         return self._input("estop", "silent", after_s, length_s)
 
     def bumpers(self) -> Fault:
-        """Make the board report the bumpers of `safety.bumpers`, or else four, as released."""
+        """Make the board report that all bumpers are released.
+
+        The bumpers are those in `safety.bumpers`, or four bumpers if that list is empty.
+        """
         return self._input("bumpers", self._bumpers)
 
     def bumper_pressed(self, number: float, after_s: float, length_s: float) -> Fault:
-        """Press bumper `number` (from 1) after `after_s` s for `length_s` s (0 s: for ever)."""
+        """Press bumper `number` (from 1) `after_s` s after this fault is switched on.
+
+        The bumper is released `length_s` s later. If `length_s` is 0, the bumper stays pressed.
+        """
         marks = ["X" if i == number else mark for i, mark in enumerate(self._bumpers, 1)]
         return self._input("bumpers", "".join(marks), after_s, length_s)
 
     def bumpers_silent(self, after_s: float, length_s: float) -> Fault:
-        """Make the board report released bumpers, and then no longer report them.
+        """Make the board report released bumpers, and then omit these reports.
 
-        The reports end after `after_s` s, and begin again `length_s` s later. If `length_s` is 0,
-        they do not begin again.
+        The reports end `after_s` s after this fault is switched on, and begin again `length_s` s
+        later. If `length_s` is 0, they do not begin again.
         """
         return self._input("bumpers", "silent", after_s, length_s)
 
     def driver_fault(self, after_s: float, length_s: float) -> Fault:
-        """Make the board report a driver fault `after_s` s later for `length_s` s (0: for ever)."""
+        """Make the board report a fault of the motor driver.
+
+        The reports begin `after_s` s after this method switches the fault on, and end `length_s` s
+        later. If `length_s` is 0, they do not end.
+        """
         return self._input("driver", "fault", after_s, length_s)
 
     @contextmanager

@@ -81,7 +81,10 @@ class Faults:
         """Simulate the vehicle up to now. `FakeMcu` implements this."""
 
     def _hit(self, what: str, every: int) -> bool:
-        """Count an event of kind `what`. Return whether it is an `every`-th one; 0 means never."""
+        """Count an event of kind `what`, and return True for every n-th one, where n is `every`.
+
+        If `every` is 0, always return False.
+        """
         self._passed[what] += 1
         return every > 0 and self._passed[what] % every == 0
 
@@ -92,7 +95,7 @@ class Faults:
         return b"%b%c%b" % (data[:place], data[place] ^ 1 << bit, data[place + 1 :])
 
     def having(self, fault: NamedFault) -> Fault:
-        """Return the context manager of a fault that `[sim] faults` or `--fault` names."""
+        """Return the context manager that switches on a fault from `[sim] faults` or `--fault`."""
         block: Fault = getattr(self, fault.name)(*fault.values)
         return block
 
@@ -154,11 +157,14 @@ class Faults:
         return self._with(drives=[0.0 if i == wheel else d for i, d in enumerate(self.drives)])
 
     def pushed(self, speed: float) -> Fault:
-        """Simulate a person who pushes the robot straight at `speed` m/s, against its motors."""
+        """Simulate a person who pushes the robot straight at `speed` m/s.
+
+        The motors have no effect while the person pushes.
+        """
         return self._with(push=speed)
 
     def slow_reply(self, delay_s: float = 0.03) -> Fault:
-        """Make the board obey and answer each line `delay_s` s later."""
+        """Make the board obey and answer each line `delay_s` s later than usual."""
         return self._with(extra_delay_ns=int(delay_s * NS_PER_S))
 
     def sparse_replies(self, period_s: float = 0.1) -> Fault:
@@ -182,11 +188,14 @@ class Faults:
         return self._with(ending=",\r\n")
 
     def comma_latched(self) -> Fault:
-        """Make the board obey each value before a comma and ignore checksums, like old firmware."""
+        """Make the board obey each value that a comma follows, and ignore checksums.
+
+        Old firmware does this too.
+        """
         return self._with(understand=protocol.latched)
 
     def no_check(self) -> Fault:
-        """Make the board ignore checksums: it obeys checked lines, but sends plain replies."""
+        """Make the board obey lines with a checksum without checking it, and reply without one."""
         return self._with(understand=protocol.prefix)
 
     def plain_only(self) -> Fault:
@@ -218,7 +227,10 @@ class Faults:
         return self._with(lose_command=every)
 
     def bit_errors(self, every: int = 7) -> Fault:
-        """Flip a different bit in every n-th line of both directions, where n is `every`."""
+        """Flip one bit in every n-th line of both directions, where n is `every`.
+
+        The place of the bit in the line changes each time.
+        """
         return self._with(bit_error=every)
 
     def ftdi(self, latency_s: float = 0.016) -> Fault:

@@ -1,7 +1,8 @@
 """The serial protocol as the board implements it: the lines that it obeys, and its answers.
 
-There is a decoder for each kind of firmware; `whole` is the reference firmware. A checked line is a
-plain line with a suffix: a sequence number and a checksum. The module shares no code with the host.
+There is a decoder for each kind of firmware; `whole()` is that of the reference firmware. A checked
+line is a plain line with a suffix: a sequence number and a checksum. The module shares no code with
+the host.
 """
 
 from __future__ import annotations
@@ -63,7 +64,10 @@ def prefix(line: bytes) -> Command | None:
 
 
 def latched(line: bytes) -> Command:
-    """Decode a line like old firmware: it obeys each value before a comma, even in a bad line."""
+    """Decode a line like old firmware, which obeys each value that a comma follows.
+
+    Such firmware obeys these values even if the rest of the line is not valid.
+    """
     values = {}
     for token in line.split(b",")[:-1]:
         motor, sign = token[:1], token[1:2]
@@ -131,8 +135,8 @@ def status(fields: Mapping[str, str], check: bool) -> bytes:
 def identity(counts: int, watchdog_ms: int, sample: bool) -> bytes:
     """Return the line with which the firmware identifies itself.
 
-    `counts` is the number of encoder counts per wheel turn. `sample` says whether the firmware can
-    add its time and encoder counts to its replies.
+    `counts` is the number of encoder counts per wheel revolution. `sample` says whether the
+    firmware can add its time and encoder counts to its replies.
     """
     text = f"!acsard-mcu 1 counts={counts} watchdog_ms={watchdog_ms} check=1 sample={int(sample)}"
     return text.encode() + b"\r\n"

@@ -31,7 +31,7 @@ class Sight(Struct, frozen=True):
 
 
 class WatchedMcu(FakeMcu):
-    """A `FakeMcu` that calls `see` with an observation a hundred times per simulated second."""
+    """A `FakeMcu` that passes an observation to the callback `see` every 10 simulated ms."""
 
     def __init__(self, config: Config, now_ns: int, see: Callable[[Sight], None]) -> None:
         super().__init__(config, now_ns)
@@ -43,7 +43,7 @@ class WatchedMcu(FakeMcu):
         """Times (ns) and angles turned until then (rad), as far back as the delayed gyro needs."""
 
     def next_ns(self) -> int:
-        """Return the monotonic time of the next event or observation, ns."""
+        """Return the monotonic time, ns, at which to call `advance()` next."""
         due_ns = super().next_ns()
         return self._look_ns if due_ns is None else min(due_ns, self._look_ns)
 

@@ -55,7 +55,11 @@ class Vehicle:
         """Fraction of each set point that the motors do not reach, 0 to 1."""
 
     def advance(self, dt: float, push: float | None = None) -> None:
-        """Move the robot for `dt` s by its set points, or pushed by a person at `push` m/s."""
+        """Move the robot for `dt` s according to its set points.
+
+        If `push` is not None, a person pushes the robot at `push` m/s, and the set points have no
+        effect.
+        """
         if dt <= 0.0:
             return
         if push is None and not (any(self.set_points) or any(self.speeds)):

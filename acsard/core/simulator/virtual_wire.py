@@ -1,7 +1,7 @@
 """A serial connection to the simulated board in virtual time, in which waiting takes no real time.
 
-`acsard mcu check` can use it in place of a serial port (`checkup.board.Wire`). With a wrong baud
-rate, the bytes of both directions arrive garbled.
+`acsard mcu check` can use this connection in place of a serial port (`checkup.board.Wire`). With a
+wrong baud rate, the bytes of both directions arrive garbled.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class VirtualWire:
         return self._now_ns
 
     def late_ns(self) -> int:
-        """Return 0, because in virtual time nothing waits for a processor."""
+        """Return 0, because in virtual time a busy processor delays nothing."""
         return 0
 
     def send(self, data: bytes) -> None:
@@ -42,7 +42,10 @@ class VirtualWire:
         self.mcu.receive(self._now_ns, garbled(data, self._baud_rate, self.mcu.baud_rate))
 
     def listen(self, until_ns: int) -> list[Piece]:
-        """Let time pass up to `until_ns`, and return the received pieces with their times, ns."""
+        """Let time pass up to `until_ns`, and return the bytes that the host received in that time.
+
+        Each piece is the virtual time of its arrival, ns, and its bytes.
+        """
         pieces = []
         while (due_ns := self.mcu.next_ns()) is not None and due_ns <= until_ns:
             due_ns = max(due_ns, self._now_ns)

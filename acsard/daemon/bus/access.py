@@ -162,7 +162,8 @@ class _Keys:
     def commands_by(self, certificate: str) -> list[str]:
         """Return the command keys of all sources for the certificate with this common name.
 
-        "*" gives the keys of all certificates: a router forwards the commands of every client.
+        "*" gives the keys of all certificates. A router needs these keys, because it forwards the
+        commands of every client.
         """
         return [full_key(self._robot, key) for key in source_keys(self._sources, certificate)]
 
@@ -179,7 +180,8 @@ class _Keys:
         if row_of(native) is None:
             # `least_role` would let every role use the ROS key.
             raise LookupError(
-                f"the table of keys has no row for {native}, the key of {endpoint.key}"
+                f"the table of keys has no row for {native}, which the daemon uses for the ROS "
+                f"key {endpoint.key}"
             )
         return least_role(native)
 

@@ -74,11 +74,11 @@ def _config_of_environment() -> Config:
         return parse(Path(file).read_bytes() if file else b"", given)
     except OSError as error:
         raise UsageError(
-            f"cannot read {file}, the file in ACSARD_CONFIG: {error.strerror}; name an existing "
-            "file, or unset ACSARD_CONFIG"
+            f"cannot read {file}, which ACSARD_CONFIG names: {error.strerror}; set ACSARD_CONFIG "
+            "to an existing file, or unset it"
         ) from None
     except ConfigError as error:
-        where = f"{file}, the file in ACSARD_CONFIG" if file else "the environment"
+        where = f"{file}, which ACSARD_CONFIG names" if file else "the environment"
         raise UsageError(f"{where}: {'; '.join(error.problems)}") from None
 
 

@@ -35,7 +35,8 @@ OPEN_TIMEOUT_S = 10.0
 CLOSE_TIMEOUT_S = 0.3
 
 TWIN_TIMEOUT_S = 0.5
-"""Time to look for another daemon with this robot's id or ROS names at the start, s."""
+"""Time for which a starting daemon looks for another daemon with the same robot id or the same ROS
+names, s."""
 
 
 class ZenohBus:
@@ -204,7 +205,10 @@ class ZenohBus:
 
 
 def _others(session: zenoh.Session, alive: str, claims: tuple[str, ...]) -> set[str]:
-    """Return those of these tokens that other sessions hold. Block up to `TWIN_TIMEOUT_S`."""
+    """Return the tokens among `alive` and `claims` that other sessions hold.
+
+    Blocks for up to `TWIN_TIMEOUT_S`.
+    """
     liveliness = session.liveliness()
     subscribers = {
         token: liveliness.declare_subscriber(token, history=True) for token in (alive, *claims)

@@ -33,7 +33,8 @@ class CertificateFiles:
     def __init__(self, authority: Path, certificate: Path, key: Path) -> None:
         """Record the state of the files.
 
-        The process must read the files after this, or a replacement in between goes unnoticed.
+        The process must read the files only after this call. Otherwise a replacement between the
+        reading and this call goes unnoticed.
         """
         self._files = authority, certificate, key
         self._used = self._seen = self._signature()
@@ -78,10 +79,11 @@ again at the next reading of the robot's files."""
 
 
 def ends_of(routers: Iterable[str], directory: str) -> dict[str, int]:
-    """Return when the certificates of those routers that answer expire, ns since 1970.
+    """Return the expiry time of each router's certificate, ns since 1970.
 
-    The keys of the result are names for messages, like "the router tls/HOST:PORT". `directory`
-    contains the certificate with which this machine connects.
+    A router that does not answer is left out. The dict keys of the result are names of the routers
+    for messages, like "the router tls/HOST:PORT". `directory` contains the certificate with which
+    this machine connects.
     """
     found = {f"the router {one}": peer_ends_ns(one, directory) for one in routers}
     return {whose: ends_ns for whose, ends_ns in found.items() if ends_ns is not None}

@@ -23,7 +23,7 @@ from acsard.daemon.bus.tls import common_name
 from acsard.host import clock
 
 WHOAMI_S, WHOAMI_MORE_S = 2.0, 0.3
-"""Time to wait for the first answer, and then for further answers, s."""
+"""Time to wait for the first answer to the queries for the role, and then for other answers, s."""
 
 Ask = Callable[[str, Callable[[zenoh.Sample], object]], None]
 """Function that queries a key, and passes each sample of the answer to the callback."""
@@ -55,19 +55,21 @@ class Identity(Struct, frozen=True):
 
     @property
     def silence(self) -> str:
-        """The likeliest reasons why no key answered; "" with a role or without a certificate.
+        """The likeliest reasons why no key answered, in words.
 
-        A client cannot distinguish a robot that is absent, a robot that hangs, and a robot that
-        does not list the client's certificate.
+        "" if a key answered (the client then has a role) or if the client has no certificate. A
+        client cannot distinguish a robot that is absent, a robot that hangs, and a robot that does
+        not list the client's certificate.
         """
         return "" if self.role or not self.certificate else self._nobody()
 
     def _nobody(self) -> str:
         where = f" at {self.endpoint}" if self.endpoint else ""
         key = full_key(self.robot, whoami_key(ROLES[0])) if self.robot else ""
-        robot = f" as '{self.robot}'{where} (asked: {key})" if key else where
+        robot = f" as '{self.robot}'{where} (queried key: {key})" if key else where
         message = (
-            f"no daemon answers{robot}: is --id right, and does that robot's daemon run and answer?"
+            f"no daemon answers{robot}: is --id right, and is that robot's daemon running and not "
+            "stuck?"
         )
         if not self.certificate:
             return message
@@ -84,7 +86,7 @@ class Identity(Struct, frozen=True):
         owner = (
             f"your certificate {self.certificate} has the role"
             if self.certificate
-            else "you have no certificate for this link and have the role"
+            else "you connect without a certificate and have the role"
         )
         return f"{owner} {self.role}: {MAY[self.role]}"
 

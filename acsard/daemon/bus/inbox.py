@@ -169,7 +169,8 @@ class Inbox:
         self._others: deque[Query] = deque()
         """Native queries that are neither services nor slow."""
         self._slow: deque[Query] = deque()
-        """Slow queries: ROS parameters and settings. One takes as long as all others of a step."""
+        """Slow queries: ROS parameters and settings. To answer one of them takes as long as to
+        answer all other queries of a step."""
         self._lost = dict.fromkeys(self._arrivals, 0)
         """For each buffer, the number of displaced samples at the last `take`."""
         self._any = False
@@ -213,7 +214,10 @@ class Inbox:
         self._arrived(sample, key, str(sample.encoding), "native")
 
     def on_ros_sample(self, endpoint: Endpoint, sample: zenoh.Sample) -> None:
-        """Queue a sample of a ROS key as one of the native key, with the encoding of `endpoint`."""
+        """Queue a sample of a ROS key as if it had arrived on the native key of `endpoint`.
+
+        A sample of ROS has no encoding, so `endpoint.encoding` is used.
+        """
         key = str(sample.key_expr)
         native = endpoint.native if key == endpoint.key else key
         self._arrived(sample, native, endpoint.encoding, endpoint.transport)

@@ -37,8 +37,8 @@ slot holds 0.16 s of odometry. A busy machine or a client that connects usually 
 for a shorter time."""
 
 STUCK_NS = NS_PER_S // 4
-"""Longest time of a round of puts, ns, before the bus counts as blocked. A round sends all waiting
-messages, and usually takes 0.1 ms."""
+"""If a round of puts takes longer than this time, ns, the bus counts as blocked. A round sends all
+waiting messages, and usually takes 0.1 ms."""
 
 HEARTBEAT = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5)
 """Heartbeat of the publishers of latched ROS topics, with the settings of rmw_zenoh."""

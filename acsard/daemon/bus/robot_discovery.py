@@ -99,7 +99,10 @@ def nobody(endpoint: str) -> str:
             "wildcards = true on the robots. If that does not help, your certificate has no role "
             "at any robot: `acsard whoami --id robot1` shows its role"
         )
-    return f"no robot is visible at {endpoint}; does a daemon run there, or behind that router?"
+    return (
+        f"no robot is visible at {endpoint}; is a daemon running there, or is a daemon connected "
+        "to a router there?"
+    )
 
 
 def follow(session: zenoh.Session, ids: Sequence[str], name: str) -> Subscription:
@@ -141,8 +144,8 @@ def explain_silence(key: str, robot_id: str, endpoint: str, presence: Presence) 
     """Return why no sample arrives on `key` (the part below the robot's id), and how to fix it."""
     if not presence.linked:
         return (
-            f"the endpoint {endpoint} has no connection any more: the daemon or router there has "
-            "ended (`acsard run` starts a daemon), or the network is interrupted"
+            f"the connection to {endpoint} is lost: the daemon or router there has ended "
+            "(`acsard run` starts a daemon), or the network is interrupted"
         )
     if presence.here:
         return f"robot {robot_id} is there, but {_silent(key)}"
@@ -150,17 +153,17 @@ def explain_silence(key: str, robot_id: str, endpoint: str, presence: Presence) 
         # With a cutoff of 0.0 no robot is excluded, and the most similar ids come first.
         near = get_close_matches(robot_id, presence.others, MAX_NAMED, 0.0)
         more = len(presence.others) - len(near)
-        named = ", ".join(near) + (f" and {more} more (`acsard fleet`)" if more else "")
+        named = ", ".join(near) + (f" and {more} more (`acsard fleet` lists them)" if more else "")
         return f"there is no robot {robot_id}. Robots here: {named}; use --id {near[0]}"
     if endpoint.startswith(TLS):
         return (
             f"robot {robot_id} is not visible: no robot at {endpoint} has this robot.id, or your "
-            f"certificate does not permit it; `acsard whoami --id {robot_id}` shows the role of "
-            "your certificate"
+            f"certificate does not permit you to see the robot; `acsard whoami --id {robot_id}` "
+            "shows the role of your certificate"
         )
     return (
-        f"no robot is visible at {endpoint}: no daemon runs there or behind that router; "
-        "`acsard run` starts a daemon"
+        f"no robot is visible at {endpoint}: no daemon is running there, and no daemon is "
+        "connected to a router there; `acsard run` starts a daemon"
     )
 
 
@@ -169,7 +172,7 @@ def _silent(key: str) -> str:
     if row is None:
         return f"it has no such key ({key_hint(key)})"
     if row.direction == "in":
-        return f"no program sends on {key} now"
+        return f"no program sends on the Zenoh key {key} now"
     if row.simulated:
         return f"only the simulator publishes {key}"
     if row.urdf:

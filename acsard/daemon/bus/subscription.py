@@ -30,7 +30,7 @@ class Arrivals(Mailbox[zenoh.Sample]):
         """Return the next sample, None if none waits; raise `ZError` if the session has closed."""
         sample = self.pop()
         if sample is None and self.closed and not self.waiting:
-            raise zenoh.ZError("the session has been closed")
+            raise zenoh.ZError("the Zenoh session has been closed")
         return sample
 
     def undeclare(self) -> None:

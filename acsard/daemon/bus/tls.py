@@ -41,8 +41,8 @@ def require_usable(directory: str) -> None:
             file.read_bytes()
         except PermissionError:
             raise NotPermittedError(
-                f"no permission to read {file}: use sudo, or make your own copies; a service "
-                "gets its copies from the drop-in deploy/systemd/lan.conf",
+                f"no permission to read {file}: use sudo, or make copies that you may read; a "
+                "systemd service gets its copies from the drop-in deploy/systemd/lan.conf",
             ) from None
         except OSError as error:
             raise CertificateError(
@@ -136,14 +136,14 @@ NO_CHECK_TIME = 0x200000
 """OpenSSL's flag X509_V_FLAG_NO_CHECK_TIME, which Python's `ssl` does not name."""
 
 AUTHORITY = "the authority"
-"""Key of the authority's certificate in the result of `ends`."""
+"""Dict key that stands for the authority's certificate in the result of `ends()`."""
 
 
 def ends(directory: str) -> dict[str, int]:
     """Return when the certificates in `directory` expire, ns since 1970.
 
-    The key "" stands for the directory's own certificate, and `AUTHORITY` for that of its
-    authority. Returns {} if a file cannot be read or the optional library is missing.
+    The dict key "" stands for `certificate.pem`, and `AUTHORITY` for `ca.pem`. Returns {} if a
+    file cannot be read or the optional library is missing.
     """
     try:
         from cryptography import x509
@@ -163,7 +163,7 @@ def ends(directory: str) -> dict[str, int]:
 def peer_ends_ns(endpoint: str, directory: str) -> int | None:
     """Return when the certificate of the program at a TLS endpoint expires, ns since 1970.
 
-    Nothing is verified, so that this also works for an expired certificate. Returns None if the
+    The certificate is not verified, so that this also works if it has expired. Returns None if the
     program cannot be reached or the optional library is missing. Blocks for up to twice
     `PATIENCE_S`.
     """
@@ -211,7 +211,8 @@ def _place(endpoint: str) -> tuple[str, str]:
 
 
 PATIENCE_S = 2.0
-"""Time limit for the server to accept the connection, s. Its TLS answer has the same limit."""
+"""Time limit for the server to accept the TCP connection, s. Each answer of the server in the TLS
+handshake has the same limit."""
 
 REFUSAL_S = 0.5
 """Time to wait after the TLS handshake for a rejection of the client's certificate, s. A server
@@ -235,8 +236,8 @@ def trouble(endpoint: str, directory: str) -> str:
     except socket.gaierror:
         return (
             f"the name {host} does not resolve on this machine; write the robot's IP address "
-            "(`hostname -I` prints it there; its certificate must contain it), or fix DNS, mDNS "
-            "or /etc/hosts"
+            "(`hostname -I` on the robot prints it; the robot's certificate must contain this "
+            "address), or fix DNS, mDNS or /etc/hosts"
         )
     except TimeoutError:
         return (
@@ -250,8 +251,8 @@ def trouble(endpoint: str, directory: str) -> str:
                 "this network, is the address right?"
             )
         return (
-            f"no program listens on port {port} of {host} ({error}); does the robot's "
-            "bus.listen have this address?"
+            f"no program listens on port {port} of {host} ({error}); does bus.listen in the "
+            "robot's acsard.toml contain this address?"
         )
     with plain:
         return _tls_trouble(plain, host, directory)
@@ -285,13 +286,14 @@ def _server_rejected(error: ssl.SSLCertVerificationError, host: str, directory: 
             return (
                 f"the certificate of {host} has expired, according to this machine's clock "
                 f"({now}); if the clock is right, run `acsard tls renew` on the machine that has "
-                "ca-key.pem (with `--name NAME` for a robot of a fleet); it prints the next step"
+                "ca-key.pem (with `--name NAME` for a robot of a fleet); this command prints the "
+                "next step"
             )
         case code if code == NOT_YET:
             return (
                 f"the certificate of {host} is not valid yet, according to this machine's clock "
-                f"({now}); either set this clock (`timedatectl`), or set the clock of the machine "
-                "that made the certificate and then renew the certificate"
+                f"({now}); either correct this machine's clock (`timedatectl`), or correct the "
+                "clock of the machine that made the certificate and then renew the certificate"
             )
         case code if code in (WRONG_NAME, WRONG_ADDRESS):
             return (
@@ -300,8 +302,9 @@ def _server_rejected(error: ssl.SSLCertVerificationError, host: str, directory: 
                 "robot; the command says what to do next"
             )
     return (
-        f"the certificate of {host} comes from another authority than {directory}/{CA} "
-        f"({error.verify_message}); get a directory that `acsard tls add` made for this robot"
+        f"the certificate of {host} was signed by another authority than {directory}/{CA} "
+        f"({error.verify_message}); use a certificate directory that `acsard tls add` made for "
+        "this robot"
     )
 
 

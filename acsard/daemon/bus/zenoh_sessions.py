@@ -23,9 +23,9 @@ from acsard.host.terminal_modes import coloured
 
 COMMAND_RATE_HZ = 1000.0
 """Largest number of commands per second that a session accepts on each key. It allows a zero
-command 1 ms after another command, and is so low that a flood does not cost a control period. The
-TLS gateway also applies it to stops. Dropping a stop beyond the limit is safe, because another stop
-came less than a millisecond before."""
+command 1 ms after another command. It is so low that a flood does not make the daemon miss a
+control period. The TLS gateway also applies the limit to stops. Dropping a stop beyond the
+limit is safe, because another stop came less than a millisecond before."""
 
 MAX_SESSIONS = 256
 """Largest number of connections of the daemon's session, and of the TLS gateway's session."""
@@ -100,7 +100,11 @@ def certificate_trouble(authority: Path, certificate: Path, key: Path) -> str:
 
 
 def reachable(endpoint: str) -> str:
-    """Return `endpoint` with the loopback address if it listens on all addresses."""
+    """Return the endpoint to which a program on this machine can connect.
+
+    This is `endpoint` with the loopback address in place of 0.0.0.0 or [::], which stand for all
+    addresses of the machine.
+    """
     return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 
 
@@ -141,7 +145,7 @@ def _opened(settings: dict[str, object], where: tuple[str, ...]) -> zenoh.Sessio
     except zenoh.ZError as error:
         raise InUseError(
             f"cannot listen on {', '.join(where)}: {first_line(error)}; if another daemon or "
-            "router uses the address, stop that program, or give this one another address with "
+            "router uses the address, stop that program, or give this daemon another address with "
             "--listen or in bus.listen",
         ) from error
 
@@ -187,8 +191,8 @@ def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
             f"no daemon answers at {endpoint}: "
             + (
                 reason
-                or "is `acsard run` running, does its bus.listen have this address, are fewer "
-                f"than {MAX_SESSIONS} clients connected? ({first_line(error)})"
+                or "is `acsard run` running there, does its bus.listen contain this address, and "
+                f"are fewer than {MAX_SESSIONS} clients connected? ({first_line(error)})"
             )
         ) from None
 

@@ -30,7 +30,7 @@ EXAMPLE = "robot1"
 """Id of the robot in the template."""
 
 IS_FOR = "// It is for {}. For yours:\n"
-"""Line at the head of the template and of the router's file. The ids of the robots replace {}."""
+"""Line near the top of the template and of the router's file. The robots' ids replace {}."""
 
 _BLOCK = re.compile(r"^ *// ROBOT\n(.*?)^ *// END\n", re.M | re.S)
 _NAME = re.compile(rf"\b{EXAMPLE}\b")
@@ -90,7 +90,7 @@ ROUTER_EVENTS: Events = {
 }
 
 CERTIFICATE_FILES = ("root_ca_certificate", "listen_certificate", "listen_private_key")
-"""Keys of Zenoh's `transport/link/tls` that name the files of a listening endpoint."""
+"""Settings in Zenoh's `transport/link/tls` that name the files of a listening endpoint."""
 
 AN_ADDRESS = re.compile(r"^(tcp|tls|udp|quic|ws)/[^?#]*")
 """Matches the protocol and the address of an endpoint, without its settings."""
@@ -157,8 +157,8 @@ class Router(Listener):
     def open(self) -> zenoh.Session:
         """Open the router's session and listen.
 
-        Raises `InUseError` if an address is in use or absent. Raises `RouterFileError` if the file
-        must be corrected.
+        Raises `InUseError` if an address is in use, or is not an address of this machine. Raises
+        `RouterFileError` if the file must be corrected.
         """
         try:
             return zenoh.open(self._config)
@@ -170,13 +170,14 @@ class Router(Listener):
                 ) from error
             raise InUseError(
                 f"cannot listen on {self.where}: {reason(error)}; end the program that uses the "
-                "address, or name addresses of this machine in listen: { endpoints: [...] }"
+                "address, or write addresses of this machine into listen: { endpoints: [...] } of "
+                "the router's file"
             ) from error
 
     def _opens_elsewhere(self) -> bool:
-        """Return whether Zenoh accepts the configuration if it listens on free loopback ports.
+        """Return whether Zenoh accepts the configuration with free loopback ports as addresses.
 
-        If it does, only the configured addresses are at fault, which Zenoh does not report.
+        If it does, only the configured addresses are at fault. Zenoh's own error does not say so.
         """
         config = zenoh.Config.from_file(str(self._file))
         free = [AN_ADDRESS.sub(r"\1/127.0.0.1:0", endpoint) for endpoint in self._endpoints]

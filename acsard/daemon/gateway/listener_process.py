@@ -36,17 +36,18 @@ millisecond."""
 
 FIRST_NS = 5 * NS_PER_S
 """Time within which the daemon must connect after the session has been opened, ns. It is longer
-than `ALONE_NS`, because the other clients connect at the same time."""
+than `ALONE_NS`, because all other clients connect at that time too."""
 
 ALONE_NS = NS_PER_S
-"""Time within which a lost daemon must connect again, ns. Otherwise the process restarts."""
+"""Time within which the daemon must connect again after its connection was lost, ns. If it does
+not, this process restarts."""
 
 REPORTS = Rate(1 / 60)
 """Largest rate of events that report that all connections are taken: one a minute."""
 
 MAX_UNANSWERED = 4
-"""Number of consecutive queries without an answer within 1 s that show a dead connection to the
-daemon. Such a connection is still open, but its data does not reach the daemon."""
+"""If the daemon leaves this number of consecutive queries unanswered for 1 s each, the connection
+to it counts as dead. Such a connection is still open, but its data does not reach the daemon."""
 
 NAMES = 5
 """Largest number of clients that an event names: those with the most connections."""
@@ -82,7 +83,11 @@ class SessionHealth:
     """The health of the session, derived from its successive observations."""
 
     def __init__(self, most: int, opened_ns: int, events: Events = GATEWAY_EVENTS) -> None:
-        """Start at the monotonic time `opened_ns`. `most` is the largest number of connections."""
+        """Prepare for the first observation.
+
+        `most` is the largest number of connections. `opened_ns` is the monotonic time at which the
+        session was opened.
+        """
         self._most, self._events = most, events
         self._linked_ns, self._patience_ns = opened_ns, FIRST_NS
         self._last_ns, self._silence = 0, Silence(STUCK_NS)
@@ -99,14 +104,15 @@ class SessionHealth:
             return None
         text = (
             f"all {self._most} connections are taken, {connection_counts(observed.holders)}: no "
-            "other client is admitted; close programs that are not needed"
+            "other client can connect; close client programs that are not needed"
         )
         return Event(self._events["full"], text, "warning")
 
     def restart_event(self, observed: Observation, passed_ns: int) -> Event | None:
         """Return an event that says why the process must restart, or None if it need not.
 
-        `observed` may be the same as in the last call, which was `passed_ns` ns ago.
+        `observed` is the latest observation, which may be the same as in the last call of this
+        method. `passed_ns` is the time since that call, ns.
         """
         new, self._last_ns = observed.at_ns != self._last_ns, observed.at_ns
         stuck = self._silence.too_long(new, passed_ns)
@@ -114,20 +120,20 @@ class SessionHealth:
             self._linked_ns, self._patience_ns = observed.at_ns, ALONE_NS
         if stuck:
             text = (
-                "Zenoh does not respond, because a client keeps it too busy; this process "
-                "restarts, which disconnects all clients"
+                "Zenoh in this process does not respond, because a client keeps it too busy; the "
+                "process restarts, which disconnects all clients"
             )
             return Event(self._events["stuck"], text, "error")
         if observed.at_ns - self._linked_ns > self._patience_ns:
             text = (
-                "the daemon is not connected any more; this process restarts, which disconnects "
-                "all clients"
+                "the TLS gateway has lost its connection to the daemon; the gateway restarts, "
+                "which disconnects all clients"
             )
             return Event(self._events["alone"], text, "warning")
         if observed.unanswered >= MAX_UNANSWERED:
             text = (
-                f"the daemon is connected, but has left {observed.unanswered} queries unanswered; "
-                "this process restarts, which disconnects all clients"
+                f"the daemon is connected to the TLS gateway, but has left {observed.unanswered} "
+                "queries unanswered; the gateway restarts, which disconnects all clients"
             )
             return Event(self._events["alone"], text, "warning")
         return None
@@ -160,7 +166,7 @@ class Listener:
     """Largest number of connections from the network."""
     events: Events
     files: CertificateFiles | None
-    """The certificate files of the session, or None if it has none to watch."""
+    """The certificate files of the session, or None if the session has no such files."""
 
     def ready(self) -> bool:
         """Return whether clients may be admitted now."""
@@ -222,7 +228,9 @@ class ListenerProcess:
                 self._log.event(event)
                 return Exit.FAILURE
             if self._renewed():
-                text = "restarts with its new certificate, which disconnects all clients"
+                text = (
+                    "this process restarts with its new certificate, which disconnects all clients"
+                )
                 self._log.info(self._listener.events["open"], text=text)
                 return Exit.FAILURE
             before_ns = now_ns
@@ -235,7 +243,10 @@ class ListenerProcess:
             return False
         why = files.refused()
         if why:
-            text = f"goes on with its old certificate, because it cannot use the new one: {why}"
+            text = (
+                "this process goes on with its old certificate, because it cannot use the new one: "
+                f"{why}"
+            )
             self._log.event(Event(self._listener.events["open"], text, "warning"))
         return not why
 

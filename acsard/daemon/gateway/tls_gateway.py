@@ -82,7 +82,11 @@ class Gateway(Listener):
         return Observation(clock.mono_ns(), holders, bool(local), unanswered)
 
     def report(self, session: zenoh.Session, observed: Observation, health: SessionHealth) -> None:
-        """Publish the number of connections and related values, which appear in `state`."""
+        """Publish the state of the gateway, which the daemon includes in the message `state`.
+
+        This state contains the number of connections, the opening time of the gateway, the earliest
+        expiry time of its certificates, and how often all connections were taken.
+        """
         if self._publisher is None:
             self._ends_ns = min(ends(self._config.bus.tls).values(), default=0)
             key, kind = full_key(self._config.robot.id, "gateway"), "GatewayState"
@@ -103,10 +107,11 @@ class DaemonProbe:
         """Prepare queries of `key`, which the daemon answers."""
         self._key, self._asked_ns, self._unanswered = key, 0, 0
         self._ended = threading.Event()
-        """Set when the query has ended, with or without a reply: the daemon has received it."""
+        """Set when the last query has ended, with or without a reply. A query that ends within
+        `PROBE_NS` has reached the daemon."""
 
     def unanswered(self, session: zenoh.Session, now_ns: int) -> int:
-        """Send the next query if it is due. Return how many in a row have exceeded `PROBE_NS`."""
+        """Send the next query if it is due. Return the number of consecutive unanswered queries."""
         if now_ns - self._asked_ns < PROBE_NS:
             return self._unanswered
         if self._asked_ns:

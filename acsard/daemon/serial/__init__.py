@@ -1,1 +1,1 @@
-"""The serial port: opened raw and locked, written without a queue, closed after a STOP."""
+"""Access to the serial port, which is opened raw and locked, and closed after a last STOP line."""

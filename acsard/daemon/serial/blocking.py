@@ -16,13 +16,15 @@ from acsard.host import clock
 from acsard.host.processes import Holder, master_of, waited_ns
 
 SEND_S = 0.5
-"""Time limit for a driver that accepts no byte, s. The slowest wire needs 50 ms for a line."""
+"""Longest time for which `send` waits while the driver accepts no byte, s. Even at the lowest baud
+rate, a line needs only 50 ms."""
 
 DRAIN_S = 0.5
 """Longest time for which `close` waits for the driver to send the last stop lines, s."""
 
 CLOSE_S = 1.0
-"""Longest time to wait for a close, s. Some drivers drain for 30 s."""
+"""Longest time for which `close` waits until the device is closed, s. Some drivers take 30 s,
+because they first try to send the bytes in their buffer."""
 
 
 class BlockingPort:

@@ -19,10 +19,11 @@ from acsard.host.errors import InUseError, MendableError, NoPortError, NotPermit
 from acsard.host.processes import holder_of
 
 _left_open: list[int] = []
-"""Descriptors that could not be closed because no thread could be started."""
+"""Descriptors that `close` could not close because no thread could be started."""
 
 DRAIN_STEP_S = 0.001
-"""Time between two checks for unsent bytes, s. At every baud rate a line takes longer."""
+"""Time between two checks for unsent bytes, s. Even at the highest baud rate a line takes
+longer."""
 
 
 class _Device(serial.Serial):  # type: ignore[misc]
@@ -39,7 +40,7 @@ class _Device(serial.Serial):  # type: ignore[misc]
         except OSError as error:
             raise serial.SerialException(f"read failed: {error}") from error
         if not data:
-            raise serial.SerialException("the device has hung up")
+            raise serial.SerialException("the serial device has hung up")
         return data
 
 
@@ -98,13 +99,13 @@ def unsent(fd: int) -> int:
 
 
 def draining(fd: int, deadline_ns: int) -> Iterator[float]:
-    """Yield pauses to sleep, s, until all bytes are sent or monotonic `deadline_ns` is reached."""
+    """Yield pauses, s, for the caller to sleep, until all bytes are sent or `deadline_ns` comes."""
     while unsent(fd) and clock.mono_ns() < deadline_ns:
         yield DRAIN_STEP_S
 
 
 def unlock(fd: int) -> None:
-    """Let other processes open the device. A pty keeps its lock after this process ends."""
+    """Unlock the device for other processes. Otherwise a pty stays locked after this one ends."""
     try:
         fcntl.ioctl(fd, termios.TIOCNXCL)
     except OSError:
@@ -114,10 +115,10 @@ def unlock(fd: int) -> None:
 def close(device: serial.Serial, *, lost: bool = False, wait_s: float = 0.0) -> None:
     """Discard unsent bytes, and unlock and close the device in a thread.
 
-    The thread is needed because a driver may drain for 30 s. This call waits for the thread for at
-    most `wait_s` seconds. If no thread can be started, the next `open_raw` closes the device. After
-    the call, the descriptor of `device` refers to /dev/null, so the owner can drain and close it
-    without delay.
+    The thread is needed because a driver may take 30 s to close. This call waits for the thread for
+    at most `wait_s` seconds. If no thread can be started, the next `open_raw` closes the device.
+    After the call, the descriptor of `device` refers to /dev/null, so the owner can drain and close
+    `device` without delay.
 
     If `lost` is true, the device has failed. Its output buffer is then discarded even if the driver
     reports no unsent bytes.
@@ -167,18 +168,18 @@ def refusal(path: str, error: OSError) -> MendableError:
 
 
 _LISTED = "`acsard ports` lists the serial ports"
-_FREE = "stop it first (`systemctl stop acsard` if it is the service)"
+_FREE = "stop that process first (`systemctl stop acsard` if it is the service of acsard)"
 _JOIN = (
     "add the user to the device's group (`sudo usermod -aG dialout $USER`), then log in again; "
-    "the service is in dialout already, so its device has either another group or a type that the "
-    "unit does not allow"
+    "the systemd service of acsard is in the group dialout already; if it lacks permission, the "
+    "device has another group, or acsard.service does not allow this type of device"
 )
 
 
 def require(path: str) -> None:
-    """Raise the error of `refusal` unless `path` is a character device. The tools call this.
+    """Raise the error of `refusal` unless `path` is a character device.
 
-    The daemon does not call this, because it waits for a device that is absent.
+    Only the tools call this function. The daemon waits for a device that is absent.
     """
     try:
         if not stat.S_ISCHR(os.stat(path).st_mode):

@@ -1,9 +1,9 @@
 """The daemon's serial port: opens, reads and reopens the device, and sends STOP before it closes.
 
-The daemon uses pyserial-asyncio only to read. Its transport would queue the bytes that the kernel
-does not take, and send an old line later (the third rule in `acsard/README.md`). So the daemon
-writes to the descriptor directly. Opening runs in a thread with a time limit, because drivers may
-block.
+The daemon uses pyserial-asyncio only to read. A transport of that library would queue the bytes
+that the kernel does not accept, and send an old line later (the third rule in `acsard/README.md`).
+So the daemon writes to the descriptor directly. Opening runs in a thread with a time limit, because
+drivers may block.
 """
 
 from __future__ import annotations
@@ -27,30 +27,33 @@ from acsard.host.errors import InUseError, MendableError, NotPermittedError
 from acsard.host.threads import NoThreadError, in_thread
 
 OPEN_TIMEOUT_S = 5.0
-"""Time after which a call that opens a device counts as hung, s. Until it ends, the same device is
-not opened again."""
+"""Time after which a call that opens a device counts as hung, s. Until that call returns, the same
+device is not opened again."""
 
 BACK_OFF_S = (0.05, 0.1, 0.2)
-"""Pauses between the attempts to reopen the port, s. The last one repeats. The first ones are
-short, because udev soon sets the group of a new device."""
+"""Pauses between the attempts to reopen the port, s. The last pause repeats. The first ones are
+short, because udev sets the group of a new device within a short time."""
 
 PERMISSION_PATIENCE_S = 2.0
-"""Time that the start waits for udev to grant access before it fails, s."""
+"""Time for which the start of the daemon waits for udev to grant access to the device, s. If access
+is still denied after it, the start fails."""
 
-HUNG = "the driver did not answer"
+HUNG = "the driver of the serial port did not answer"
 
 FAREWELL_S = 0.15
-"""Time limit of the last STOP, s: twice the time of a line on the slowest wire, and a margin."""
+"""Time limit for sending the last STOP, s. It is twice the time that a line takes at the lowest
+baud rate, plus a margin."""
 
 
 AT_ONCE = 4096
-"""Largest number of bytes per read, as many as a driver buffers."""
+"""Largest number of bytes per read. A driver buffers this many."""
 
 
 class SerialPort:
     """The port to the board, as an asynchronous context manager.
 
-    Entering opens the port, `keep_open` reopens it for ever, and leaving sends STOP and closes it.
+    Entering opens the port. `keep_open` reopens it for ever. Leaving sends STOP and closes the
+    port.
     """
 
     def __init__(
@@ -75,9 +78,9 @@ class SerialPort:
         self._lost = asyncio.Event()
         self._fd = -1
         self._opening = set[tuple[int, int]]()
-        """The devices that a thread is opening, as (st_dev, st_ino) of the path at that time."""
+        """The devices that a thread is opening now, as (`st_dev`, `st_ino`) of their paths."""
         self.trouble = ""
-        """The reason why the port is closed, "" while it is open."""
+        """The reason why the port is closed; "" while the port is open."""
 
     # The control loop calls the methods below.
 
@@ -89,8 +92,9 @@ class SerialPort:
     def take(self, late: Instant | None = None) -> tuple[Received, ...]:
         """Return the bytes received since the last call.
 
-        `late` is the time of a late step, else None. A late step also reads the bytes that wait in
-        the kernel, because its own delay would otherwise look like silence of the board.
+        `late` is the time of this step if it is late, else None. In a late step, this method also
+        reads the bytes that wait in the kernel. Otherwise the delay of the step would look like
+        silence of the board.
 
         After a suspend of the computer, this method closes the port so that it is opened again,
         even if the device did not notice. A new session then begins: every sender must return to
@@ -112,7 +116,8 @@ class SerialPort:
     def offer(self, line: bytes, now: Instant) -> Offered:
         """Write a line that was made at `now`, and return "sent".
 
-        Return "down" if the port is closed, and "superseded" if the line was dropped.
+        Return "down" if the port is closed. Return "superseded" if the line was not written
+        completely, so that a newer line must replace it.
         """
         if not self.is_open:
             return "down"

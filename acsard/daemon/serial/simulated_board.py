@@ -140,11 +140,11 @@ class Simulated(SimPty):
         self._last: tuple[Sight, int] | None = None
 
     def tell(self, bus: Bus) -> None:
-        """Publish the robot's true pose and the gyro's samples on this bus from now on."""
+        """Publish the robot's true pose and the gyro's samples on `bus` from now on."""
         self._bus = bus
 
     def current(self, key: str) -> Message | None:
-        """Return the newest true pose; None before the first, and if `key` is not `sim/pose`."""
+        """Return the newest true pose; None before the first, or if `key` is not `sim/pose`."""
         return true_pose(*self._last) if key == POSE and self._last is not None else None
 
     def _see(self, sight: Sight) -> None:

@@ -69,7 +69,7 @@ def test_what_a_real_port_hides_is_said_to_be_left_out() -> None:
     text = plain(*parts(REAL))
     assert text.count("not measured") == 3
     assert "zero speeds only" in text
-    assert "cannot see the lines" in text
+    assert "cannot see them on a real port" in text
 
 
 def test_json_has_every_figure_by_its_name() -> None:

@@ -41,8 +41,8 @@ def test_of_a_scale_that_nothing_measured_nothing_is_written() -> None:
 def test_people_are_told_what_it_improves_and_what_remains() -> None:
     told = plain(*parts(REPORT, FOUND, "acsard.toml"), width=SENTENCES)
     assert "wheel_separation_multiplier   " in told
-    assert f"error of a turn of 360 deg: {REPORT.turn_error_before:.0f} deg now" in told
-    assert "the error that remains" in told
+    assert f"heading error after a turn of 360 deg: {REPORT.turn_error_before:.0f} deg now" in told
+    assert "remaining error" in told
     assert "--distance METRES" in told
 
 

@@ -78,7 +78,7 @@ def test_a_reversed_side_does_not_hide_the_time_offset() -> None:
 
 def test_a_gyro_that_says_the_same_always_is_refused() -> None:
     drive = usual()
-    with pytest.raises(LogError, match="same in every row"):
+    with pytest.raises(LogError, match="same value in every row"):
         headings_of(replace(drive, gyro=drive.gyro * 0))
 
 

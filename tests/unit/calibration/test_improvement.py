@@ -73,7 +73,7 @@ def test_without_anything_to_tell_an_error_by_nothing_is_sure() -> None:
     better = improvement([], BASE.start(), BASE, rows, [], [])
     assert (better.turn.before, better.heading.before, better.place.after) == (None, None, None)
     assert not better.sure
-    assert "no drive could be left out" in no_better(better)
+    assert "no drive of the log could be left out" in no_better(better)
 
 
 def test_a_slow_curve_is_no_straight() -> None:

@@ -365,7 +365,7 @@ def test_noise_is_written_beside_the_geometry_and_told(found: Calibration) -> No
     assert after.yaw_variance_per_radian < before.yaw_variance_per_radian / 10
     assert after.distance_variance_per_metre < before.distance_variance_per_metre
     told = plain(*parts(report("a.csv", found, DriveConfig(), ""), found, "f"), width=SENTENCES)
-    assert "random errors of the heading after 10 m, as odometry publishes them: " in told
+    assert "random heading error that the odometry messages state after 10 m of driving: " in told
     assert "random errors of the distance after 10 m" in told
 
 

@@ -220,7 +220,7 @@ def test_one_movement_only_is_refused_with_what_to_drive(
 ) -> None:
     with pytest.raises(RefusedError) as refused:
         rolls_enough(rows(left, right))
-    assert "drive 60 s" in str(refused.value)
+    assert "a drive of 60 s" in str(refused.value)
 
 
 def test_little_of_it_is_refused() -> None:

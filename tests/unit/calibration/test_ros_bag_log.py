@@ -282,8 +282,8 @@ def again(seen: Drive) -> Iterator[RosMessage]:
 @each(
     ("topics", "why"),
     [
-        ([imu(SHORT)], "no wheel angles.*Its topics: /imu/data .Imu."),
-        ([], "no wheel angles.*no message at all"),
+        ([imu(SHORT)], "no wheel angles.*The bag contains /imu/data .Imu."),
+        ([], "no wheel angles.*no messages at all"),
         ([joint_states(SHORT, names=("a", "b")), imu(SHORT)], r"but are a, b\. .*\[joints\]"),
         ([joint_states(SHORT)], "nothing with which to compare the wheels"),
         ([joint_states(SHORT), as_encoding(imu(SHORT), "ros1")], "encoded as ros1, not as cdr"),
@@ -297,12 +297,14 @@ def test_what_a_bag_lacks_is_told(topics: list[Iterator[RosMessage]], why: str) 
 
 
 def test_a_topic_that_is_not_there_is_told_with_those_that_are() -> None:
-    with pytest.raises(LogError, match=r"no topic /imu to use. Its topics: .*/imu/data"):
+    with pytest.raises(
+        LogError, match=r"no topic /imu that can be used. The bag contains .*/imu/data"
+    ):
         of(joint_states(SHORT), imu(SHORT), use=["/imu"])
 
 
 def test_an_axis_without_an_imu_is_told() -> None:
-    with pytest.raises(LogError, match="no IMU is used"):
+    with pytest.raises(LogError, match="the tool uses no IMU"):
         of(joint_states(SHORT), poses(SHORT), axis="x")
 
 

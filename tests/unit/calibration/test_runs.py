@@ -38,7 +38,7 @@ def test_repeated_times_are_taken_once_and_told() -> None:
 def test_a_time_that_begins_anew_begins_a_run() -> None:
     names, ends, notes = of(rows(0, 500) + rows(0, 300))
     assert (names, len(ends)) == (["1", "2"], 2)
-    assert any("jump back of the time begins a new run: 1 of them" in note for note in notes)
+    assert any("the time in the log jumps back; number of jumps: 1" in note for note in notes)
 
 
 def test_halves_of_a_drive_in_the_wrong_order_stay_one_run() -> None:
@@ -90,7 +90,7 @@ def test_a_pause_of_a_day_parts_two_drives() -> None:
     names, ends, notes = of(rows(0, 500) + rows(86_400, 300))
     assert names == ["1", "2"]
     assert ends == pytest.approx([4.99, 2.99])
-    assert any("over 60 s in the wheel speeds begins a new run: 1 of" in note for note in notes)
+    assert any("over 60 s in the wheel speeds; number of gaps: 1" in note for note in notes)
 
 
 def test_a_column_without_any_number_is_named() -> None:
@@ -122,7 +122,7 @@ def test_front_and_rear_that_differ_are_reported() -> None:
 
 
 def test_a_run_for_each_row_is_none() -> None:
-    with pytest.raises(LogError, match="must name drives, not rows"):
+    with pytest.raises(LogError, match="each name must stand for a drive"):
         of([f"{i / 100},{i},{i},{i},{i}" for i in range(2000)])
 
 

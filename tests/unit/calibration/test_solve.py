@@ -219,7 +219,9 @@ def test_ten_manoeuvres_of_a_skidding_robot_give_its_track(seed: int) -> None:
     found = calibrated(log_of_runs(manoeuvres(seed, 10, 0.1), places=False))
     assert found.kept == (RATIO,)
     assert found.multipliers.values[1:].tolist() == pytest.approx([1.0, 1.0], abs=1e-6)
-    assert any("left to right stays as configured" in note for note in found.notes)
+    assert any(
+        "the left to the right wheel radius stays as configured" in note for note in found.notes
+    )
     elsewhere = manoeuvres(seed + 1000, 40, 0.1)
     best = min(turned_wrong(elsewhere, track) for track in np.arange(1.0, 3.0, 0.02))
     error = turned_wrong(elsewhere, found.multipliers.values[0])
@@ -422,7 +424,7 @@ TOO_LITTLE = [[(3, 0, 0), (30, 0.3, 0)], [(3, 0, 0), (60, 0.3, 0.8)], [(60, 0, 0
 )
 def test_a_drive_that_tells_too_little_is_refused(way: str, plan: list[tuple[float, ...]]) -> None:
     gyro, places = WAYS[way]
-    with pytest.raises(RefusedError, match="drive 60 s"):
+    with pytest.raises(RefusedError, match="a drive of 60 s"):
         calibrated(table(drive(Robot(), plan), gyro=gyro, places=places))  # type: ignore[arg-type]
 
 

@@ -808,7 +808,7 @@ def test_what_a_later_step_could_judge_is_told_though_an_earlier_one_could_not()
     class Sees(Nobody):
         def doing(self, text: str) -> None:
             if "runs again" not in text:
-                robot.looked = text.startswith("trying the comma")
+                robot.looked = text.startswith("testing whether lines")
 
     robot = Refuses("plain_only", late_s=0.05, every=3)
     robot.mcu.understand = obeys

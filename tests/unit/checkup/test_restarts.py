@@ -249,7 +249,7 @@ def test_a_clock_that_began_again_is_a_restart(before_ms: int) -> None:
     restarts = heard(reply(10.0, before_ms))
     again = reply(12.1, 100)
     gone_ms = (100 - before_ms) % CLOCK
-    assert ("restarted" in sign(restarts.look(b"", again.at_s, again))) == (gone_ms > 4100)
+    assert ("started again" in sign(restarts.look(b"", again.at_s, again))) == (gone_ms > 4100)
 
 
 def test_it_is_told_what_turned_and_for_how_long_nothing_was_sent_when_it_was_heard_last() -> None:

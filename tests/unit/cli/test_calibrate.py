@@ -46,7 +46,7 @@ def test_people_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert called(tmp_path, GOOD) == 0
     out = capsys.readouterr().out
     assert "wheel_separation_multiplier" in out
-    assert "error of a turn of 360 deg" in out
+    assert "heading error after a turn of 360 deg" in out
     assert (tmp_path / "acsard.toml").read_text() == "# mine\n"
 
 
@@ -233,7 +233,7 @@ def test_another_kind_of_bag_is_told_with_the_command_that_converts_it(
 
 
 def test_a_directory_that_is_no_bag_is_told(tmp_path: Path) -> None:
-    with pytest.raises(MendableError, match="directory without an MCAP file"):
+    with pytest.raises(MendableError, match="directory contains no MCAP file"):
         of_bag(tmp_path, tmp_path)
 
 
@@ -308,12 +308,12 @@ def driving(*words: str) -> int:
     ("words", "why"),
     [
         ([], "person at the terminal"),
-        (["--distance", "2.0"], "--distance goes with --log"),
+        (["--distance", "2.0"], "--distance needs --log"),
         (["--method", "positions"], "--positions KEY"),
         (["--method", "tape", "--positions", "sim/pose"], "leave one out"),
         (["--positions-at", "tcp/127.0.0.1:7447"], "--positions KEY"),
-        (["--positions", "odom"], "computed from the wheels themselves"),
-        (["--positions", "acsard/acsar/odom"], "computed from the wheels themselves"),
+        (["--positions", "odom"], "computes odom from the wheels themselves"),
+        (["--positions", "acsard/acsar/odom"], "computes odom from the wheels themselves"),
         (["--log", "drive.csv", "--method", "tape"], "--method is for a guided drive"),
         (["--log", "drive.csv", "--imu", "imu"], "--imu is for a guided drive"),
         (["--method", "tape", "--imu", "imu"], "--imu is for --method gyro, not for --method tape"),
@@ -322,7 +322,7 @@ def driving(*words: str) -> int:
         (["--yaw-axis=x"], "--topic and --yaw-axis need --log"),
         (["--log", "drive.csv", "--yes"], "--yes is for a guided drive"),
         (["--log", "drive.csv", "--json-lines"], "--json-lines is for a guided drive"),
-        (["--yes", "--json-lines"], "--json-lines asks them through a program"),
+        (["--yes", "--json-lines"], "with --json-lines a program asks them"),
     ],
 )
 def test_what_cannot_be_meant_is_said_before_anything_is_connected_to(

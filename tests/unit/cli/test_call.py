@@ -21,6 +21,6 @@ def test_what_is_not_for_many_says_why_and_what_to_type_instead(
 ) -> None:
     assert main(["call", *words]) == Exit.USAGE
     told = capsys.readouterr().err
-    assert "only stop goes to many robots at once" in told
+    assert "only stop can be called on several robots at once" in told
     assert "a person must look at each" in told
     assert all(one in told for one in instead)

@@ -99,7 +99,7 @@ def test_what_the_simulator_shows_is_not_offered_for_a_robot_s_file(
 ) -> None:
     assert called(tmp_path, "--port", "sim", *how, text=REAL) == 0
     out = capsys.readouterr().out
-    assert "mcu.port here is /dev/acsar_mcu" in out
+    assert "the configured mcu.port is /dev/acsar_mcu" in out
     if "--json" in how:
         found = json.loads(out)
         assert (found["changes"], found["toml"]) == ({}, "")

@@ -17,8 +17,8 @@ MEGA = SerialDevice(
 @pytest.mark.parametrize(
     ("ports", "code", "words"),
     [
-        ([], 1, "no serial ports: is the board plugged in"),
-        ([ON_THE_MAINBOARD], 0, "no board is here: is the board plugged in"),
+        ([], 1, "no serial ports: check that the board is plugged in"),
+        ([ON_THE_MAINBOARD], 0, "acsard finds no board: check that the board is plugged in"),
         ([ON_THE_MAINBOARD, UNKNOWN], 0, "unplug the board and run this again"),
         ([ON_THE_MAINBOARD, UNKNOWN, MEGA], 0, ""),
     ],

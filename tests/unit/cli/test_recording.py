@@ -66,7 +66,8 @@ def test_the_list_has_a_line_for_each_recording_with_its_events(where: Path) -> 
     assert "000001-20270115T080000Z.mcap" in first
     assert first.endswith("  ! start, 1 change of commander, 1 stop (stopped by unnamed (native))")
     assert second.endswith(
-        "    start, 1 change of commander  [no end: cut off, or still being recorded]"
+        "    start, 1 change of commander  "
+        "[the file has no end: it was cut off, or is still being recorded]"
     )
     set_age(where, 2.0)
     assert log(where)[1].endswith("start, 1 change of commander  [being recorded]")
@@ -337,7 +338,7 @@ def test_a_replay_says_what_it_has_compared(where: Path) -> None:
     _, told = out.splitlines()
     for word in (
         "each line to the board",
-        "each pose",
+        "each odometry pose",
         "the mode, reason, link and source of each step",
         "each event",
         "the recorded inputs",
@@ -358,9 +359,10 @@ def test_with_another_configuration_it_tells_what_would_have_been(
     other.write_text("[limits]\nlinear_speed = 0.3\n")
     code, out, _ = log(where, "replay", "1", "--config", str(other))
     assert code == 0
-    assert " s after the beginning: line, sent line\n" in out
+    assert " s after the beginning of the recording: line, sent line\n" in out
     assert "  recorded  ap" in out
-    assert "the highest wheel speed in any line: 10.00 rad/s recorded, 6.00 rad/s replayed" in out
+    fastest = "the highest wheel speed in any line to the board: 10.00 rad/s recorded, 6.00 rad/s"
+    assert f"{fastest} replayed" in out
 
 
 def test_it_tells_which_limits_are_others_what_they_do_and_that_the_wheels_knew_nothing_of_it(
@@ -374,12 +376,12 @@ def test_it_tells_which_limits_are_others_what_they_do_and_that_the_wheels_knew_
     assert "limits.linear_speed was 1.0, is 0.1" in keys
     assert "limits.linear_acceleration was 1.0, is 0.5" in keys
     (told,) = [
-        line for line in out.splitlines() if line.startswith("the highest wheel speed in that")
+        line for line in out.splitlines() if line.startswith("the highest wheel speed in the first")
     ]
     assert told.endswith(", because of limits.linear_speed, limits.linear_acceleration")
     then, now = (float(word) for word in re.findall(r"(\d+\.\d+) rad/s", told))
     assert then > now
-    (fault,) = [line for line in out.splitlines() if "in fault from " in line]
+    (fault,) = [line for line in out.splitlines() if "in the mode fault from " in line]
     assert "wheel" in fault
     assert "a robot with this configuration might not have had that fault" in out
 
@@ -389,7 +391,7 @@ def test_settings_that_change_no_line_are_told_all_the_same(where: Path, tmp_pat
     same.write_text("[rates]\nstate = 5.0\n")
     code, out, _ = log(where, "replay", "1", "--config", str(same))
     assert (code, "differs" in out) == (0, False)
-    assert "computes its outputs with that configuration from the recorded inputs" in out
+    assert "computes new outputs with the other configuration from the recorded inputs" in out
     assert out.splitlines()[-1].startswith("changed settings: rates.state was 10.0, is 5.0")
 
 
@@ -400,7 +402,7 @@ def test_what_was_cut_is_written_as_a_finished_file(where: Path, tmp_path: Path)
     assert code == 0
     assert f"messages in {new}" in out
     code, _, err = log(where, "replay", str(new))
-    assert (code, "cut, or still being recorded, when it was recovered" in err) == (0, True)
+    assert (code, "cut off, or still being recorded, when `acsard" in err) == (0, True)
     assert log(where, "recover", str(cut), str(tmp_path / "none" / "x"))[0] == 1
 
 
@@ -422,7 +424,7 @@ def test_what_is_recovered_stands_there_whole_or_not_at_all_and_over_no_recordin
     (other,) = where.glob("*.mcap")
     (held := tmp_path / "held.mcap").write_bytes(other.read_bytes())
     code, _, err = log(where, "recover", str(cut), str(held), "--force")
-    assert (code, "it is a recording; name another file" in err) == (1, True)
+    assert (code, "this file is a recording of acsard; name another file" in err) == (1, True)
     assert held.read_bytes() == other.read_bytes()
     held.unlink()
     (mine := tmp_path / "mine").write_text("mine")
@@ -440,7 +442,7 @@ def test_recover_replaces_its_own_earlier_result_only_on_request_and_says_so(
     (earlier := tmp_path / "earlier.mcap.part").write_bytes(cut.read_bytes()[:-2000])
     assert log(where, "recover", str(earlier), str(new))[0] == 0
     code, _, err = log(where, "recover", str(cut), str(new))
-    assert (code, "it exists; --force overwrites it" in err) == (1, True)
+    assert (code, "this path exists already; --force overwrites it" in err) == (1, True)
     code, out, _ = log(where, "recover", str(cut), str(new), "--force")
     assert (code, f"{new}, which replaces an earlier copy of the same recording" in out) == (
         0,
@@ -448,10 +450,10 @@ def test_recover_replaces_its_own_earlier_result_only_on_request_and_says_so(
     )
     longer = new.read_bytes()
     code, _, err = log(where, "recover", str(earlier), str(new), "--force")
-    assert (code, "it is a recording; name another file" in err) == (1, True)
+    assert (code, "this file is a recording of acsard; name another file" in err) == (1, True)
     assert new.read_bytes() == longer, "the shorter copy lacks messages of the longer one"
     code, _, err = log(where, "recover", str(cut), str(cut), "--force")
-    assert (code, "it is a recording; name another file" in err) == (1, True)
+    assert (code, "this file is a recording of acsard; name another file" in err) == (1, True)
 
 
 def harmed(data: bytes, dice: random.Random) -> bytes:

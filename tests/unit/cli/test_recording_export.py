@@ -61,7 +61,7 @@ def test_a_number_and_a_name_are_taken_and_what_is_there_stays(
     before = (here / "mine.mcap").read_bytes()
     assert export(where, "7", "mine.mcap") == 1
     assert capsys.readouterr().err == (
-        "acsard: cannot write mine.mcap: it exists; --force overwrites it\n"
+        "acsard: cannot write mine.mcap: this path exists already; --force overwrites it\n"
     )
     assert (here / "mine.mcap").read_bytes() == before
     assert export(where, "7", "mine.mcap", "--csv", "--force") == 0

@@ -39,7 +39,7 @@ def test_it_says_how_far_it_is(
         *([] if verb == "replay" else [str(tmp_path / "new")]),
     ]
     told = on_terminal(80, lambda: main(words), monkeypatch)
-    assert re.match(r"\r0 of \d s\r\d of \d s", told)
+    assert re.match(r"\r0 of \d s of the recording\r\d of \d s of the recording", told)
     assert told.endswith("\r\x1b[K")
 
 

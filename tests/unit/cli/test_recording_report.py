@@ -49,7 +49,7 @@ def test_the_numbers_of_the_file_are_those_of_the_recording(
     monkeypatch.chdir(tmp_path)
     code, out, err = report(QUIET)
     assert code == 0
-    assert "computes other words for reasons or events than the recorded ones" in err
+    assert "the texts of reasons or events differ from the recorded ones" in err
     assert len(err.splitlines()) == 1
     path = tmp_path / "quiet.html"
     assert out.startswith("quiet.html: ")
@@ -66,7 +66,7 @@ def test_nothing_is_overwritten_without_force(tmp_path: Path) -> None:
     new.write_text("mine")
     code, _, err = report(QUIET, new)
     assert code == 1
-    assert f"cannot write {new}: it exists; --force overwrites it" in err
+    assert f"cannot write {new}: this path exists already; --force overwrites it" in err
     assert new.read_text() == "mine"
     assert report(QUIET, new, "--force")[0] == 0
     assert new.stat().st_size > 1e6
@@ -77,7 +77,7 @@ def test_a_recording_never_goes_not_even_by_force(tmp_path: Path) -> None:
     shutil.copy(QUIET, new)
     code, _, err = report(QUIET, new, "--force")
     assert code == 1
-    assert f"cannot write {new}: it is a recording; name another file" in err
+    assert f"cannot write {new}: this file is a recording of acsard; name another file" in err
     assert new.read_bytes() == QUIET.read_bytes()
 
 
@@ -99,8 +99,8 @@ def test_a_part_of_the_time_and_what_was_cut(tmp_path: Path) -> None:
     cut.write_bytes(cut.read_bytes()[:-4000])
     code, _, err = report(cut, new, "--from", "1", "--to", "2")
     assert code == 0
-    assert "no end: cut" in err
-    assert "no end: cut" in new.read_text(encoding="utf-8")
+    assert "no end: it was cut" in err
+    assert "no end: it was cut" in new.read_text(encoding="utf-8")
     times = column(pictures(new)["speeds"][2]["x"])
     assert times[-1] - times[0] == pytest.approx(1000, abs=30)
 
@@ -132,5 +132,5 @@ def test_without_the_library_it_says_what_to_type(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setitem(sys.modules, "plotly.offline", None)
     code, _, err = report(QUIET)
     assert code == 1
-    assert "needs the library plotly; run: " in err
+    assert "needs the library plotly; to install it, run: " in err
     assert "[report]" in err

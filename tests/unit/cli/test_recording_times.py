@@ -93,11 +93,14 @@ def test_a_time_without_a_recording_is_refused_with_the_nearest_recordings(
     where, names, _ = ring
     code, out, err = recording(where, verb, "--from", local(3600.0))
     assert (code, out) == (1, "")
-    assert f"nothing was recorded from {local(3600.0)[:19]}; the last recording before it is" in err
+    assert (
+        f"nothing was recorded from {local(3600.0)[:19]}; the last recording before that time is"
+        in err
+    )
     assert f"is {names[-1]}, " in err
     code, out, err = recording(where, verb, "--to", local(-3600.0))
     assert (code, out) == (1, "")
-    assert f"the first one after it is {names[0]}, {local(0.0)[:19]} to " in err
+    assert f"the first recording after that time is {names[0]}, {local(0.0)[:19]} to " in err
     assert not [*tmp_path.iterdir()]
 
 
@@ -112,8 +115,8 @@ def test_a_time_between_two_recordings_names_both(tmp_path: Path) -> None:
     times = ("--from", local(600.0), "--to", local(700.0))
     code, out, err = recording(tmp_path, "show", *times)
     assert (code, out) == (1, "")
-    assert "before it is 000001-20270115T080000Z.mcap, " in err
-    assert "after it is 000002-20270115T090000Z.mcap, " in err
+    assert "before that time is 000001-20270115T080000Z.mcap, " in err
+    assert "after that time is 000002-20270115T090000Z.mcap, " in err
     times = ("--from", local(-60.0), "--to", local(7200.0))
     code, out, err = recording(tmp_path, "show", *times)
     begins = [line.split("  ")[0] for line in out.splitlines() if "  start: " in line]
@@ -254,7 +257,9 @@ def test_a_search_reports_the_drive_and_the_cut_at_the_end_of_the_newest_recordi
         code, out, err = recording(tmp_path, "show", *times)
         drive, cut = out.splitlines()[-2:]
         assert (code, "  drive: was driving, 1." in drive) == (0, True)
-        assert cut.endswith("  ! cut: no end: cut off, or still being recorded")
+        assert cut.endswith(
+            "  ! cut: the file has no end: it was cut off, or is still being recorded"
+        )
         assert part.name in err
         os.utime(part)
         code, out, err = recording(tmp_path, "show", *times)
@@ -280,8 +285,8 @@ def test_seconds_need_one_recording(ring: Ring) -> None:
     code, _, err = recording(where, "show", "--from", "0.1")
     assert code == 0
     assert names[-1] in err
-    assert "a number of seconds counts from its beginning" in err
-    assert "the newest of 30 recordings; `acsard recording` lists them" in err
+    assert "the seconds of --from and --to count from the beginning of this recording" in err
+    assert "this is the newest of 30 recordings; `acsard recording` lists all" in err
     code, _, err = recording(where, "show", "all", "--from", "0.1")
     assert (code, "name that recording, or write a time" in err) == (2, True)
 

@@ -68,7 +68,7 @@ def test_the_help_and_the_ros_page_say_what_write_does_not_write(
     ("words", "why"),
     [
         ([], "name one robot in --id to list its settings"),
-        (["rates.state", "5", "--write"], "--write changes only the file of this machine"),
+        (["rates.state", "5", "--write"], "--write changes only the configuration file"),
     ],
 )
 def test_several_robots_are_refused_for_a_list_and_for_the_local_file(
@@ -83,10 +83,11 @@ def test_several_robots_are_refused_for_a_list_and_for_the_local_file(
     [
         (
             "limits.linear_speed",
-            "; until the next start; a lowered limit survives the restart, except on the simulator",
+            "; until the daemon's next start; a lowered limit survives a restart of the daemon, "
+            "except on the simulator",
         ),
-        ("limits.linear_deceleration", "; until the next start"),
-        ("rates.state", "; until the next start"),
+        ("limits.linear_deceleration", "; until the daemon's next start"),
+        ("rates.state", "; until the daemon's next start"),
     ],
 )
 def test_the_answer_says_how_long_the_setting_lasts(

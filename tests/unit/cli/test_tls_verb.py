@@ -384,7 +384,7 @@ def test_add_with_a_broken_authority_says_so(
     (own / name).write_text("not what it should be")
     before = sorted(own.rglob("*"))
     assert tls("add", "anna", "--role", "viewer", "--directory", str(own)) == Exit.FAILURE
-    assert "cannot use the authority" in capsys.readouterr().err
+    assert "cannot use the certificate authority" in capsys.readouterr().err
     assert sorted(own.rglob("*")) == before
 
 
@@ -523,8 +523,8 @@ def test_without_an_authority_nothing_is_renewed(
 ) -> None:
     assert tls("renew", "--directory", str(tmp_path)) == Exit.FAILURE
     said = capsys.readouterr().err
-    assert "name the directory of ca-key.pem with --directory" in said
-    assert "if there is none yet, run `acsard tls init`" in said
+    assert "name the directory that contains ca-key.pem with --directory" in said
+    assert "if you have no authority yet, run `acsard tls init`" in said
 
 
 # files that the operator would lose
@@ -554,7 +554,7 @@ def test_no_certificate_is_made_that_the_authority_may_not_sign(
     more = ("--directory", str(own), "--address", "bank.example", "--address", "new.local")
     assert tls(*words, *more) == Exit.FAILURE
     said = capsys.readouterr().err
-    assert "may not sign for bank.example: " in said
+    assert "may not sign a certificate for bank.example: " in said
     assert "tls init --force --address bank.example`" in said
     assert certificate(own).serial_number == before
 
@@ -572,7 +572,7 @@ def test_without_the_authority_s_key_the_message_asks_for_it(
 ) -> None:
     (own / "ca-key.pem").rename(own.parent / "ca-key.pem")
     assert tls("renew", "--directory", str(own)) == Exit.FAILURE
-    assert "has no ca-key.pem: copy the authority's key back" in capsys.readouterr().err
+    assert "has no ca-key.pem: first copy the key of the" in capsys.readouterr().err
 
 
 def test_add_prints_a_list_that_keeps_who_is_there(

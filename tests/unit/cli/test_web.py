@@ -75,4 +75,4 @@ def test_a_second_robot_of_the_same_user_has_tokens_of_its_own(told: Callable[..
     told("--invite", "viewer", "--name", "phone", robot="robot2")
     assert "operator" in told("--tokens")
     assert "operator" not in told("--tokens", robot="robot2")
-    assert "no tokens of robot3" in told("--tokens", robot="robot3")
+    assert "no tokens for the robot robot3" in told("--tokens", robot="robot3")

@@ -352,7 +352,10 @@ def test_a_drive_of_no_time_is_refused_before_anything_is_sent(seconds: float) -
         (FOLLOWED, ""),
         (replace(FOLLOWED, sender=""), ""),  # an older daemon does not name the sender
         (replace(FOLLOWED, sources=[source("1 more of this source's senders must wait")]), ""),
-        (replace(FOLLOWED, sender=OTHER), f"another program, {OTHER}, drives the robot as app"),
+        (
+            replace(FOLLOWED, sender=OTHER),
+            f"another program, {OTHER}, drives the robot as source app",
+        ),
         (OPENING, NEUTRAL),
         (HIGHER, "teleop has priority"),
         (replace(STOPPED, mode="ready", sources=[source("a command", 7.0)]), "receives no command"),

@@ -52,11 +52,11 @@ SOURCES = (Source("app", 50), Source("slow", 10, timeout=1.0))
 CODEC = Codec(WheelMap())
 STOP = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
 
-NOT_A_LINE = "it is not a complete line with four wheel speeds"
-TOO_FAST = "it moves a wheel faster than limits.wheel_speed"
-NO_LINK = "it moves a wheel while the serial link is not up"
-GROWS = "it speeds up a wheel without a fresh command, or not in mode driving"
-LATE = "it still moves a wheel although the longest ramp to zero has ended"
+NOT_A_LINE = "the line is not complete, or does not have four wheel speeds"
+TOO_FAST = "the line moves a wheel faster than limits.wheel_speed"
+NO_LINK = "the line moves a wheel while the serial link is not up"
+GROWS = "the line speeds up a wheel without a fresh command, or not in mode driving"
+LATE = "the line still moves a wheel although the longest ramp to zero has ended"
 
 
 def line(*wheels: float) -> bytes:
@@ -793,7 +793,7 @@ def test_a_healthy_robot_never_trips_the_guard_and_its_wheels_need_a_link_and_a_
 
 # the checked line
 
-NO_CHECK = "it moves a wheel without the checksum that mcu.link_check requires"
+NO_CHECK = "the line moves a wheel without the checksum that mcu.link_check requires"
 
 
 @pytest.mark.parametrize("comma", [False, True])

@@ -297,7 +297,7 @@ def test_a_press_is_latched_in_every_mode(before: str) -> None:
         case "stopped":
             bench.step(ask="stop")
         case "fault":
-            bench.step(guard_trip="it is not a complete line with four wheel speeds")
+            bench.step(guard_trip="the line is not complete, or does not have four wheel speeds")
         case "inactive":
             bench.step(ask="deactivate")
         case "waiting":
@@ -587,9 +587,9 @@ def test_a_clear_in_the_step_of_a_repeated_driver_fault_does_not_release_it() ->
 def test_a_clear_in_the_step_of_a_repeated_guard_trip_does_not_release_the_fault() -> None:
     bench = Bench()
     bench.driving()
-    bench.step(guard_trip="it is not a complete line with four wheel speeds")
+    bench.step(guard_trip="the line is not complete, or does not have four wheel speeds")
     (answer,) = bench.step(
-        guard_trip="it is not a complete line with four wheel speeds", ask="clear"
+        guard_trip="the line is not complete, or does not have four wheel speeds", ask="clear"
     ).answers
     assert not answer.success
     assert bench.mode() == "fault"
@@ -626,7 +626,7 @@ def test_an_empty_battery_ramps_to_rest_and_is_latched() -> None:
     assert all(a - b <= drop + 1e-9 for a, b in pairwise(speeds))
     assert speeds[-1] == 0.0
     assert bench.out.reason.startswith("battery below battery.stop_below = 21 V (latched at ")
-    assert bench.out.reason.endswith("; charge it to 21.5 V, then call srv/clear")
+    assert bench.out.reason.endswith("; charge the battery to 21.5 V, then call srv/clear")
 
 
 def test_each_new_level_is_an_event_and_a_change_of_the_status() -> None:
@@ -654,7 +654,8 @@ def test_clear_is_refused_while_the_battery_is_low_and_works_above_the_hysteresi
     answer = bench.answer("clear")
     assert (answer.success, answer.message) == (
         False,
-        "battery below battery.stop_below = 21 V: charge it to 21.5 V, then call srv/clear again",
+        "battery below battery.stop_below = 21 V: charge the battery to 21.5 V, then call "
+        "srv/clear again",
     )
     bench.status(FULL_LINE)
     for _ in range(1000):
@@ -869,7 +870,7 @@ def test_the_last_refusal_is_shown_in_words() -> None:
     bench.step(REST, source="stranger")
     bench.step(REST)
     refused = bench.robot.snapshot(bench.now_ns).refused
-    assert refused == "source stranger: not one of commands.sources"
+    assert refused == "source stranger: this source is not in commands.sources"
 
 
 def test_lines_are_counted_and_rejects_by_reason_and_zeros_left_out() -> None:
@@ -1199,7 +1200,7 @@ def test_a_stop_that_comes_ahead_of_its_query_and_with_it_is_one_event() -> None
 def test_a_refused_command_is_reported_with_its_reason_and_its_sender() -> None:
     (event,) = Bench().linked().step(REST, source="nobody").events
     assert (event.name, event.level) == ("command_refused", "warning")
-    assert event.text == "unknown_source: source nobody: not one of commands.sources"
+    assert event.text == "unknown_source: source nobody: this source is not in commands.sources"
     refusal = Refusal("malformed", "cmd/app: no map", "app", "a" * 1000)
     bench = Bench().linked()
     told = [event for _ in range(150) for event in bench.step(refusals=(refusal,)).events]
@@ -1254,12 +1255,13 @@ def test_a_guard_trip_is_a_latched_fault_and_an_error_event() -> None:
     out = bench.step(GO, guard_trip="a wheel is too fast")
     assert out.mode == "fault"
     at = "latched at 2027-01-15 08:00:50 UTC"
-    trip = "the guard replaced a line to the board by zeros: a wheel is too fast"
+    trip = "the daemon's guard replaced a line for the board with zeros: a wheel is too fast"
     assert out.reason == f"{trip}, {at}; call srv/clear"
     event, mode = out.events
     assert (event.name, event.level) == ("fault", "error")
     assert mode.text.startswith(
-        "driving -> fault: the guard replaced a line to the board by zeros: a wheel is too fast"
+        "driving -> fault: the daemon's guard replaced a line for the board with zeros: a wheel is "
+        "too fast"
     )
     for _ in range(50):
         bench.step(REST)

@@ -563,7 +563,7 @@ def test_a_process_without_room_for_a_thread_starts_the_robot_stopped(
 
 def test_a_thread_that_has_ended_is_reported(file: LatchFile) -> None:
     file.close()
-    assert file.trouble.startswith("the thread that stores stops for the next start has ended")
+    assert file.trouble.startswith("the thread that writes stops to the latch file has ended")
 
 
 def test_a_file_that_was_not_read_at_the_start_is_read_before_it_is_written(
@@ -650,7 +650,9 @@ def test_a_disk_that_hangs_later_is_reported_once_and_so_is_its_answer(
     stuck.goes.set()
     until(lambda: file.trouble == "")
     assert file.news() == [
-        Event("latch_file", f"stops will survive a restart again; they are stored in {path}")
+        Event(
+            "latch_file", f"stops survive a restart of the daemon again: they are stored in {path}"
+        )
     ]
 
 
@@ -699,6 +701,8 @@ def test_a_disk_that_fills_up_is_reported_once_and_tried_until_it_takes(
     monkeypatch.setattr(module, "replace", replace_file)
     until(lambda: file.trouble == "")
     assert file.news() == [
-        Event("latch_file", f"stops will survive a restart again; they are stored in {path}")
+        Event(
+            "latch_file", f"stops survive a restart of the daemon again: they are stored in {path}"
+        )
     ]
     assert path.read_bytes() == encode("acsar", STOP)

@@ -120,8 +120,11 @@ def test_a_file_without_one_of_its_names_is_refused() -> None:
         (b"[" * 5000, "it is damaged"),
         (b"[1, 2]", "it is damaged"),
         (b'{"format": "2"}', "it is damaged"),
-        (encode("acsar", ALL).replace(b'"format": 1', b'"format": 2'), "another version wrote it"),
-        (b'{"format": 2, "all": "new"}', "another version wrote it"),
+        (
+            encode("acsar", ALL).replace(b'"format": 1', b'"format": 2'),
+            "another version of acsard wrote the file",
+        ),
+        (b'{"format": 2, "all": "new"}', "another version of acsard wrote the file"),
         (encode("other", ALL), "belongs to the robot 'other'"),
     ],
 )

@@ -54,7 +54,7 @@ def test_a_missing_file_is_refused_with_both_fixes(tmp_path: Path) -> None:
 def test_what_is_not_a_file_is_not_read(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     for name in (tmp_path, tmp_path / "pipe"):
-        assert "not a file" in refusal(name)
+        assert "not a regular file" in refusal(name)
 
 
 @each(
@@ -102,7 +102,7 @@ def test_the_longest_description_fits_into_a_message_of_each_encoding(
 
     accepted = max(count for count in range(0, MAX_BYTES + 1000, 500) if fits(count))
     assert 0 < accepted < MAX_BYTES
-    assert "shorten it" in refusal(written(tmp_path, text(accepted + 500)))
+    assert "shorten the URDF" in refusal(written(tmp_path, text(accepted + 500)))
     message = String(text(accepted))
     for form in ("json", "msgpack", "cdr"):
         assert len(encode(message, form)) < MESSAGE_BYTES - 512

@@ -149,9 +149,9 @@ def test_stopping_is_reported_with_why(manager: Manager) -> None:
 def test_waiting_asks_for_more_time_than_passes_until_it_is_reported_again(
     manager: Manager,
 ) -> None:
-    systemd(manager).waiting("waits for the router")
+    systemd(manager).waiting("the daemon waits for the Zenoh router")
     assert manager.heard() == [
-        {"EXTEND_TIMEOUT_USEC": "30000000", "STATUS": "waits for the router"}
+        {"EXTEND_TIMEOUT_USEC": "30000000", "STATUS": "the daemon waits for the Zenoh router"}
     ]
 
 
@@ -232,9 +232,9 @@ def test_nothing_but_a_step_feeds_it(manager: Manager) -> None:
 @pytest.mark.parametrize(
     ("twist", "text"),
     [
-        (Twist(0.5, 0.0), "driving 0.5 m/s by nav"),
-        (Twist(-0.5, 0.04), "driving -0.5 m/s by nav"),
-        (Twist(0.0, -1.26), "driving 0.0 m/s, -1.3 rad/s by nav"),
+        (Twist(0.5, 0.0), "driving at 0.5 m/s, commanded by nav"),
+        (Twist(-0.5, 0.04), "driving at -0.5 m/s, commanded by nav"),
+        (Twist(0.0, -1.26), "driving at 0.0 m/s, -1.3 rad/s, commanded by nav"),
     ],
 )
 def test_driving_is_shown_by_its_speed_and_source(
@@ -253,14 +253,14 @@ def test_the_same_status_is_sent_once(manager: Manager) -> None:
     there = systemd(manager)
     for step in range(1, 1000):
         there.step(outputs(step * 10 * MS, changed=step % 3 == 0))
-    assert statuses(manager) == ["driving 0.5 m/s by nav"]
+    assert statuses(manager) == ["driving at 0.5 m/s, commanded by nav"]
 
 
 def test_a_change_of_mode_is_sent_at_once(manager: Manager) -> None:
     there = systemd(manager)
     there.step(outputs(NS_PER_S))
     there.step(outputs(NS_PER_S + 10 * MS, mode="stopped", reason="by teleop", changed=True))
-    assert statuses(manager) == ["driving 0.5 m/s by nav", "stopped: by teleop"]
+    assert statuses(manager) == ["driving at 0.5 m/s, commanded by nav", "stopped: by teleop"]
 
 
 def test_a_change_of_speed_is_sent_at_most_once_a_second(manager: Manager) -> None:

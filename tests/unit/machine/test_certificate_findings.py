@@ -68,7 +68,7 @@ def test_the_robots_own_certificate_is_renewed_as_printed(
 def test_without_the_authoritys_key_the_advice_asks_for_it(fleet: Path) -> None:
     Authority.load(fleet, str).issue(fleet, "robot", ["localhost"], 9.9)
     (fleet / "ca-key.pem").unlink()
-    assert finding(fleet).mend.endswith(", after you have put ca-key.pem there")
+    assert finding(fleet).mend.endswith(", after you have copied ca-key.pem into that directory")
 
 
 @pytest.mark.parametrize("days", [9.9, -3.0])
@@ -82,7 +82,7 @@ def test_a_robot_of_a_fleet_is_renewed_as_printed(
     told = finding(there)
     assert told.level == ("warning" if days > 0 else "failure")
     typed(told.mend, fleet, monkeypatch)
-    assert told.mend.endswith(f"; then copy clients/robot4/*.pem to {there}")
+    assert told.mend.endswith(f"; then copy clients/robot4/*.pem from there to {there}")
     for name in PEM:
         shutil.copy(fleet / "clients" / "robot4" / name, there)
     require_usable(str(there))
@@ -103,7 +103,7 @@ def test_the_advice_about_an_authority_makes_a_new_one(
 def test_the_advice_about_a_router_names_its_certificate(fleet: Path) -> None:
     told = renewal(str(fleet / "clients" / "robot4"), "the router tls/router.local:7447")
     assert "`acsard tls renew --name router.local --directory .`" in told
-    assert told.endswith("then copy clients/router.local/*.pem to the router")
+    assert told.endswith("then copy clients/router.local/*.pem from there to the router")
     assert "init --force" in renewal(str(fleet), AUTHORITY)
 
 
@@ -146,7 +146,7 @@ def test_a_missing_key_of_a_robot_of_a_fleet_does_not_lead_to_a_new_authority(fl
     (own / "key.pem").unlink()
     for one in certificates(str(own)):
         assert "tls init" not in one.mend
-        assert "copy ca.pem, certificate.pem and key.pem there again" in one.mend
+        assert "copy ca.pem, certificate.pem and key.pem into that directory again" in one.mend
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")

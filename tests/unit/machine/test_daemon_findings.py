@@ -75,7 +75,7 @@ def test_each_key_that_is_otherwise_is_reported_with_both_values() -> None:
     (finding,) = compared(running(runs), FILE)
     assert finding.level == "ok"
     assert 'mcu.port = "/dev/pts/3", not "sim"' in finding.text
-    assert "to keep them, write" in finding.mend
+    assert "to keep these values after a restart, write" in finding.mend
     assert "anew" not in finding.mend  # a restart would lead back to the simulator
 
 
@@ -228,7 +228,7 @@ CONFIG = Config(mcu=McuConfig(port="/dev/ttyX"))
     [
         (True, "try-reload-or-restart acsard-gateway acsard-web"),
         (True, "if the robot connects to a router, also `sudo systemctl reload acsard`"),
-        (False, "`acsard doctor` on that machine"),
+        (False, "`acsard doctor` on the daemon's machine"),
     ],
 )
 def test_a_certificate_in_use_that_ends_is_a_warning_with_its_mend(here: bool, mend: str) -> None:
@@ -246,7 +246,9 @@ def test_settings_that_differ_from_the_file_of_another_machine_are_a_warning(her
     running = seen(0.0, here=here)
     running = replace(running, state=replace(running.state, settings_differ="rates.state = 7.5"))
     told = [one.text for one in daemon(running) if one.subject == "configuration"]
-    words = "the settings in force differ from the robot's file: rates.state = 7.5"
+    words = (
+        "the daemon's settings differ from the configuration file on the robot: rates.state = 7.5"
+    )
     # On the daemon's own machine the doctor compares with the file itself.
     assert told == ([] if here else [words])
 
@@ -278,7 +280,7 @@ def test_a_port_that_is_closed_is_mended_at_the_port() -> None:
 def test_lines_that_are_not_answered_are_a_warning() -> None:
     (finding,) = found({"lines": 80, "lines_sent": 100}, {"lines": 160, "lines_sent": 200})
     assert finding.level == "warning"
-    assert "answered only 80 of 100 lines that were sent in a second" in finding.text
+    assert "answered only 80 of the 100 lines that the daemon sent in a second" in finding.text
     assert "mcu check" in finding.mend
 
 
@@ -301,14 +303,14 @@ def test_lines_that_did_not_count_are_told_by_kind_above_one_in_fifty() -> None:
 def test_a_link_that_went_because_this_computer_was_late_is_not_blamed_on_the_board() -> None:
     (late,) = found({}, {"link_lost": 3, "link_lost_host_stall": 3})
     assert "lost 3 times" in late.text
-    assert "this computer" in late.text
+    assert "the daemon's computer" in late.text
     assert "mcu check" not in late.mend
     late, board = found({}, {"link_lost": 5, "link_lost_host_stall": 3})
     assert "lost 2 times" in board.text
     assert "mcu check" in board.mend
     states = replace(STATE, counters={"link_lost": 2})
     (sim,) = link(Running(INFO, Config(), STATE, states, 0))
-    assert "this computer" in sim.text
+    assert "the daemon's computer" in sim.text
     assert "mcu check" not in sim.mend
     why = "this computer did not run for 0.80 s, and heard nothing"
     (finding,) = found({}, {}, link="stale", mode="waiting", reason=why)
@@ -326,7 +328,7 @@ def test_a_wheel_that_is_left_out_is_reported() -> None:
     [
         ("pressed", "warning", "emergency stop pressed at the robot"),
         ("silent", "failure", "the board has not reported its emergency stop for 0.5 s"),
-        ("released", "ok", "the board reports it, and it is released"),
+        ("released", "ok", "the board reports that the emergency stop is released"),
     ],
 )
 def test_the_emergency_stop_of_the_board_is_reported(state: str, level: str, text: str) -> None:
@@ -367,7 +369,7 @@ def test_a_bumper_that_only_limits_lets_the_robot_drive_away_before_a_clear() ->
     state = replace(STATE, bumpers=[True])
     *_, finding = link(Running(INFO, config, state, state, 0))
     assert finding.mend.startswith(
-        "drive away from it in a straight line; if the robot is stopped, release it at the robot"
+        "drive straight away from the obstacle; if the robot is stopped, release it at the robot"
     )
 
 
@@ -383,10 +385,12 @@ THRESHOLDS = BatteryConfig(warning_below=22.0, stop_below=21.0)
          "21.50 V; the mean is below battery.warning_below = 22 V", "charge it"),
         (BatterySummary(20.5, None, None, "stop"), "failure",
          "20.50 V; the mean is below battery.stop_below = 21 V",
-         "charge it to 21.5 V, then `acsard call clear`"),
+         "charge the battery to 21.5 V, then `acsard call clear`"),
         (BatterySummary(None, None, None, "unknown"), "warning",
          "the board has not reported its battery for 5 s", CHECK),
-        (None, "warning", "the board has not reported its battery, but [battery] has thresholds",
+        (None, "warning",
+         "the board has not reported its battery, but the configuration has thresholds in "
+         "[battery]",
          CHECK),
     ],
 )  # fmt: skip
@@ -441,6 +445,9 @@ def test_the_last_causes_of_lateness_are_shown_and_warn_only_if_periods_are_miss
     assert [one.text.rpartition("because ")[2] for one in findings] == [
         "it is 2", "it is 3", "it is 4",
     ]  # fmt: skip
-    assert "was late before 2027-01-15 08:00:05 UTC: by 0.14 s, because" in findings[-1].text
+    assert (
+        "missed control periods before 2027-01-15 08:00:05 UTC: by 0.14 s, because"
+        in findings[-1].text
+    )
     row = DiagnosticStatus(1, "acsard: control loop", "600 of 6000 periods missed", "acsar", [])
     assert {one.level for one in late(replace(calm, rows=(row,)))} == {"warning"}

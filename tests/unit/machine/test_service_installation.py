@@ -121,7 +121,7 @@ def test_what_is_as_installed_is_kept_and_the_commands_run_all_the_same() -> Non
 
 def test_somebody_else_s_file_is_overwritten_by_force_only() -> None:
     found = there(unit=b"mine", own=None)
-    with pytest.raises(MendableError, match=f"those of this version: {UNIT_FILE.path};"):
+    with pytest.raises(MendableError, match=f"this version of acsard installs: {UNIT_FILE.path};"):
         installing(ALL, found, force=False)
     steps = installing(ALL, found, force=True)
     assert [step for step in steps if isinstance(step, Write)] == [Write(UNIT_FILE), Write(OWN)]
@@ -178,9 +178,9 @@ def test_each_that_stays_says_why_and_what_removes_it() -> None:
     found = there(unit=b"mine", own=b"mine")
     steps = uninstalling(ALL, found, [tls, own], force=False)
     assert {step.path: step.why for step in steps if isinstance(step, Keep)} == {
-        UNIT_FILE.path: "it has been edited; --force removes it",
+        UNIT_FILE.path: "somebody has edited this file; --force removes it",
         STOP_FILE.path: f"{UNIT} stays and needs it",
-        OWN.path: "your configuration; --purge removes it",
+        OWN.path: "it is your configuration; --purge removes it",
         tls: "certificates and their authority; --purge removes it",
         own: "not the service's own; --purge removes it",
     }

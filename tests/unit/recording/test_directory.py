@@ -338,7 +338,7 @@ def test_a_file_that_a_disk_error_cut_is_finished_and_keeps_its_class(tmp_path: 
 def test_two_daemons_cannot_record_to_the_same_directory(tmp_path: Path) -> None:
     one = ring(tmp_path)
     writing = one.begin(about())
-    with pytest.raises(OSError, match="another daemon records there"):
+    with pytest.raises(OSError, match="another daemon records into this directory"):
         ring(tmp_path)
     assert writing.path.name.endswith(PART)
     assert writing.path.exists()

@@ -241,7 +241,7 @@ def test_a_device_or_a_pipe_is_never_replaced(path: Path, tmp_path: Path) -> Non
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     for kind in KINDS:
-        with pytest.raises(FileExistsError, match="it is a device or a pipe"):
+        with pytest.raises(FileExistsError, match="this path is a device or a pipe"):
             export(Recording(path), pipe, kind, force=True)
     assert pipe.is_fifo()
 
@@ -251,7 +251,7 @@ def test_a_recording_is_never_replaced(path: Path, tmp_path: Path) -> None:
     before = path.read_bytes()
     other.write_bytes(before)
     for recording in (other, path):
-        with pytest.raises(FileExistsError, match="it is a recording"):
+        with pytest.raises(FileExistsError, match="this file is a recording"):
             export(Recording(recording), other, "mcap", force=True)
     assert other.read_bytes() == before
 

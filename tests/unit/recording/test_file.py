@@ -229,7 +229,7 @@ def test_a_file_that_was_cut_before_its_first_chunk_is_refused_with_a_message(
         told = str(refused.value)
         assert (str(path) in told, told.isprintable()) == (True, True)
         if not tail:
-            lacks = "has no steps" if size >= config_end else "its beginning is missing"
+            lacks = "has no steps" if size >= config_end else "the beginning of the file is missing"
             assert lacks in told
 
 

@@ -86,7 +86,7 @@ def test_a_recorded_drive_replays_bit_by_bit(bench: Bench) -> None:
     result = replay_file(Recording(path))
     assert (result.comparison.same, result.comparison.exact, result.gaps) == (True, True, [])
     assert result.comparison.steps == bench.world.steps
-    assert [event.text for event in bench.said] == [f"to {bench.where}"]
+    assert [event.text for event in bench.said] == [f"the daemon records to {bench.where}"]
     assert bench.recorder.status.missing == 0
 
 
@@ -130,7 +130,9 @@ def test_if_the_queue_is_full_steps_are_lost_and_counted_and_the_loop_never_wait
     bench.world.drive(0.5, 0.2, seconds=1.0)
     while bench.recorder.status.missing == 0:
         bench.world.hold(0.5, 0.2, seconds=1.0)
-    assert bench.recorder.status.trouble == "the disk is too slow"
+    assert (
+        bench.recorder.status.trouble == "the disk is too slow, so steps of the recording are lost"
+    )
     bench.world.hold(0.5, 0.2, seconds=1.0)
     assert len(bench.recorder._queue) == most
     bench.drive(3.0)
@@ -138,7 +140,8 @@ def test_if_the_queue_is_full_steps_are_lost_and_counted_and_the_loop_never_wait
     assert bench.recorder.status.trouble == ""
     assert missing > 100
     before, after = bench.end()
-    told = [event.text for event in bench.said if event.text != f"to {bench.where}"]
+    works = f"the daemon records to {bench.where}"
+    told = [event.text for event in bench.said if event.text != works]
     assert told == [
         "the disk is too slow, so steps are missing in the recording",
         f"the disk keeps up again; {missing} steps are missing in the recording",
@@ -178,7 +181,7 @@ def test_a_disk_that_hangs_is_reported_after_three_seconds_and_so_is_its_return(
     assert (bench.said, bench.recorder.status.trouble) == ([], "")
     with slow_syncs(bench, 3.2):
         bench.write()
-    words = "the disk has accepted nothing for 3 s"
+    words = "the disk has accepted no data for 3 s"
     assert [(e.text, e.level) for e in bench.said] == [(f"{words}; driving goes on", "warning")]
     assert bench.recorder.status.trouble == words
     bench.drive(2.0)
@@ -194,7 +197,8 @@ def test_a_disk_that_takes_long_for_every_sync_is_reported_once(bench: Bench) ->
     bench.write()
     with slow_syncs(bench, 3.5):
         bench.drive(4.0)
-    assert [e.level for e in bench.said if e.text != f"to {bench.where}"] == ["warning"]
+    works = f"the daemon records to {bench.where}"
+    assert [e.level for e in bench.said if e.text != works] == ["warning"]
 
 
 @pytest.mark.slow
@@ -236,8 +240,9 @@ def test_a_disk_that_refuses_is_reported_and_tried_again_and_driving_goes_on(
     levels = [event.level for event in bench.said]
     assert levels == ["warning", "info"]
     missing = bench.recorder.status.missing
-    because = f"({where}: File exists)"
-    assert bench.said[-1].text == f"to {where} again; {missing} steps are missing {because}"
+    because = f"(the error was: {where}: File exists)"
+    again = f"the daemon records to {where} again; {missing} steps are missing"
+    assert bench.said[-1].text == f"{again} {because}"
     (path,) = bench.end()
     assert replay_file(Recording(path)).comparison.same
     assert next(steps(Recording(path))).number > 100
@@ -417,8 +422,10 @@ def test_a_bug_of_the_daemon_is_recorded_with_the_inputs_of_the_failed_step(
     assert step.number == number
     assert [one.verb for one in step.inputs.requests] == ["stop"]
     assert step.inputs.now.mono_ns <= bench.world.now_ns
-    assert "does not end this version" in result.failed_step
-    assert ("ends this version too, with ZeroDivisionError" in ended) is (broken == "robot")
+    assert "does not fail in this version" in result.failed_step
+    assert ("also fails in this version of acsard, with ZeroDivision" in ended) is (
+        broken == "robot"
+    )
     rewrite(recording, new := path.with_name("new.mcap"))
     assert read_end(new) == last
     assert replay_file(Recording(new)) == result

@@ -160,7 +160,7 @@ def test_chunks_whose_beginning_is_damaged_are_not_thrown_away(data: bytes, tmp_
     (begin, end), *_ = chunks(data)
     part.write_bytes(data[:8] + bytes(begin - 8) + data[begin:end])
     assert part.stat().st_size < NOTHING_BYTES
-    assert "cannot be finished" in recover(part, whole, "crash", room=True)
+    assert "cannot finish a recording" in recover(part, whole, "crash", room=True)
     assert list(tmp_path.iterdir()) == [whole]
 
 
@@ -201,7 +201,7 @@ def test_a_short_file_with_a_bad_sector_at_its_beginning_stays_and_is_reported(
     bad[begin : begin + 512] = bytes(512)
     assert len(bad) < NOTHING_BYTES
     part.write_bytes(bad)
-    assert "its file is a.mcap" in recover(part, whole, "crash", room)
+    assert "renamed its file to a.mcap" in recover(part, whole, "crash", room)
     assert whole.read_bytes() == bad
     assert not part.exists()
 
@@ -310,5 +310,5 @@ def test_an_empty_file_is_removed_and_an_unreadable_file_is_reported(tmp_path: P
         assert bool(said) == bool(told)
         assert list(tmp_path.iterdir()) == []
     part.write_bytes(b"\x89MC" + bytes(NOTHING_BYTES))
-    assert "cannot be finished" in recover(part, whole, "crash", room=True)
+    assert "cannot finish a recording" in recover(part, whole, "crash", room=True)
     assert list(tmp_path.iterdir()) == [whole]

@@ -132,7 +132,7 @@ def test_a_robot_with_a_wrong_part_is_refused_with_a_message(
     spoilt = replace_state(taped, freeze(robot, memory))
     spoilt.write(path := tmp_path / "spoilt.mcap", Config(), 100)
     recording = Recording(path)
-    words = r"spoilt\.mcap: this version cannot read the state at its start: "
+    words = r"spoilt\.mcap: this version of acsard cannot read the robot state at the start of "
     with pytest.raises(RecordingError, match=words):
         replay_file(recording)
     with pytest.raises(RecordingError, match=words):
@@ -164,7 +164,8 @@ def test_a_missing_part_that_a_new_robot_lacks_too_gives_a_message(tmp_path: Pat
 
     recording = of_older_code(tmp_path / "old.mcap", forget)
     words = (
-        r"old\.mcap: this version cannot read the state at its start: .*'arrived_ns'.* by acsard"
+        r"old\.mcap: this version of acsard cannot read the robot state at the start of the "
+        r"recording: .*'arrived_ns'.* by acsard"
     )
     with pytest.raises(RecordingError, match=words):
         replay_file(recording)

@@ -62,7 +62,7 @@ def test_a_recording_that_continues_another_begins_with_what_the_robot_does() ->
     assert entry.seconds == steps[0].inputs.now.wall_ns / 1e9
     assert entry.by == "app"
     assert entry.text == (
-        "this recording continues an earlier one: driving, link up, "
+        "this recording continues an earlier recording. The robot is now: driving, link up, "
         f"at x {x / 1e6:.2f} m, y {y / 1e6:.2f} m, yaw {math.degrees(yaw / 1e6):.1f} deg"
     )
     assert "continues" not in [other.name for other in others]
@@ -78,8 +78,8 @@ def test_without_a_link_a_recording_that_continues_another_begins_without_a_pose
     ]
     (entry,) = [entry for entry in [*entries, *writer.end()] if entry.name == "continues"]
     assert entry is entries[0]
-    assert "this recording continues an earlier one: waiting (" in entry.text
-    assert entry.text.endswith(", the pose is not known")
+    assert "continues an earlier recording. The robot is now: waiting (" in entry.text
+    assert entry.text.endswith(", the pose of the robot is not known")
 
 
 def test_a_drive_that_goes_on_at_the_last_step_has_an_entry() -> None:
@@ -148,7 +148,7 @@ def waits(first: str, second: str, seconds: float = 3.0) -> list[tuple[str, str]
 
 def test_a_sender_that_waits_for_another_source_or_sender_has_one_entry_with_both_names() -> None:
     somebody, eve = public_name("somebody"), public_name("eve")
-    text = "sends speeds and must wait: the robot follows"
+    text = "this sender must wait: the robot follows the speeds of"
     higher = f"{text} teleop ({somebody}), which has the higher priority"
     assert waits("teleop", "app") == [(higher, f"app ({eve})")]
     assert waits("app", "app") == [(f"{text} app ({somebody}), which came first", f"app ({eve})")]
@@ -202,7 +202,7 @@ def test_a_clock_that_was_set_has_an_entry_with_the_time_of_the_new_clock() -> N
     world.run(1.0)
     forward, back = [entry for entry in story(tape) if entry.name == "clock"]
     assert new_s - 1.1 < forward.seconds < new_s
-    assert "was set forward by 10 h, or this computer was suspended:" in forward.text
+    assert "was set forward by 10 h, or the computer was suspended:" in forward.text
     assert "was set back by 2 h:" in back.text
 
 
@@ -366,7 +366,7 @@ def test_a_summary_names_who_stopped_the_robot_and_counts_the_incidents() -> Non
         TimelineEntry(4.0, "command_refused", "old", count=7),
         TimelineEntry(5.0, "link_stale", "silent", "warning", count=2),
         TimelineEntry(6.0, "link_down", "gone", "warning", count=2),
-        TimelineEntry(7.0, "mcu_restarted", "has started", "warning", count=2),
+        TimelineEntry(7.0, "mcu_restarted", "has restarted", "warning", count=2),
     ]
     assert summary(events) == (
         "2 stops, 1 fault, 7 refused commands, 2 board silences, 2 lost ports, 2 board restarts "

@@ -50,7 +50,7 @@ def test_an_attack_is_refused_with_a_message_and_has_no_effect(
     name: str, said: dict[str, str]
 ) -> None:
     words = said[name]
-    assert "the state at its start" in words
+    assert "the robot state at the start" in words
     assert words.isprintable()
     assert len(words) < 300
 
@@ -96,7 +96,7 @@ def test_nesting_is_limited_in_depth_and_doubling_in_size() -> None:
         unpickle(nested(MAX_DEPTH + 1), part_class)
     most = MAX_PARTS.bit_length() - 2
     unpickle(whole(doubled(most)), part_class)
-    with pytest.raises(ValueError, match="more parts"):
+    with pytest.raises(ValueError, match="than that of any real robot"):
         unpickle(whole(doubled(most + 1)), part_class)
 
 

@@ -45,7 +45,7 @@ def test_a_source_that_sends_during_a_fault_has_only_the_fault_as_reason() -> No
 def test_a_source_that_is_not_configured_is_refused_among_the_others() -> None:
     (refused,) = spans(OTHERS)
     assert refused.kind == "refused"
-    assert refused.words == "not one of commands.sources"
+    assert refused.words == "this source is not in commands.sources"
 
 
 def test_an_invalid_message_is_refused_with_its_reason() -> None:

@@ -92,7 +92,7 @@ def test_one_command_of_99_m_s_does_not_flatten_the_speeds() -> None:
         mark = trace(figure, "commanded outside", axis)
         assert column(mark["customdata"]) == [wish]
         assert mark["marker"]["symbol"] == ["triangle-up" if wish > 0 else "triangle-down"]
-    assert "the furthest is 99 m/s and -50 rad/s." in figure.caption
+    assert "the largest of these is 99 m/s and -50 rad/s." in figure.caption
     assert ("▲", "commanded outside of the picture") in [(k.sign, k.meaning) for k in figure.keys]
 
 
@@ -127,7 +127,10 @@ def test_bands_show_the_reason_on_hover(figures: dict[str, Figure]) -> None:
     assert max(column(waits["x"])) > 1500  # in ms
     rows = [note["text"] for note in figures["sources"].layout["annotations"]]
     assert rows == ["mode", "link", "teleop", "nav", "others"]
-    assert "Silent all the time: app, ros2_control, dock." in figures["sources"].caption
+    assert (
+        "These sources were silent all the time: app, ros2_control, dock."
+        in figures["sources"].caption
+    )
 
 
 def drivers(figure: Figure) -> dict[str, tuple[str, str]]:

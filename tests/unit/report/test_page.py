@@ -155,9 +155,11 @@ def escaped_words(mark: Mark) -> str:
 def test_missing_steps_are_reported_at_the_top() -> None:
     _, steps = drive_of_two()
     report = report_from(steps[:200] + steps[260:])
-    notes = Origin("a", "r", "1", "3", ("no end: cut off, or still being recorded",))
+    notes = Origin(
+        "a", "r", "1", "3", ("the file has no end: it was cut off, or is still being recorded",)
+    )
     words = Read(page(report, notes, LIBRARY, clock)).words
-    assert "no end: cut off, or still being recorded" in words
+    assert "the file has no end: it was cut off, or is still being recorded" in words
     assert any(text.startswith("60 steps are missing: ") for text in words)
 
 

@@ -136,7 +136,7 @@ def test_the_events_of_a_clock_that_was_set_have_the_time_of_the_clock() -> None
     assert stop.seconds == pytest.approx(START.wall_ns / NS_PER_S - 3600 + 1.0, abs=0.1)
     assert stop.t == pytest.approx(1.0, abs=0.1)
     assert report.ended == steps[-1].inputs.now.wall_ns / NS_PER_S
-    assert any("was set during this time" in note for note in notes(report, ORIGIN))
+    assert any("was set during this recording" in note for note in notes(report, ORIGIN))
 
 
 def test_a_pose_that_was_set_adds_no_distance() -> None:

@@ -91,7 +91,7 @@ def test_a_number_is_asked_for_until_it_is_one_within_its_bounds(program: Progra
     with program.hears(JsonPrompt()) as person:
         assert person.number(DISTANCE) == 1.75
     assert program.told("question") == [1, 2, 3, 4, 5]
-    assert program.told("wrong") == ["type a number of m from 0.5 to 3"] * 4
+    assert program.told("wrong") == ["type a number in m, from 0.5 to 3"] * 4
     assert {key: program.said[0][key] for key in ("words", "unit", "least", "most")} == {
         "words": "How far?", "unit": "m", "least": 0.5, "most": 3.0,
     }  # fmt: skip
@@ -210,7 +210,9 @@ def test_silence_ends_what_moves_and_signs_of_life_do_not(
             program.say({})
             assert person.keys(0.05) == ""
         interrupted(program, lambda: person.keys(60.0))
-    assert "no sign of life from the operator arrived for 0.25 s" in capfd.readouterr().err
+    assert (
+        "the operator's page or program sent no sign of life for 0.25 s" in capfd.readouterr().err
+    )
 
 
 def test_a_question_waits_for_a_person_for_as_long_as_he_takes(

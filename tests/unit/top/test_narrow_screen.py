@@ -17,7 +17,7 @@ REASON = "the microcontroller's lines come 0.50 s apart; set mcu.reply_period = 
 FULL = of(
     mode="waiting",
     reason=REASON,
-    refused="source nav: NaN or infinity in its twist",
+    refused="source nav: the twist contains NaN or infinity",
     certificate_expiry="ends in 12 days",
     gyro="used",
     effective_track="learned 1.603 ± 0.032 (in use), configured 1.000",
@@ -39,7 +39,7 @@ def test_every_figure_is_on_a_screen_of_any_width(width: int) -> None:
         "10 3.0 s", "app has priority: wait until it is silent", "link up",
         "ends in 12 days", "in 100.0/s of 1,300", "out 100.0/s of 1,301", "superseded 12,345",
         "20.0/s of 220", "missed periods 3", "bus overrun 7", "malformed 30", "stale 4",
-        "NaN or infinity in its twist", "gyro used",
+        "the twist contains NaN or infinity", "gyro used",
         "track learned 1.603 ± 0.032 (in use), configured 1.000",
     ):  # fmt: skip
         assert figure in told, figure

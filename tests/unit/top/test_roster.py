@@ -279,7 +279,7 @@ def test_robots_beyond_what_is_kept_are_said_to_be_left_out(session: Session) ->
     assert fleet.seen == "all robots visible at tcp/127.0.0.1:7448: 3 robots"
     session.comes("robot3")
     assert [row.robot_id for row in fleet.rows()] == ["robot0", "robot1", "robot2"]
-    assert "more than 3 robots, and the others are left out" in fleet.more
+    assert "more than 3 robots, and this list leaves out the others" in fleet.more
     assert "--id" in fleet.more
 
 

@@ -75,7 +75,9 @@ def test_a_long_reason_goes_on_below_and_moves_nothing() -> None:
 
 
 def test_before_the_first_state_it_says_what_it_waits_for() -> None:
-    assert lines_of(ScreenData("acsar", "tcp/x:1", None))[1] == "waiting for the first state"
+    assert lines_of(ScreenData("acsar", "tcp/x:1", None))[1] == (
+        "waiting for the first state message of the daemon"
+    )
 
 
 @pytest.mark.parametrize("state", [STATE, None])
@@ -139,7 +141,13 @@ def test_more_warnings_take_one_line_of_a_wide_screen() -> None:
 def test_a_usual_screen_fits_80_by_24_with_nothing_cut() -> None:
     four = [*STATE.sources, SourceState("spare", 1, None, "a command")]
     counters = dict.fromkeys(STATE.counters, 10**7) | {"lines_superseded": 12_345}
-    told = lines_of(of(sources=four, counters=counters, refused="source nav: NaN or infinity"))
+    told = lines_of(
+        of(
+            sources=four,
+            counters=counters,
+            refused="source nav: the twist contains NaN or infinity",
+        )
+    )
     assert len(told) == 24
     assert max(map(cell_len, told)) == 80
     assert not any(line.endswith("…") for line in told)

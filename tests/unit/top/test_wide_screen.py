@@ -94,11 +94,11 @@ def test_missed_periods_are_counted_and_stand_out_while_they_grow() -> None:
 
 def test_rejects_are_told_by_reason_and_stand_out_while_they_grow() -> None:
     counters = {"line_malformed": 3, "line_implausible": 12, "command_stale": 4, "line_zero": 0}
-    seen = of(counters=counters, refused="source nav: NaN or infinity")
+    seen = of(counters=counters, refused="source nav: the twist contains NaN or infinity")
     assert line_with("rejected", seen).split(maxsplit=1)[1] == (
         "lines implausible 12, malformed 3 · commands stale 4"
     )
-    assert "source nav: NaN or infinity" in line_with("last one", seen)
+    assert "source nav: the twist contains NaN or infinity" in line_with("last one", seen)
     assert "\x1b[33mimplausible 12\x1b[0m" in painted(seen)
     assert "\x1b[33mimplausible" not in painted(replace(seen, before=seen.state))
     assert "nothing" in line_with("rejected")

@@ -115,7 +115,7 @@ def test_a_stop_ends_a_check_and_is_done_when_it_has_ended_and_the_daemon_says_s
     ended: bool,
 ) -> None:
     async def ends() -> Ending:
-        return Ending("the check of phone has ended", ended)
+        return Ending("the check started by phone has ended", ended)
 
     def served(query: zenoh.Query) -> None:
         with query:
@@ -130,12 +130,12 @@ def test_a_stop_ends_a_check_and_is_done_when_it_has_ended_and_the_daemon_says_s
 
     told = asyncio.run(story(None))
     assert not told.success, "no daemon has confirmed anything"
-    assert told.message.startswith("the check of phone has ended; ")
+    assert told.message.startswith("the check started by phone has ended; ")
     with zenoh.open(quiet()) as session:
         session.declare_queryable("acsard/acsar/srv/stop", served)
         told = asyncio.run(story(Client(session, "acsar", "teleop")))
     assert told.success == ended
-    assert told.message == "the check of phone has ended; stopped"
+    assert told.message == "the check started by phone has ended; stopped"
 
 
 async def test_a_stop_of_another_robot_is_told_to_it_however_many_are_waited_for() -> None:

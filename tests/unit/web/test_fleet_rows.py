@@ -83,7 +83,7 @@ async def test_a_robot_that_is_present_and_silent_is_not_shown_in_its_last_mode(
     await row(fleet, lambda one: one.mode == STATE.mode)
     silent = await row(fleet, lambda one: one.mode is None)
     assert (silent.speed, silent.link, silent.place) == (None, "", None)
-    assert silent.reason == f"it was {STATE.mode}"
+    assert silent.reason == f"the robot was {STATE.mode}"
     assert silent.age is not None
     token.undeclare()
     fleet.leave(1)

@@ -86,12 +86,15 @@ async def test_a_recording_that_has_grown_is_drawn_anew_and_one_that_has_not_is_
 @each(
     ("program", "why"),
     [
-        ("import sys; sys.exit('acsard: needs the library plotly; run: pip')", "needs the library"),
-        ("raise MemoryError", "memory: draw it on another machine"),
+        (
+            "import sys; sys.exit('acsard: this command needs the library plotly')",
+            "needs the library",
+        ),
+        ("raise MemoryError", "memory: draw the report on another machine"),
         ("{}['x']", "KeyError: 'x'"),
         ("import os; os.kill(os.getpid(), 9)", "most likely because memory ran out"),
         ("import os; os.kill(os.getpid(), 15)", "was ended by signal 15"),
-        (f"import sys; sys.stdout.write('x' * {BYTES + 1})", "draw a part of it"),
+        (f"import sys; sys.stdout.write('x' * {BYTES + 1})", "draw a part of the recording"),
     ],
 )
 async def test_what_fails_says_why_and_is_tried_anew_when_it_is_asked_for_again(

@@ -93,7 +93,7 @@ def test_a_name_is_given_once_and_an_unknown_one_cannot_be_revoked(tmp_path: Pat
     vault.invite("viewer", "tv", 1)
     with pytest.raises(UsageError, match="--revoke"):
         vault.invite("operator", "tv", 1)
-    with pytest.raises(UsageError, match="its tokens: tv"):
+    with pytest.raises(UsageError, match="the robot's tokens: tv"):
         vault.revoke("phone")
 
 
@@ -116,7 +116,7 @@ def test_robots_that_share_the_file_know_their_own_tokens_alone(tmp_path: Path) 
     assert first.left_s(token.digest) == 0
     first.revoke("phone")
     assert (first.all(), [one.name for one in second.all()]) == ([], ["phone"])
-    with pytest.raises(UsageError, match="its tokens: none"):
+    with pytest.raises(UsageError, match="the robot's tokens: none"):
         first.revoke("phone")
 
 

@@ -46,7 +46,7 @@ def test_one_sentence_says_what_to_do_about_the_largest_that_was_measured(
     cause: Cause, says: str
 ) -> None:
     told = advice(of((cause, 100.0, "measured"), KNOWN))
-    assert told.startswith(f"the largest measured cause is {cause}: ")
+    assert told.startswith(f"the largest measured cause of errors is {cause}: ")
     assert says in told
 
 
@@ -57,19 +57,21 @@ def test_coarse_encoders_are_named() -> None:
 def test_coarse_encoders_whose_counts_nobody_knows_come_first() -> None:
     told = advice(of(("time", 100.0, "measured"), KNOWN, coarse=True))
     assert told.startswith("the encoders are coarse")
-    assert "write mcu.encoder_counts" in told
+    assert "as mcu.encoder_counts" in told
 
 
 def test_what_is_only_declared_does_not_hide_what_was_measured() -> None:
     told = advice(of(("slip", 900.0, "settings"), ("time", 50.0, "measured"), KNOWN))
-    assert told.startswith("according to the settings in [odometry], the largest cause is slip")
-    assert "the largest measured cause is time" in told
+    assert told.startswith(
+        "according to the settings in [odometry], the largest cause of errors is slip"
+    )
+    assert "the largest measured cause of errors is time" in told
 
 
 def test_who_never_calibrated_is_told_so_first() -> None:
     told = advice(of(("time", 50.0, "measured"), ("parameters", None, "unknown")))
-    assert told.startswith("the error of wheel radii and track width is unknown")
-    assert "the largest measured cause is time" in told
+    assert told.startswith("the errors of the configured wheel radii and track width are unknown")
+    assert "the largest measured cause of errors is time" in told
 
 
 def test_without_an_error_it_says_so() -> None:
@@ -109,6 +111,6 @@ def test_a_robot_that_stands_is_told_what_settings_tell_and_to_drive() -> None:
     told = text(of(("parameters", 7.2, "settings"), still=True))
     assert "stands still" in told
     assert "0.10 mm/s" in told
-    assert "7.20 deg a turn" in told
+    assert "7.20 deg in a full turn" in told
     assert "Drive the robot" in told
     assert "never calibrated" in text(of(("parameters", None, "unknown"), still=True))

@@ -114,7 +114,7 @@ STOPS: dict[str, Late] = {
     "the daemon receives no command of source app": changed(
         sources=[SourceState("app", 50, 3.0, "a command")]
     ),
-    "no command of source app has arrived for 0.4 s": changed(
+    "the daemon has received no command of source app for 0.4 s": changed(
         sources=[SourceState("app", 50, 3.0, "")]
     ),
     "app is not one of commands.sources": changed(sources=[SourceState("nav", 50, 0.01, "")]),
@@ -124,7 +124,7 @@ STOPS: dict[str, Late] = {
 
 
 PASSING = {
-    "no command of source app has arrived for 0.4 s", "although 0.30 is commanded",
+    "the daemon has received no command of source app for 0.4 s", "although 0.30 is commanded",
     "sends no feedback",
 }  # fmt: skip
 """The stops of `STOPS` that may not happen again."""
@@ -172,8 +172,10 @@ def test_of_two_calibrations_the_one_that_is_followed_goes_on() -> None:
 def test_of_two_calibrations_the_other_says_who_drives_and_moves_nothing() -> None:
     world = of_two(LEG, OTHER).run(OPENED_S + 0.5)
     assert set(world.said) == {REST}
-    assert world.driver.halted.startswith(f"another program, {OTHER}, drives the robot as app")
-    assert "end it, or wait" in world.driver.halted
+    assert world.driver.halted.startswith(
+        f"another program, {OTHER}, drives the robot as source app"
+    )
+    assert "end that program, or wait" in world.driver.halted
 
 
 def test_one_whose_robot_another_takes_on_the_way_says_so_at_once() -> None:
@@ -194,7 +196,10 @@ def test_a_daemon_that_falls_silent_stops_it() -> None:
     world.speaks = False
     world.run(QUIET_S + 2 * TICK)
     assert world.said[-1] == REST
-    assert world.driver.halted == "nothing received from the daemon: does it run (`acsard doctor`)?"
+    assert (
+        world.driver.halted
+        == "no messages of the daemon arrive: does the daemon run (`acsard doctor`)?"
+    )
     assert world.driver.silent
     assert not world.driver.disturbed
 

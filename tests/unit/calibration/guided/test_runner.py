@@ -79,7 +79,7 @@ def test_a_disturbed_leg_is_repeated_and_the_result_is_right(
     assert np.all(np.abs(values - expected.values) < 4 * expected.std)
     said = " ".join(capsys.readouterr().err.split())
     assert "was disturbed: a person stood in the way" in said
-    assert "set the robot back" in said
+    assert "put the robot back" in said
 
 
 def test_a_leg_that_is_disturbed_three_times_ends_the_drive() -> None:
@@ -94,4 +94,4 @@ def test_on_the_simulator_a_leg_is_repeated_more_often_and_nobody_sets_it_back(
 ) -> None:
     drive = Disturbed("gyro", "turns", MOST_SIMULATED_REPEATS)
     assert drive.found(simulated=True).multipliers.values[0] > 0.9
-    assert "set the robot back" not in capsys.readouterr().err
+    assert "put the robot back" not in capsys.readouterr().err

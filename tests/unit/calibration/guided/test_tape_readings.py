@@ -137,7 +137,7 @@ def test_two_distances_from_a_line_are_an_angle(angle: float, apart: float) -> N
 
 
 def test_distances_that_no_robot_can_have_are_refused() -> None:
-    with pytest.raises(RefusedError, match="measure again"):
+    with pytest.raises(RefusedError, match="measure anew"):
         slant(0.1, 0.5, 0.25)
 
 
@@ -192,7 +192,7 @@ def test_people_read_it_and_the_configuration_takes_it() -> None:
     made = calibrated("a tape", readings(), DRIVE, OdometryConfig())
     told = plain(*parts(report("the drive", made, DRIVE, ""), made, "acsard.toml"))
     assert "compared with a tape" in told
-    assert "error of a turn of 360 deg" in told
+    assert "heading error after a turn of 360 deg" in told
     config = parse("\n".join(excerpt(keys(made))).encode())
     assert config.drive.wheel_separation_multiplier == pytest.approx(1.5, rel=0.02)
     assert 0 < config.odometry.wheel_separation_multiplier_std < 0.2

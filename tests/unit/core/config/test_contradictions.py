@@ -47,8 +47,8 @@ def test_a_tls_endpoint_needs_certificates(endpoint: str) -> None:
 def test_the_gateway_needs_a_way_to_the_daemon() -> None:
     (line,) = problems(bus=BusConfig(listen=("tls/0.0.0.0:7449",), tls="/etc/acsard/tls"))
     assert line == (
-        'bus.listen = ["tls/0.0.0.0:7449"]: the TLS gateway reaches the daemon through a tcp '
-        f'address on this machine, and none is listed; add "{HERE}"'
+        'bus.listen = ["tls/0.0.0.0:7449"]: the TLS gateway needs a tcp address of '
+        f'this machine to reach the daemon, but the list has none; add "{HERE}"'
     )
 
 
@@ -122,7 +122,7 @@ def test_checked_lines_take_more_of_the_wire() -> None:
         "control.rate = 25: a line of 41 B at 9600 baud takes 42.7 ms, so at most 23 Hz is "
         "possible, and 18 Hz uses 80 % of the wire; "
         'write mcu.baud_rate = 19200 or more; or control.rate = 18 or "auto"; or '
-        'mcu.link_check = "off" (lines of 33 B)'
+        'mcu.link_check = "off", which shortens the lines to 33 B'
     )
     assert Config(mcu=mcu, control=ControlConfig(rate="auto")).rate_hz == 18
 
@@ -134,7 +134,7 @@ def test_the_sample_fields_take_more_still() -> None:
         "control.rate = 100: a line of 62 B at 57600 baud takes 10.8 ms, so at most 92 Hz is "
         "possible, and 74 Hz uses 80 % of the wire; "
         'write mcu.baud_rate = 115200 or more; or control.rate = 74 or "auto"; or '
-        "mcu.encoder_counts = 0 (lines of 41 B)"
+        "mcu.encoder_counts = 0, which shortens the lines to 41 B"
     )
     assert problems(mcu=mcu, control=ControlConfig(rate=92)) == []
     (warning,) = warnings(

@@ -175,7 +175,7 @@ def test_a_setting_that_cannot_be_set_is_reported_with_the_remedy(
 def test_of_many_that_cannot_be_set_one_is_explained() -> None:
     first, more = problems({f"limits.no{n}": 1.0 for n in range(100)})
     assert "limits.no0" in first
-    assert more == "and 99 more that cannot be set"
+    assert more == "and 99 more of these keys cannot be set"
 
 
 # while it drives

@@ -115,7 +115,7 @@ def test_what_needs_a_timer_is_told_where_it_goes() -> None:
 def test_what_is_no_list_of_short_texts_is_told_as_of_any_key(faults: str) -> None:
     (told,) = problems(faults)
     assert told.startswith("sim.faults = ")
-    assert "expected a list, each a fault of `acsard sim --fault` in quotes" in told
+    assert "expected a list, each a fault that `acsard sim --fault` accepts, in quotes" in told
 
 
 def test_a_simulator_with_faults_is_a_surprise_and_a_device_has_none() -> None:

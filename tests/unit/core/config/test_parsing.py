@@ -294,7 +294,7 @@ PLANTED = [
         "write 0.1 or less and make the firmware report more often; "
         "or write feedback.fault_time = 0.3",
     ),
-    ("[bus]\nlisten = []", "bus.listen", "[]", 'write ["tcp/127.0.0.1:7448"]'),
+    ("[bus]\nlisten = []", "bus.listen", "[]", 'write bus.listen = ["tcp/127.0.0.1:7448"]'),
     ('[bus]\nlisten = ["7448"]', "bus.listen", '"7448"', 'like "tcp/127.0.0.1:7448"'),
     ('[bus]\nconnect = ["tcp/10.0.0.2:1"]', "bus.connect", '"tcp/10.0.0.2:1"', "insecure = true"),
     (

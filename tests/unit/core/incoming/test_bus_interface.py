@@ -86,9 +86,9 @@ def test_a_router_that_is_missing_from_the_start_is_reported_and_counted() -> No
     daemon = Daemon()
     (event,) = daemon.hears((), (A,))
     assert (event.name, event.level) == ("router_missing", "warning")
-    assert (
-        event.text
-        == f"not connected to {A}; the daemon tries again until it connects, and driving goes on"
+    assert event.text == (
+        f"not connected to {A}; the daemon tries again until it connects, and the robot can drive "
+        "meanwhile"
     )
     assert daemon.counters == {"router_missing": 1}
 

@@ -573,7 +573,10 @@ def test_the_outcome_is_an_event() -> None:
         bench.talk()
         told += bench.session.events
     (outcome,) = [event for event in told if event.name == "link_check"]
-    assert (outcome.level, outcome.text) == ("info", "the serial lines are checked")
+    assert (outcome.level, outcome.text) == (
+        "info",
+        "the form of the lines on the serial port is now checked",
+    )
 
 
 def test_a_refusal_is_an_event_and_the_reason() -> None:

@@ -390,7 +390,7 @@ def test_the_counts_that_the_lines_show_are_in_state_and_on_the_links_row() -> N
         (
             RoutersStatus(("a", "b"), peers=("b",)),
             1,
-            "connected; b is not a router: clients that connect here see only this robot",
+            "connected; b is not a router: clients that connect to this daemon see only this robot",
             {"a": "connected", "b": "a peer, not a router"},
         ),
     ],

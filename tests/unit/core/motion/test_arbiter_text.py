@@ -35,8 +35,8 @@ SENTENCES = [
     (
         Wait("neutral", "nav", 1.0, lasts=3.0, ros=True),
         "send a zero first: nav must send a zero before it can drive; it has sent speeds for over "
-        '3 s (`ros2 topic pub` of a speed never sends a zero; "After a clear" in '
-        "deploy/ros2/README.md lists tools that do)",
+        '3 s (`ros2 topic pub` with a speed never sends a zero; the section "After a clear" of '
+        "deploy/ros2/README.md lists tools that send one)",
     ),
     (Wait("zeros", "app", lasts=3.0), "held by app, which has sent only zeros for over 3 s"),
     (

@@ -145,7 +145,7 @@ def test_the_stop_is_reported_once_and_held_until_the_hysteresis() -> None:
     pack.at(20.9, 5.0)
     assert (pack.stops, pack.battery.held) == (1, True)
     assert pack.battery.why == "battery below battery.stop_below = 21 V"
-    assert pack.battery.mend == "charge it to 21.4 V"
+    assert pack.battery.mend == "charge the battery to 21.4 V"
     pack.at(21.3, 60.0)
     assert pack.battery.held
     pack.at(24.0, 10.0)
@@ -156,12 +156,12 @@ def test_the_stop_is_reported_once_and_held_until_the_hysteresis() -> None:
     first, *_, last = pack.events
     assert first == (
         "battery_stop",
-        "20.90 V; the mean is below battery.stop_below = 21 V; charge it to 21.4 V, then call "
-        "srv/clear",
+        "20.90 V; the mean is below battery.stop_below = 21 V; charge the battery to 21.4 V, then "
+        "call srv/clear",
     )
-    assert [text for _, text in pack.events if text.endswith("stays stopped until srv/clear")] == [
+    assert [text for _, text in pack.events if text.endswith("until srv/clear is called")] == [
         "24.00 V; the mean is below battery.return_below = 21.5 V; the robot stays stopped until "
-        "srv/clear"
+        "srv/clear is called"
     ]
     assert last[0] == "battery_stop"
 

@@ -135,7 +135,8 @@ def test_a_press_counts_at_once_and_a_release_ends_it() -> None:
         Event("bumper_pressed",
               "front bumper pressed; release it at the robot, then call srv/clear",
               "error"),
-        Event("bumper_released", "released; a stop stays latched until srv/clear"),
+        Event("bumper_released",
+              "the bumpers are released; a latched stop lasts until srv/clear is called"),
     ]  # fmt: skip
 
 
@@ -175,10 +176,11 @@ def test_a_release_says_that_a_stop_stays_only_if_there_is_one() -> None:
     pins.step("..")
     pins.step("X.")
     pins.step("..")
-    assert pins.events[-1].text == "released; the bumpers allow every direction again"
+    assert pins.events[-1].text == "the bumpers are released and allow every direction again"
     pins.quiet(600)
     pins.step("..")
-    assert pins.events[-1].text == "released; a stop stays latched until srv/clear"
+    told = "the bumpers are released; a latched stop lasts until srv/clear is called"
+    assert pins.events[-1].text == told
 
 
 def test_bumpers_with_places_are_missing_until_the_board_reports_their_number() -> None:

@@ -177,7 +177,7 @@ def test_a_number_is_not_used_again_after_a_restart_with_a_wall_clock_that_went_
     second = Lifecycle(active=True, latches=first.latches.after_restart())
     second.stop("joe", ns(3.0), Instant(ns(3.0), 0))
     assert number(second) > max(numbers)
-    with pytest.raises(RefusedError, match=f"latch {numbers[0]} is not in force"):
+    with pytest.raises(RefusedError, match=f"latch {numbers[0]}, which is not the latest one"):
         second.clear(numbers[0], ns(3.1), Instant(ns(3.1), 0))
 
 
@@ -240,7 +240,7 @@ def test_a_release_that_arrived_before_the_latch_is_refused(
 def test_a_release_of_the_same_step_as_the_latch_is_refused(held: Held) -> None:
     life = ready()
     held.hold(life, 1.0, "ann")
-    with pytest.raises(RefusedError, match="at the time of this call or later"):
+    with pytest.raises(RefusedError, match="at the same time as this call or after it"):
         getattr(life, held.verb)(number(life), ns(1.001), at(1.0))
 
 
@@ -274,8 +274,9 @@ def test_a_release_that_names_another_latch_is_refused(held: Held, none: bool) -
     with pytest.raises(RefusedError) as caught:
         {"clear": clear, "activate": activate}[held.verb](life, 20.0, seen)
     assert str(caught.value) == (
-        f"latch {seen} is not in force; the robot is still {held.said} by joe: look at it, then "
-        f"call srv/{held.verb} again"
+        f"this call names latch {seen}, which is not the latest one; the robot is still "
+        f"{held.said} by joe: look at the robot, then call srv/{held.verb} again with the latest "
+        "number"
     )
     assert mode(life) is held.mode
 
@@ -411,7 +412,7 @@ def test_a_pressed_emergency_stop_is_latched_and_says_what_to_do() -> None:
         clear(life, 9.0, number(life))
     assert str(caught.value) == f"{PRESSED}: release it at the robot, then call srv/clear again"
     life.hold("", "", ns(9.2))
-    with pytest.raises(RefusedError, match="came before the release: call srv/clear again"):
+    with pytest.raises(RefusedError, match="before the cause of the stop or fault had ended"):
         life.clear(number(life), ns(9.2), at(9.3))
     assert (mode(life), life.why) == (Mode.STOPPED, f"{latched}; call srv/clear")
     assert clear(life, 9.5, number(life)).startswith("cleared; ")
@@ -477,8 +478,8 @@ def test_a_press_after_a_release_is_a_new_latch() -> None:
     with pytest.raises(RefusedError) as caught:
         clear(life, 9.0, seen)
     assert str(caught.value) == (
-        f"latch {seen} is not in force; the robot is still stopped ({PRESSED}): look at it, then "
-        "call srv/clear again"
+        f"this call names latch {seen}, which is not the latest one; the robot is still stopped "
+        f"({PRESSED}): look at the robot, then call srv/clear again with the latest number"
     )
 
 
@@ -519,7 +520,7 @@ def test_an_activate_of_an_active_robot_changes_nothing_whatever_it_names() -> N
 
 def test_a_robot_that_starts_switched_off_has_the_number_0() -> None:
     life = ready(active=False)
-    with pytest.raises(RefusedError, match="latch 7 is not in force; the robot is still switched"):
+    with pytest.raises(RefusedError, match="latch 7, which is not the latest one; the robot"):
         activate(life, 1.0, 7)
     assert activate(life, 1.0, 0)
 

@@ -82,7 +82,7 @@ def test_a_file_that_cannot_be_used_is_an_error_that_names_it(
         named.unlink()
     else:
         named.write_text(text)
-    with pytest.raises(UsageError, match="the file in ACSARD_CONFIG") as error:
+    with pytest.raises(UsageError, match="which ACSARD_CONFIG names") as error:
         address_by_environment(None, "r8", "")
     assert words in str(error.value)
     assert str(named) in str(error.value)

@@ -58,7 +58,7 @@ def test_a_silent_robot_leads_to_questions_first_about_the_id_and_to_no_claim() 
     nobody = Identity("", "anna", "joe/1/aa", "robot1", "tls/a.local:7449")
     for told in (nobody.words(), nobody.lacks("state"), nobody.lacks("srv/stop")):
         assert told.startswith("no daemon answers as 'robot1' at tls/a.local:7449")
-        assert "asked: acsard/robot1/whoami/viewer" in told
+        assert "queried key: acsard/robot1/whoami/viewer" in told
         assert told.index("is --id right") < told.index("daemon run") < told.index("role's list")
         assert "your certificate, anna," in told
         assert "add" not in told

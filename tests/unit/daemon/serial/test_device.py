@@ -39,11 +39,13 @@ def path() -> Iterator[str]:
         (errno.EPERM, Exit.NO_PERMISSION, "dialout"),
         (errno.EBUSY, Exit.IN_USE, "in use by another process"),
         (errno.EAGAIN, Exit.IN_USE, "in use by another process"),
-        (errno.EIO, Exit.FAILURE, "the driver did not answer"),
+        (errno.EIO, Exit.FAILURE, "the driver of the serial port did not answer"),
     ],
 )
 def test_each_error_has_its_code_and_its_words(number: int, code: Exit, words: str) -> None:
-    refused = refusal("/dev/acsar_that_is_not", OSError(number, "the driver did not answer"))
+    refused = refusal(
+        "/dev/acsar_that_is_not", OSError(number, "the driver of the serial port did not answer")
+    )
     assert refused.code is code
     assert str(refused).count("/dev/acsar_that_is_not") == 1
     assert words in str(refused)
