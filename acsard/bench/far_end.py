@@ -19,7 +19,7 @@ from acsard.bench.matching import Seen, staircase
 from acsard.core.config.parsing import from_builtins
 from acsard.core.config.settings import Config
 from acsard.core.simulator.fake_mcu import FakeMcu
-from acsard.daemon.serial.simulated_board import PtyEnd
+from acsard.daemon.serial.simulator_pty import PtyEnd
 from acsard.host import clock
 from acsard.host.timerfd import TimerFd
 

@@ -22,7 +22,7 @@ from acsard.core.config.motion_rules import LONGEST_REPLY_S
 from acsard.core.config.settings import McuConfig, WheelMap
 from acsard.core.config.wire_time import line_bytes, wire_ns
 from acsard.core.link.board_status import STATUS, decode_status
-from acsard.core.link.checksum import ASK_SAMPLE, SEQUENCES, seal, unseal
+from acsard.core.link.checked_line import ASK_SAMPLE, SEQUENCES, seal, unseal
 from acsard.core.link.codec import LETTERS, Codec, FrameError, Motors
 from acsard.core.link.lines import LineReader
 from acsard.core.link.link_diagnosis import Heard

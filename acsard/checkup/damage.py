@@ -8,7 +8,7 @@ from acsard.checkup import outcomes
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding
 from acsard.checkup.motion import GLANCE_S, SPEED, ZERO, moving
-from acsard.core.link.checksum import seal
+from acsard.core.link.checked_line import seal
 from acsard.core.link.codec import LETTERS
 
 WHOLE = {"over-long", "garbage before it"}

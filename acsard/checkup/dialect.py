@@ -16,7 +16,7 @@ from acsard.checkup.findings import Finding, StoppedError, motor_name
 from acsard.checkup.motion import BOOT_S, CUT_S, GLANCE_S, ZERO, Reply
 from acsard.core.config.settings import Baud
 from acsard.core.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
-from acsard.core.link.checksum import seal
+from acsard.core.link.checked_line import seal
 from acsard.core.link.session import IDENTITY
 
 

@@ -15,7 +15,7 @@ from statistics import fmean
 from msgspec import Struct
 
 from acsard.core.config.wire_time import FIELD
-from acsard.core.link.checksum import Reading
+from acsard.core.link.checked_line import Reading
 from acsard.core.link.codec import Motors
 
 # Bounds, s, of a measured watchdog time that agrees with the firmware's contract, `WATCHDOG_S`.

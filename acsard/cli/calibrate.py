@@ -272,7 +272,7 @@ def _usable(args: argparse.Namespace, odometry: str) -> None:
         )
     if not (args.yes or args.json_lines or sys.stdin.isatty()):
         raise UsageError(
-            "calibrate drives the robot, and a person at the terminal starts and stops "
+            "`acsard calibrate` drives the robot, and a person at the terminal starts and stops "
             "each leg: run `acsard calibrate` in a terminal. Without a terminal, use --yes (only "
             "with the built-in simulator), or --log with a recorded drive"
         )

@@ -98,7 +98,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="run the recorded inputs through the program again, without a robot, and compare the "
         "results",
         description="Run the recorded inputs through the program again, without a robot, and "
-        "compare every line to the board, pose, mode, reason and event with the recorded ones. "
+        "compare each line for the board, pose, mode, reason and event with the recorded one. "
         "With --config, show what another configuration would have changed. A part that cannot be "
         "read because of damage is not compared. Exit codes: 0 everything is the same, 1 something "
         "differs, 65 a part was not compared and the rest is the same.",
@@ -453,7 +453,7 @@ def _range(args: argparse.Namespace) -> tuple[float, float]:
     """Return the times of --from and --to, s since 1970; infinite for an option that is missing."""
     if any(isinstance(when, Offset) for when in (args.begin, args.end)):
         raise UsageError(
-            "--from or --to in seconds counts from the beginning of one recording: either name "
+            "--from and --to in seconds count from the beginning of one recording: either name "
             f"that recording, or write a time, for example {EXAMPLES}"
         )
     try:

@@ -16,7 +16,7 @@ from acsard.cli.common import add_config, load
 from acsard.core.config.named_faults import FAULTS, INPUTS, RESET, NamedFault, forms, named
 from acsard.core.config.settings import Config
 from acsard.core.simulator.fake_mcu import FakeMcu
-from acsard.daemon.serial.simulated_board import SimPty
+from acsard.daemon.serial.simulator_pty import SimPty
 from acsard.host import clock
 from acsard.host.errors import UsageError
 

@@ -33,7 +33,7 @@ from acsard.daemon.latch_file import LatchFile
 from acsard.daemon.late_watch import LateWatch
 from acsard.daemon.robot_description import robot_description
 from acsard.daemon.serial.port import SerialPort
-from acsard.daemon.serial.simulated_board import Simulated
+from acsard.daemon.serial.simulator_pty import Simulated
 from acsard.daemon.settings_file import SettingsFile
 from acsard.daemon.supervisor import GATEWAY, PAGE, keep_running
 from acsard.daemon.wakeup import Next, Ticker, Wakeup

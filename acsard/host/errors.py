@@ -33,7 +33,7 @@ WORDS: dict[int, str] = {
     Exit.INCOMPLETE: "part of the recording is damaged",
     Exit.NO_PORT: "no such port",
     Exit.UNREACHABLE: "daemon unreachable",
-    Exit.IN_USE: "another process uses the port, bus address or robot id",
+    Exit.IN_USE: "port, bus address or robot id in use",
     Exit.NO_PERMISSION: "no permission",
     Exit.BAD_CONFIG: "bad configuration",
 }

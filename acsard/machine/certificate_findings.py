@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from acsard.core.config.settings import TLS, Config
-from acsard.core.messages.expiry import expiry, first
+from acsard.core.messages.certificate_expiry import expiry, first
 from acsard.daemon.bus.certificate_watch import ends_of
 from acsard.daemon.bus.tls import (
     AUTHORITY,

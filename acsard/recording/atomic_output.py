@@ -86,7 +86,10 @@ def _require_free(new: Path, force: bool, may_replace: Callable[[Recording], boo
     elif new.exists() and not new.is_file():
         raise FileExistsError(EEXIST, "this path is a device or a pipe, not a file; name a file")
     elif new.is_file() and (recording := _recording(new)) and not may_replace(recording):
-        raise FileExistsError(EEXIST, "this file is a recording of acsard; name another file")
+        raise FileExistsError(
+            EEXIST,
+            "this file is a recording of acsard, and would be overwritten; name another file",
+        )
     if not force:
         raise FileExistsError(EEXIST, "this path exists already; --force overwrites it")
 

@@ -151,7 +151,7 @@ class EndRecordBuilder:
             self._incidents.append(event)
 
     def end_record(self, cut: str = "", why: str = "") -> EndRecord:
-        """Return the end record for the messages so far, with the cause `cut` and `why`."""
+        """Return the end record so far. `cut` is the kind of end; `why` explains it in words."""
         text = summary(self._incidents, self._starts)
         return EndRecord(self._wall_ns, self._last_ns, text, cut, why, self._earliest_ns)
 

@@ -423,7 +423,7 @@ ROUTES: tuple[Route, ...] = (
     Route("POST", "/api/recordings/{name}/report", RECORDINGS, Page.draw,
         "starts to draw the report of a recording, or returns the progress; repeat the request "
         "until its status is 200",
-        gives={200: Body("The report is drawn; get it at `href`.", ReportState),
+        gives={200: Body("The report is ready; get it at `href`.", ReportState),
                202: Body("This report or another one is being drawn.", ReportState),
                503: Body("The report cannot be drawn; the reason is in the answer.", ReportState)}),
     Route("GET", "/report/{name}", RECORDINGS, Page.report,

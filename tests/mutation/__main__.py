@@ -40,7 +40,7 @@ CORE = (
     "acsard/core/motion",
     "acsard/core/guard.py",
     "acsard/core/link/board_status.py",
-    "acsard/core/link/checksum.py",
+    "acsard/core/link/checked_line.py",
     "acsard/core/link/encoders.py",
     "acsard/core/link/codec.py",
     "acsard/core/link/negotiation.py",

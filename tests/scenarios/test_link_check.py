@@ -24,7 +24,7 @@ from acsard.core.config.settings import (
     SimConfig,
     WheelMap,
 )
-from acsard.core.link.checksum import unseal
+from acsard.core.link.checked_line import unseal
 from acsard.core.link.codec import Codec, FrameError
 from acsard.core.link.lines import LineReader
 from acsard.core.messages.schema import DiagnosticArray

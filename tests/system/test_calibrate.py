@@ -418,7 +418,7 @@ def test_positions_that_are_missing_or_of_another_type_are_reported(
     monkeypatch.setattr(robot_on_bus, "FIRST_S", 0.2)
     with router(free) as said, client_session(free, "") as heard:
         sensor = Sensor(heard, "slam/pose", POSITIONS)
-        with pytest.raises(GuideError, match="does not arrive on slam/pose"):
+        with pytest.raises(GuideError, match="does not arrive on the Zenoh key slam/pose"):
             sensor.await_first("a position")
 
         def came() -> int:

@@ -578,7 +578,7 @@ def test_get_of_several_robots_names_the_one_that_does_not_answer(shared: Daemon
     assert ended.code == Exit.UNREACHABLE
     (line,) = ended.out.splitlines()
     assert json.loads(line)["robot"] == "acsar"
-    assert ended.err.startswith("other: NO ANSWER: no answer on acsard/other/info")
+    assert ended.err.startswith("other: NO ANSWER: no answer on the Zenoh key acsard/other/info")
 
 
 def test_get_of_a_service_does_not_call_it(shared: Daemon, bus: Bus) -> None:

@@ -21,7 +21,7 @@ import pytest
 import serial
 
 from acsard.core.config.settings import McuConfig
-from acsard.core.link.checksum import seal
+from acsard.core.link.checked_line import seal
 from acsard.core.link.session import McuSession
 from acsard.core.values import NS_PER_S, STILL, Event, Instant
 from acsard.daemon.serial.device import open_raw

@@ -118,7 +118,7 @@ def test_what_is_wrong_with_the_robot_s_certificate(
 @pytest.mark.parametrize(
     ("shown", "sentence"),
     [
-        ("stranger", "comes from another authority than"),
+        ("stranger", "was signed by another authority than"),
         ("mixed", "comes from another authority than the robot's"),
         ("ended", "has expired or is not valid yet"),
     ],

@@ -77,10 +77,11 @@ async def test_who_opens_it_has_the_last_minute_and_what_was_wished_while_somebo
             await asyncio.to_thread(bus.at_rest)
             async with hands(page) as later:
                 minute = (await later.find(lambda said: "minute" in said))["minute"]
-    assert max(minute["linear"]) > 0.25
+    # A late message leaves a gap.
+    assert max(one or 0.0 for one in minute["linear"]) > 0.25
     assert max(one or 0.0 for one in minute["wished_linear"]) == pytest.approx(0.3)
     assert minute["age"] == sorted(minute["age"], reverse=True)
-    wheels = [max(one) for one in minute["wheels"]]
+    wheels = [max(speed or 0.0 for speed in one) for one in minute["wheels"]]
     assert len(wheels) == 4
     assert min(wheels) > 0.25 / 0.05
 

@@ -192,7 +192,7 @@ class Motion(Struct, frozen=True):
     late: Floats
     """Errors of distance and turn due to wrong stamps, rows of (m, rad)."""
     lateness: float
-    """RMS error of the stamps, s."""
+    """RMS error of the time stamps of feedback lines, s."""
     filled: Floats
     """Variances (m2, rad2) of the motion that the odometry assumed for lost lines; 0 elsewhere."""
     unfilled: Floats

@@ -15,7 +15,7 @@ from typing import Literal
 from msgspec import Struct
 
 from acsard.core.config.wire_time import FIELD
-from acsard.core.link.checksum import Reading
+from acsard.core.link.checked_line import Reading
 from acsard.core.link.codec import Motors
 from acsard.core.link.minimum_delay import MinimumDelay
 from acsard.core.values import NS_PER_S
@@ -53,9 +53,9 @@ class Encoders:
     def __init__(self, counts: int, wheel_speed: float, quiet_ns: int) -> None:
         """Start.
 
-        A restart sets the board's clock to 0. Because the clock is modulo 65536 ms, it then seems
-        to have jumped ahead, and the next reading seems to come too early. So the board is taken to
-        have restarted if the delay of a reading is below the least delay so far by more than
+        A restart sets the board's clock, which counts modulo 65536 ms, to 0. It then seems to have
+        jumped ahead, so the delay of the next reading (arrival minus board time) seems too small.
+        The board is taken to have restarted if a delay is below the least delay so far by more than
         `quiet_ns`.
 
         Args:

@@ -19,7 +19,7 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import McuConfig
 from acsard.core.config.wire_time import PLAIN_BYTES, wire_ns
-from acsard.core.link.checksum import Reading
+from acsard.core.link.checked_line import Reading
 from acsard.core.link.codec import Codec, Motors
 from acsard.core.link.encoders import Encoders, Turned
 from acsard.core.link.sample_time import BRIDGED_S, FreeRunningTimes, Placed, PromptedTimes

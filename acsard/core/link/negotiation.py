@@ -29,7 +29,7 @@ from typing import Literal
 
 from acsard.core.config.settings import McuConfig
 from acsard.core.config.wire_time import line_bytes, wire_ns
-from acsard.core.link.checksum import ASK_NOTHING, ASK_SAMPLE, SEQUENCES, Checked, seal
+from acsard.core.link.checked_line import ASK_NOTHING, ASK_SAMPLE, SEQUENCES, Checked, seal
 from acsard.core.link.codec import FrameError
 from acsard.core.link.link_state import WATCHDOG_S
 from acsard.core.values import NS_PER_S, WheelSpeeds

@@ -13,7 +13,7 @@ from acsard.core.config.motion_rules import LONGEST_REPLY_S
 from acsard.core.config.settings import FeedbackConfig, McuConfig
 from acsard.core.link import link_diagnosis
 from acsard.core.link.board_status import STATUS, BoardStatus, decode_status, merged
-from acsard.core.link.checksum import Reading, unseal
+from acsard.core.link.checked_line import Reading, unseal
 from acsard.core.link.codec import Codec, FrameError
 from acsard.core.link.feedback import Feedback, Timeline
 from acsard.core.link.lines import LineReader

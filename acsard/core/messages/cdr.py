@@ -1,8 +1,9 @@
 """Encodes msgspec structs as CDR, the encoding of ROS 2, and decodes them.
 
-The codec is derived from the type of the struct. It writes plain CDR (XCDR1), little endian, after
-the encapsulation header of 4 bytes. It reads both byte orders. Numbers are aligned relative to the
-byte after the header. Neighbouring numbers are packed by a single call, which is faster.
+The codec is derived from the type of the struct. `incoming/commands.py` decodes velocity commands
+with it. It writes plain CDR (XCDR1), little endian, after the encapsulation header of 4 bytes. It
+reads both byte orders. Numbers are aligned relative to the byte after the header. Neighbouring
+numbers are packed by a single call, which is faster.
 """
 
 from __future__ import annotations

@@ -12,9 +12,9 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from msgspec.structs import asdict
 
 from acsard.core.config.settings import Config
+from acsard.core.messages.certificate_expiry import DAY_NS, expiry, first
 from acsard.core.messages.covariances import UNKNOWN, Covariances
 from acsard.core.messages.diagnostics import diagnostics
-from acsard.core.messages.expiry import DAY_NS, expiry, first
 from acsard.core.messages.recent_events import RecentEvents
 from acsard.core.messages.schema import (
     Battery,

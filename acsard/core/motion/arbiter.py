@@ -121,7 +121,7 @@ class _Source:
             sender.require_neutral()
 
     def neutral(self, sender: Sender, lasts: float = 0.0) -> Wait:
-        """Return the `Wait` of a sender that must send a zero, and has waited for `lasts` s."""
+        """Return the `Wait` of a sender that drives only after a zero speed: `lasts` s so far."""
         pause = self.pause_ns / NS_PER_S
         return Wait("neutral", self.name, pause, lasts=lasts, ros=sender.ros, shared=sender.shared)
 
@@ -259,7 +259,10 @@ class Arbiter:
 
     @property
     def forgiven_ns(self) -> int:
-        """Sum of the delay rises, ns, that were trusted although no stamp showed an adjustment."""
+        """Sum of the rises, ns, of the delay of commands that were trusted within the budget.
+
+        The stamps do not show whether the sender's clock was set or the network held commands back.
+        """
         return self._freshness.forgiven_ns
 
     def sources(self, now_ns: int) -> tuple[SourceStatus, ...]:

@@ -69,8 +69,8 @@ class Rolling:
         """Start. The daemon commands rest after `quiet` s without feedback."""
         self._quiet = quiet
         self._lost = self._gap = self._counted = 0.0
-        """Durations, s: of implausible lines without counts, of the gaps before these lines, and of
-        implausible lines with counts."""
+        """Times, s, covered by implausible lines without counts (`_lost`), by the gaps before these
+        lines (`_gap`), and by implausible lines with counts (`_counted`)."""
         self._turned, self._skipped = NOWHERE, 0
 
     def skip(self, line: Feedback) -> None:

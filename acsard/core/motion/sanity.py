@@ -53,7 +53,7 @@ class Sanity:
         self._lines = self._dropped = 0
         """Numbers of all lines and of impossible lines in the present window."""
         self.warning: Event | None = None
-        """The warning that too many lines are impossible. None unless the last line caused it."""
+        """The warning of too many impossible lines. None unless the last line caused it."""
 
     def forget(self) -> None:
         """Start over, because the link was lost or a fault has been cleared."""

@@ -11,7 +11,7 @@ from acsard.checkup.dialect import check, identity
 from acsard.checkup.motion import Reply
 from acsard.checkup.wheels import turn
 from acsard.core.config.settings import Config, SimConfig
-from acsard.core.link.checksum import Reading
+from acsard.core.link.checked_line import Reading
 from tests.each import each
 from tests.unit.checkup.robots import Robot
 

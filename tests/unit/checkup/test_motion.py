@@ -8,7 +8,7 @@ import pytest
 
 from acsard.checkup import motion
 from acsard.checkup.motion import Reply
-from acsard.core.link.checksum import Reading
+from acsard.core.link.checked_line import Reading
 
 
 def course(

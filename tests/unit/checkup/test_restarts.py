@@ -21,7 +21,7 @@ from acsard.checkup.restarts import (
     finding,
 )
 from acsard.core.config.settings import Config
-from acsard.core.link.checksum import Reading
+from acsard.core.link.checked_line import Reading
 from acsard.core.link.session import IDENTITY
 from tests.each import each
 from tests.unit.checkup.robots import MS, Checked, Robot, check

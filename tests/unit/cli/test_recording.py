@@ -122,7 +122,7 @@ def test_the_list_takes_only_the_recordings_of_a_time(tmp_path: Path) -> None:
 
 def test_the_list_takes_no_seconds_and_a_replay_no_time(where: Path) -> None:
     code, _, err = log(where, "--from", "5")
-    assert (code, "counts from the beginning of one recording" in err) == (Exit.USAGE, True)
+    assert (code, "count from the beginning of one recording" in err) == (Exit.USAGE, True)
     for words in (["replay", "1"], ["recover", "1", "new.mcap"]):
         told = typed("recording", "--from", "14:05", "--directory", str(where), *words)
         assert "leave out --from and --to" in told.err
@@ -424,7 +424,10 @@ def test_what_is_recovered_stands_there_whole_or_not_at_all_and_over_no_recordin
     (other,) = where.glob("*.mcap")
     (held := tmp_path / "held.mcap").write_bytes(other.read_bytes())
     code, _, err = log(where, "recover", str(cut), str(held), "--force")
-    assert (code, "this file is a recording of acsard; name another file" in err) == (1, True)
+    assert (
+        code,
+        "this file is a recording of acsard, and would be overwritten; name another file" in err,
+    ) == (1, True)
     assert held.read_bytes() == other.read_bytes()
     held.unlink()
     (mine := tmp_path / "mine").write_text("mine")
@@ -450,10 +453,16 @@ def test_recover_replaces_its_own_earlier_result_only_on_request_and_says_so(
     )
     longer = new.read_bytes()
     code, _, err = log(where, "recover", str(earlier), str(new), "--force")
-    assert (code, "this file is a recording of acsard; name another file" in err) == (1, True)
+    assert (
+        code,
+        "this file is a recording of acsard, and would be overwritten; name another file" in err,
+    ) == (1, True)
     assert new.read_bytes() == longer, "the shorter copy lacks messages of the longer one"
     code, _, err = log(where, "recover", str(cut), str(cut), "--force")
-    assert (code, "this file is a recording of acsard; name another file" in err) == (1, True)
+    assert (
+        code,
+        "this file is a recording of acsard, and would be overwritten; name another file" in err,
+    ) == (1, True)
 
 
 def harmed(data: bytes, dice: random.Random) -> bytes:

@@ -77,7 +77,9 @@ def test_a_recording_never_goes_not_even_by_force(tmp_path: Path) -> None:
     shutil.copy(QUIET, new)
     code, _, err = report(QUIET, new, "--force")
     assert code == 1
-    assert f"cannot write {new}: this file is a recording of acsard; name another file" in err
+    assert (
+        f"cannot write {new}: this file is a recording of acsard, and would be overwritten" in err
+    )
     assert new.read_bytes() == QUIET.read_bytes()
 
 

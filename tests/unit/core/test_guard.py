@@ -25,7 +25,7 @@ from acsard.core.config.settings import (
     WheelMap,
 )
 from acsard.core.guard import MARGIN_NS, Guard, Memory
-from acsard.core.link.checksum import seal
+from acsard.core.link.checked_line import seal
 from acsard.core.link.codec import Codec
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.limits import Limiter

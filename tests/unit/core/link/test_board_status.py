@@ -11,7 +11,7 @@ import pytest
 
 from acsard.core.config.settings import Place, SafetyConfig, WheelMap
 from acsard.core.link.board_status import STATUS, BoardStatus, decode_status, merged, shown
-from acsard.core.link.checksum import unseal
+from acsard.core.link.checked_line import unseal
 from acsard.core.link.codec import Codec, FrameError
 from acsard.core.motion.bumpers import Bumpers
 from acsard.core.motion.emergency_stop import SILENT_S, EmergencyStop

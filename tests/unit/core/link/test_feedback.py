@@ -9,7 +9,7 @@ from itertools import pairwise
 import pytest
 
 from acsard.core.config.settings import McuConfig, WheelMap
-from acsard.core.link.checksum import Reading
+from acsard.core.link.checked_line import Reading
 from acsard.core.link.codec import Codec
 from acsard.core.link.feedback import Feedback, ReplyStyle, Timeline
 from acsard.core.values import Instant, WheelSpeeds

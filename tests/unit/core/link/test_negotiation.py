@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from acsard.core.config.settings import McuConfig, WheelMap
-from acsard.core.link.checksum import Checked, Reading
+from acsard.core.link.checked_line import Checked, Reading
 from acsard.core.link.codec import Codec, FrameError
 from acsard.core.link.negotiation import (
     BLIND_PERIOD_NS,

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.core.link.checksum import ASK_NOTHING, ASK_SAMPLE, seal
+from acsard.core.link.checked_line import ASK_NOTHING, ASK_SAMPLE, seal
 from acsard.core.link.serial_output import SerialOutput
 from tests.each import each
 

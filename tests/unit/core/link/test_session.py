@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from acsard.core.config.settings import McuConfig, WheelMap
 from acsard.core.config.wire_time import wire_ns
-from acsard.core.link.checksum import seal
+from acsard.core.link.checked_line import seal
 from acsard.core.link.feedback import APART_NS, Feedback
 from acsard.core.link.link_state import BAD_LINES, GOOD_LINES
 from acsard.core.link.session import LONG_GAP_NS, McuSession

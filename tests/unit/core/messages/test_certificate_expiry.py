@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from acsard.core.messages.expiry import DAY_NS, expiry
+from acsard.core.messages.certificate_expiry import DAY_NS, expiry
 from tests.each import each
 
 NOW_NS = 1_700_000_000_000_000_000

@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 from acsard.core.config.settings import Config, SimConfig
 from acsard.core.simulator.faults import USB_PACKET
-from acsard.daemon.serial.simulated_board import Simulated
+from acsard.daemon.serial.simulator_pty import Simulated
 
 LINE = b"ap00.00,bp00.00,cp00.00,dp00.00\n"
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.core.link.checksum import Checked, Reading, seal, unseal
+from acsard.core.link.checked_line import Checked, Reading, seal, unseal
 from acsard.core.link.codec import FrameError
 from acsard.core.link.lines import MAX_LINE
 from tests.each import each
