@@ -47,7 +47,10 @@ END_S = 5.0
 
 
 def ended(who: str, code: int, said: str = "") -> MendableError:
-    """Return an error which says that process `who` ended with exit `code` and message `said`."""
+    """Return an error which says that process `who` ended with the exit code `code`.
+
+    If `code` is negative, it is the number of a signal. `said` is the process's message.
+    """
     return MendableError(f"{who} {how_it_ended(code)}" + (f": {said}" if said else ""))
 
 
@@ -108,7 +111,7 @@ class Rig:
     Args:
         config: the configuration in `file`.
         file: the configuration file of the measured program.
-        words: the shell command that starts the measured program, as a list of words.
+        words: the command line that starts the measured program.
         port: the serial port; "" starts a process that simulates the board on a pty.
         free_running: period of the reports of a simulated board that reports without being asked,
             s; 0 simulates a board that answers each line.

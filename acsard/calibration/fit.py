@@ -42,7 +42,7 @@ class P(IntEnum):
     SENSOR_Y = 6
     """Distance by which the position sensor is to the left of the robot's middle, m."""
     BIAS_ERROR = 7
-    """Index of the gyro bias, rad/s, that remains after the bias measured at rest is subtracted."""
+    """Gyro bias that remains after the bias measured at rest is subtracted, rad/s."""
     SCALE_ERROR = 8
     """Relative error of the gyro's scale: with 0.01, the gyro shows turns 1 % too large."""
 

@@ -409,5 +409,8 @@ def first(rows: Rows, base: Base) -> Floats:
 
 
 def by_sides(rows: Rows, base: Base, sides: Floats) -> Floats:
-    """Return the wheels' turn in each interval, rad. `sides` contains the factors from `first`."""
+    """Return the robot's turn in each interval, rad, as the wheels measure it.
+
+    `sides` contains the two factors that `first` returns.
+    """
     return np.asarray(base.gain * (sides[1] * rows.right - sides[0] * rows.left))

@@ -175,8 +175,8 @@ def scaled(
     extent = extents[best]
     if extent.straight < STRAIGHT:
         raise RefusedError(
-            f"--distance: run {names[best]} ends {extent.distance:.2f} m from its start, but its "
-            f"path is {extent.length:.2f} m long, so it is not straight enough: drive "
+            f"--distance: run {names[best]} ends {extent.distance:.2f} m from its start, and its "
+            f"path is {extent.length:.2f} m long, so it is too short or not straight enough: drive "
             "straight ahead for 2 m or more in a separate run, and measure from start to end"
         )
     # Derivatives of the logarithm of the distance with respect to the logarithms of the

@@ -104,8 +104,9 @@ def drives_enough(parts: Sequence[Block]) -> None:
 def rolls_enough(rows: Rows, *, spins: bool = False) -> None:
     """Raise `RefusedError` if the log lacks a movement of the wheels that the fit needs.
 
-    The left and right wheels must roll in the same direction at times, and in opposite directions
-    at others. With `spins`, opposite directions (turns on the spot) are enough.
+    The mean of the left and the right angle, and half their difference, must each add up to
+    `LEAST_ROLL`, and must not be proportional to each other (`ALIKE`). With `spins`, the difference
+    (turns on the spot) is enough.
     """
     together, against = (rows.right + rows.left) / 2, (rows.right - rows.left) / 2
     for rolled, what in ((together, "ahead or back"), (against, "in opposite directions")):

@@ -143,7 +143,7 @@ class _Steps:
         right = [channel.motor for channel in channels if channel.kind in ("right", "off")]
         self._measure("", lambda: line_loss.direction(board, operator, right))
         self._take("", lambda: encoder_counts.finding(board, right))
-        together = "all motors turn, then this computer sends nothing; this step may repeat"
+        together = "motors turn, then this computer sends nothing; this step may repeat"
         self._measure(together, lambda: watchdog.finding(board, right))
         broken = "sending damaged lines; a motor that turns now is a fault"
         self._measure(broken, lambda: damage.finding(board, right))
@@ -179,9 +179,7 @@ class _Steps:
         for _ in range(1 + min(LATE_AGAIN, self._late_left)):
             if late_s:
                 self._late_left -= 1
-                self._operator.doing(
-                    "this computer was too slow; this part of the check runs again"
-                )
+                self._operator.doing("this computer was late; this part of the check runs again")
                 board.known = known
                 if board.armed:
                     board.rest()

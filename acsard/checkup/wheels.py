@@ -338,9 +338,9 @@ def seen(board: Board, operator: Operator, channel: Channel) -> Channel:
     The wheels stand during the question. If no person watches, the channel is unchanged.
     """
     question = (
-        f"which wheel did motor {LETTERS[channel.motor]} turn: front right (fr), "
-        "front left (fl), rear left (rl), rear right (rr) or none? (again: turn the motor once "
-        "more)"
+        f"which wheel did motor {LETTERS[channel.motor]} turn: front right (fr), front left (fl), "
+        "rear left (rl) or rear right (rr)? Type none if no wheel turned, or again to see the "
+        "motor turn once more"
     )
     while (which := operator.ask(question, (*ANSWERS, "again"))) == "again":
         _both_ways(board, channel.motor)

@@ -35,8 +35,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--follow",
         action="store_true",
-        help="run until Ctrl-C and print a result each time the S seconds of --seconds have "
-        "passed. Each result covers the time since the start, but at most the last ten minutes",
+        help="run until Ctrl-C and print a result every S seconds (see --seconds). Each result "
+        "covers the time since the start, but at most the last ten minutes",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object a line")
     add_bus(parser)

@@ -268,7 +268,8 @@ def _usable(args: argparse.Namespace, odometry: str) -> None:
         raise UsageError(f"--imu is for --method gyro, not for {other}: leave one out")
     if args.positions_at and not args.positions:
         raise UsageError(
-            "--positions-at needs --positions KEY, too: it names the bus address of that key"
+            "--positions-at names the bus address of the key of --positions: give --positions KEY "
+            "as well"
         )
     if not (args.yes or args.json_lines or sys.stdin.isatty()):
         raise UsageError(

@@ -100,7 +100,8 @@ def require_followed(key: str) -> None:
     }.get(row.direction)
     if row.key == "alive":
         instead = (
-            "is a Zenoh liveliness token without messages: acsard fleet lists the present robots"
+            "is a Zenoh liveliness token without messages: acsard fleet lists the robots that are "
+            "present"
         )
     if instead is not None:
         raise UsageError(f"nothing is published on {key}: it {instead}")

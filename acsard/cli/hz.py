@@ -53,7 +53,7 @@ def main(args: argparse.Namespace) -> int:
 def rate(times: list[float]) -> dict[str, float]:
     """Return the count and rate, Hz, of messages, and the gaps between them, ms.
 
-    `times` are the arrival times, s. With fewer than two, the gaps are left out.
+    `times` are the arrival times, s. With fewer than two, the rate is 0 and the gaps are left out.
     """
     if len(times) < 2 or times[-1] <= times[0]:
         return {"count": len(times), "hz": 0.0}

@@ -1,7 +1,7 @@
 """Checks every outgoing line a second time, independently of the code that made the line.
 
-The guard shares no code with `limits.py`, `codec.py` or `checksum.py`. It parses the finished bytes
-in the same way as the MCU, and passes a line only if all of these conditions hold:
+The guard shares no code with `limits.py`, `codec.py` or `checked_line.py`. It parses the finished
+bytes in the same way as the MCU, and passes a line only if all of these conditions hold:
 
 - The line has the complete format, no wheel exceeds `limits.wheel_speed`, and the checksum is
   correct if the line has one. With `link_check = "require"`, a line that moves a wheel must have a
@@ -77,7 +77,7 @@ class Guard:
         """Use `config` from now on.
 
         Until the robot is at rest, the longer of the ramp times of the old and the new
-        configuration applies.
+        configuration applies, because a moving robot may still brake by its previous limits.
         """
         self._require_check = config.mcu.link_check == "require"
         self._most = int(config.limits.wheel_speed * 100 + 1)

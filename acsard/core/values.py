@@ -165,7 +165,8 @@ class Answer(Struct, frozen=True):
 
 
 class Refusal(Struct, frozen=True):
-    """A refused command, which increments the counter `command_<reason>`.
+    """A refused message of a client. It increments the counter `command_<reason>`, or
+    `commands_of_new_senders` for the reason `unproven`.
 
     `source` and `sender` are "" if they are unknown.
     """
@@ -275,7 +276,8 @@ class Wait(Struct, frozen=True):
 class SourceStatus(Struct, frozen=True):
     """A command source.
 
-    `age_s` is the time since the last accepted command of the source, None before the first one.
+    `age_s` is the time since the last accepted command of the source. It is None if no command was
+    accepted since the senders last had to return to neutral.
     """
 
     name: str
@@ -384,7 +386,7 @@ class Latch(Struct, frozen=True):
 
     number: int
     """Identifies the latch across restarts: the time at which it was set, ms since 1970, or a
-    larger number if an earlier latch has that one. JavaScript represents it exactly."""
+    larger number if an earlier latch has one as large. JavaScript represents it exactly."""
     at_ns: int
     """Wall-clock time at which the latch was set, ns since 1970."""
     by: str

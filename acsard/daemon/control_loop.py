@@ -251,7 +251,10 @@ class ControlLoop:
         return outputs
 
     def _decided(self, inputs: Inputs) -> tuple[Outputs, bool]:
-        """Run the step and send its line. Return the outputs, and whether the line was written."""
+        """Run the step and send its line. Return the outputs, and whether the line was written.
+
+        The recorder gets the step even if this method raises.
+        """
         try:
             outputs = self.outputs = self.robot.step(inputs)
             self._step_answers = self._speed.settle(
@@ -412,9 +415,9 @@ class ControlLoop:
             self._settings_file.keep(request, now.mono_ns)
 
     def _keepable(self, now: Instant) -> tuple[Request, ...]:
-        """Return each `set` with `keep` that the settings file can store.
+        """Return each `set` with `keep` that the robot may obey now.
 
-        Queue an answer for each `set` with `keep` that it cannot store.
+        Queue the answers to those that were written to the file, refused, or overdue.
         """
         if self._settings_file is None:
             return ()

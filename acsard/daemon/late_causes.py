@@ -225,7 +225,10 @@ CAUSES = (
 
 
 def causes(late: Lateness) -> tuple[tuple[str, ...], str]:
-    """Return the names of a lateness's causes, and a text that explains them with their advice."""
+    """Return the names of a lateness's causes, and a text that explains them with their advice.
+
+    Both are empty if the counters show no cause.
+    """
     found = [(cause, clause) for cause in CAUSES if (clause := cause.rule(late))]
     clauses = [f"{clause} ({cause.advice})" for cause, clause in found]
     return tuple([cause.name for cause, _ in found]), ", and ".join(clauses)

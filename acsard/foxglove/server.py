@@ -68,7 +68,8 @@ class Shown:
 class Settings:
     """The settings of the robot that viewers can read and change while the daemon runs.
 
-    The main thread calls `learn` and `refresh`. The server's threads call the other methods.
+    The main thread calls `refresh`, and the server's threads call `get`, `follow`, `unfollow` and
+    `set`. Both call `learn`: the server's threads through `set`.
     """
 
     def __init__(self, robot: Robot, notices: Notices, tables: object) -> None:
@@ -105,7 +106,10 @@ class Settings:
             self._followed.difference_update(names)
 
     def set(self, wishes: Mapping[str, Any]) -> dict[str, Any]:
-        """Change all of these settings or none of them, and return their values afterwards."""
+        """Change all of these settings or none, and return their values afterwards.
+
+        A notice tells all viewers whether it succeeded. This call may wait for the daemon.
+        """
         try:
             if any(value is None for value in wishes.values()):
                 raise AcsardError("a setting cannot be removed, only changed")

@@ -28,8 +28,8 @@ def replace(
         content: The new content. Only the owner can read the file until its mode is set.
         mode: The mode. None keeps that of the old file, and gives a new file `NEW_MODE`.
         owner: The user and the group. None keeps those of the old file, if this process may.
-        synced: True waits for the disk before the rename. If False, a power cut before `sync` may
-            leave a part of the new file.
+        synced: True waits for the disk before the rename, so that a power cut leaves the old or the
+            new file. If False, a power cut before `sync` may leave a part of the new file.
     """
     kept = owner
     if file.exists():

@@ -71,8 +71,8 @@ WAYS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = (
         "they come from another file or from the daemon's environment, or the file has changed "
         "since the daemon started",
         "if the daemon runs with another file, name that file with --config; otherwise either "
-        "write the daemon's values into this file, or restart the daemon with the values of this "
-        "file. The findings below are about the running daemon",
+        "write the daemon's values into this file, or restart the daemon with this file. The "
+        "findings below are about the running daemon",
     ),
     (
         lambda key: live(key) is not None,
@@ -316,7 +316,7 @@ def check(running: Running) -> str:
     port = running.config.mcu.port
     return (
         f"`acsard mcu check --port {port}` finds the cause. Before you run it, lift the wheels off "
-        f"the ground, and stop the daemon: run `systemctl stop acsard`, or kill {running.info.pid}"
+        f"the ground, and stop the daemon: `systemctl stop acsard`, or `kill {running.info.pid}`"
     )
 
 
@@ -344,8 +344,8 @@ CAUSES_PAGE = "deploy/systemd/README.md explains each cause of lateness"
 
 START = (
     "if the daemon is a systemd service, `systemctl status acsard` shows why it does not run; "
-    "otherwise start it with `acsard run`. If the daemon was started with --listen, name the "
-    "address that it got there with --connect"
+    "otherwise start it with `acsard run`. If the daemon was started with --listen ADDRESS, give "
+    "this command the same address with --connect"
 )
 
 ANOTHER = (
@@ -472,7 +472,7 @@ def certificate(row: DiagnosticStatus | None, here: bool) -> Iterator[Finding]:
             "acsard`. The daemon uses the new files for its next connection. A restart of the "
             "daemon ends this warning at once, but stops the robot"
         )
-    text = f"the daemon reports about its certificate that expires first: {row.message}"
+    text = f"the first certificate of the daemon to expire: {row.message}"
     yield Finding("certificates", LEVELS[min(row.level, 2)], text, mend)
 
 

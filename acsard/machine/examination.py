@@ -163,7 +163,8 @@ def _hardware(name: str) -> Iterator[Finding]:
             "port",
             "warning",
             text,
-            "if this is your microcontroller, add its USB id to deploy/udev/70-acsar.rules",
+            "if this is your microcontroller, add its USB id to deploy/udev/70-acsar.rules, and "
+            "copy that file to /etc/udev/rules.d",
         )
     timer = Path(f"/sys/class/tty/{name}/device/latency_timer")
     if timer.is_file() and timer.read_text().strip() != "1":
@@ -183,10 +184,9 @@ def _permission(path: str) -> Finding:
         group = Path(path).group()
     except KeyError:
         group = str(os.stat(path).st_gid)
-    mend = (
-        f"run `sudo usermod -aG {group} $USER`, then log in again (the systemd service needs no "
-        "such step, because its unit names the group)"
-    )
+    mend = f"run `sudo usermod -aG {group} $USER`, then log in again"
+    if group == "dialout":
+        mend += " (the systemd service needs no such step, because its unit names the group)"
     return Finding(
         "port", "failure", f"{path} belongs to group {group}, but you are not in it", mend
     )

@@ -341,7 +341,7 @@ def own_places() -> list[Path]:
 
 
 def strangers(files: Iterable[File], places: Iterable[Path]) -> list[Path]:
-    """Return the paths below the directories `places` that the installation did not write."""
+    """Return the entries of the directories `places` that the installation did not write."""
     ours = {file.path for file in files}
     inside = (path for place in places if place.is_dir() for path in sorted(place.iterdir()))
     return [path for path in inside if path not in ours]
@@ -378,7 +378,7 @@ def uninstalling(
         if file.kept:
             why[file.path] = "it is your configuration; --purge removes it"
         elif not force:
-            why[file.path] = "somebody has edited this file; --force removes it"
+            why[file.path] = "the file differs from what this version installs; --force removes it"
     if any(path.name == UNIT for path in why):
         # The daemon's unit stays and may start again. Then it needs `acsard-stop`, which sends
         # zeros after the daemon's end.

@@ -425,8 +425,8 @@ def _first_state(recording: Recording) -> tuple[int, State | None]:
 
 def _foreign(recording: Recording, reason: str) -> RecordingError:
     return RecordingError(
-        f"{recording.path}: {reason}; the recording was made by acsard {recording.about.version}, "
-        "whose replay can read it"
+        f"{recording.path}: {reason}. If the file is neither damaged nor forged, the version that "
+        f"made it can replay it: acsard {recording.about.version}"
     )
 
 

@@ -107,7 +107,8 @@ def _finish_in_place(recording: Recording, part: Path, cut: str) -> bool:
 
     Also replace each `GROWING_HEAD` by the true header of its chunk. Returns False if the disk has
     no room; the file is then unchanged. No recorded second is removed to gain room, because on some
-    disks this does not gain any room.
+    disks this does not gain any room. If a power cut interrupted an earlier recovery after it had
+    written the end, only the headers are written.
     """
     builder = EndRecordBuilder(recording.about)
     for topic, wall_ns, data in recording.messages():

@@ -25,7 +25,8 @@ MARGIN_S = 60.0
 """Tolerance for the times in an end record, s.
 
 The end record gives the time at which the last message begins. If the disk is slow, this message
-may hold many seconds of steps. Consecutive files of a series are also less than this time apart.
+may hold many seconds of steps. Therefore a file is also read if it lies outside the searched range
+by at most this time. Consecutive files of a series are also less than this time apart.
 """
 
 GAP_S = 2.0

@@ -334,7 +334,7 @@ class TimelineWriter:
             x, y, yaw = [value / MICRO for value in self._pose]
             at = f"at x {x:.2f} m, y {y:.2f} m, yaw {math.degrees(yaw):.1f} deg"
         text = (
-            "this recording continues an earlier recording. The robot is now: "
+            "this recording continues an earlier one; at its beginning the robot is: "
             f"{does}, link {link}, {at}"
         )
         yield TimelineEntry(first.inputs.now.wall_ns / 1e9, "continues", text, by=source)

@@ -197,8 +197,8 @@ class _Machine:
             self._stack.append(entry)
         else:
             raise ValueError(
-                f"the robot state has the pickle opcode {name}, which acsard never writes: the "
-                "file is damaged or forged"
+                f"the robot state has the pickle opcode {name}, which this acsard never "
+                "writes: the file is damaged or forged"
             )
 
     def _push(self, value: object) -> _Entry:
@@ -327,8 +327,8 @@ class _Machine:
         whole, named = self._stack[-1], state.value
         if not _is_part(type(whole.value)) or not isinstance(named, dict):
             raise ValueError(
-                f"the robot state sets attributes of a {type(whole.value).__name__}, which acsard "
-                "never writes: the file is damaged or forged"
+                f"the robot state sets attributes of a {type(whole.value).__name__}, which this "
+                "acsard never writes: the file is damaged or forged"
             )
         for name in named:
             if not isinstance(name, str) or hasattr(type(whole.value), name):
@@ -369,7 +369,8 @@ def _keys(entries: Sequence[_Entry]) -> None:
         parts = value if type(value) is tuple and len(value) <= MAX_KEY_PARTS else (value,)
         if not all(type(part) in SIMPLE or isinstance(part, Enum) for part in parts):
             raise ValueError(
-                f"the robot state uses a {type(value).__name__} as a key, which acsard never writes"
+                f"the robot state uses a {type(value).__name__} as a key, which this acsard never "
+                "writes"
             )
         if any(type(part) is int and abs(part) >= MAX_KEY for part in parts):
             raise ValueError(

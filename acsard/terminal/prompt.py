@@ -101,8 +101,8 @@ class Prompt(Protocol):
 
 
 SIGNALS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP
-"""The signals that end a subcommand. The signal of Ctrl-Z is among them, because a suspended
-subcommand would leave a wheel turning."""
+"""The signals that end a subcommand that moves something. The signal of Ctrl-Z is among them,
+because a suspended subcommand would leave a wheel turning."""
 
 
 @contextmanager

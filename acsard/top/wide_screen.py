@@ -31,7 +31,7 @@ LINKS = {"up": "green", "booting": "yellow"}
 FIGURES = {
     "period_lateness": (
         "period due → step",
-        "from when a step (or a missed one) was due to its start",
+        "from the first missed due time to the start of the step",
     ),
     "step_time": ("work of one step", "from the start of a step to the end of its work"),
     "command_age": ("arrival → each line", "from a command's arrival to each line that follows it"),
@@ -120,7 +120,7 @@ def drives(source: SourceState, state: RobotState) -> bool:
 def waits(source: SourceState, state: RobotState) -> str:
     """Return in words what a command source waits for before the robot follows it.
 
-    A source may also wait for nothing.
+    If it waits for nothing, the text says that it drives, or gives the robot's mode.
     """
     if source.waits_for:
         return clean(source.waits_for)

@@ -218,7 +218,8 @@ class Acceptor:
     def _has_room(self, now: float) -> bool:
         """Return whether a TLS handshake may start.
 
-        If too many run, cut a running one that is older than `HURRIED_S`, if there is one.
+        If too many run, cut the oldest one of the network with the most handshakes, if it is older
+        than `HURRIED_S`.
         """
         if len(self._starting) < HANDSHAKES_AT_ONCE:
             return True

@@ -226,7 +226,10 @@ class Admission:
         self._acceptor.admitted(request.transport, who)
         fast = self._too_fast(who, row)
         if fast and not (row and row.waits):
-            text = f"you sent more than {REQUESTS.hz:g} requests a second: use the WebSocket /ws"
+            text = (
+                f"more than {REQUESTS.hz:g} requests a second with one token: use the WebSocket "
+                "/ws, which sends each change"
+            )
             raise RefusedError("too_fast", text)
         if row is not None and row.least is not None:
             who.require(row.least, f"{row.method} {row.path}")

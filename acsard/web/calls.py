@@ -158,8 +158,8 @@ class Calls:
         )
         return ServiceReply(
             False,
-            f"the stop was sent to {robot}, but the page's server cannot wait for the answer, "
-            "because too many queries are running: check that the robot has stopped",
+            f"the stop was sent to {robot}, but the page's server does not wait for the answer, "
+            "because too many other stops wait for theirs: check that the robot has stopped",
         )
 
     def _require_few(self, who: Who) -> None:

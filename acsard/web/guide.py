@@ -139,7 +139,9 @@ class Guide:
         """Pass a viewer's answer to the child. Return "" or the reason for a refusal."""
         errand = self._of(viewer)
         if errand is None or not errand.answer(reply):
-            return f"the question {reply.reply} is over: answer the newest question on this page"
+            return (
+                f"question {reply.reply} is not open on this page: answer the newest question here"
+            )
         return ""
 
     def press(self, viewer: object, press: Press) -> None:
@@ -267,7 +269,7 @@ def _method(begin: Begin) -> list[str]:
     if (begin.method == POSITIONS) != bool(begin.positions):
         raise FrameError(
             "begin",
-            f"`positions` must be a Zenoh key for the method {POSITIONS}, and only for that method",
+            f"the method {POSITIONS} needs `positions`, a Zenoh key; other methods take none",
         )
     if begin.positions and not KEY.match(begin.positions):
         raise FrameError("begin", "`positions` must be a Zenoh key of letters, digits, _ / -")

@@ -80,8 +80,8 @@ class Route(Struct, frozen=True):
     """Limit on the rate of the requests of one token. All routes with the same rate share one
     limit."""
     waits: bool = False
-    """True if a request beyond `rate` is delayed; False if it is refused. A POST is always carried
-    out at once, and only its answer is delayed. If true, `rate` applies to each token in each
+    """True if a request beyond `rate` is delayed; False if it is refused. If true, a POST is
+    carried out at once and only its answer is delayed, and `rate` applies to each token in each
     network separately, so a program cannot use up the limit of a page that uses the same token in
     another network."""
 

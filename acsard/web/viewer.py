@@ -283,7 +283,7 @@ class Viewer:
         commander = self._commanders.setdefault(frame.source, Commander())
         owner = self.who.token or self.sender
         if not self._commands.give(owner, frame.source, commander, self._sender, wish):
-            text = f"this token sends more than {COMMANDS.hz:g} commands a second: send fewer"
+            text = f"more than {COMMANDS.hz:g} commands a second with one token: send fewer"
             self._out.refuse("cmd", "too_fast", text)
 
     def _release(self) -> None:

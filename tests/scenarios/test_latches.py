@@ -70,7 +70,9 @@ def test_a_clear_read_before_a_later_stop_and_delivered_after_it_is_refused(worl
     world.run(3.0)
     reply = call(world, "clear", "ann", seen)
     assert (reply.success, world.state.mode) == (False, "stopped")
-    assert f"is not the latest one; the robot is still stopped by {JOE} (native)" in reply.message
+    assert (
+        f"would release another one; the robot is still stopped by {JOE} (native)" in reply.message
+    )
     assert call(world, "clear", "ann", world.state.latch).success
     assert world.state.mode == "ready"
 
@@ -171,7 +173,7 @@ def test_an_activate_read_before_a_later_deactivate_and_delivered_after_it_is_re
     world.run(3.0)
     reply = call(world, "activate", "eve", seen)
     assert (reply.success, world.state.mode) == (False, "inactive")
-    told = f"is not the latest one; the robot is still switched off by {JOE} (native)"
+    told = f"would release another one; the robot is still switched off by {JOE} (native)"
     assert told in reply.message
     assert call(world, "activate", "ann", world.state.latch).success
     assert world.state.mode == "ready"
@@ -245,7 +247,9 @@ def test_two_clears_of_one_fault_do_not_release_the_stop_under_it(world: World) 
     assert call(world, "clear", "ann", fault).success
     reply = call(world, "clear", "eve", fault)
     assert (reply.success, world.state.mode) == (False, "stopped")
-    assert f"is not the latest one; the robot is still stopped by {JOE} (native)" in reply.message
+    assert (
+        f"would release another one; the robot is still stopped by {JOE} (native)" in reply.message
+    )
 
 
 # a restart

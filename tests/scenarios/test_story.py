@@ -342,8 +342,8 @@ def first_run(host: Host) -> None:
         "the disk has room again",
         r"^recording: the daemon records to .* again; \d+ steps are missing, at most \d\.0 s "
         r"\(.*No space left on device\)",
-        r"^continues: this recording continues an earlier recording. The robot is now: driving, "
-        r"link up, .* \(by nav\)",
+        r"^continues: this recording continues an earlier one; at its beginning the robot is: "
+        r"driving, link up, .* \(by nav\)",
     )
     host.hold(NAV, "nav", 0.5, 4.0)
     host.note(

@@ -176,6 +176,6 @@ def _advice_on(share: Share, budget: Budget) -> str:
             "counts, on the shafts of the motors"
         )
     return (
-        "the speeds in a plain feedback line have only two decimals: set mcu.link_check, so that "
-        "the microcontroller adds encoder counts to the feedback lines"
+        'the speeds in a plain feedback line have only two decimals: set mcu.link_check = "auto" '
+        "and mcu.encoder_counts, so that the microcontroller adds encoder counts to its lines"
     )

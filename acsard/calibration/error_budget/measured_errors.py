@@ -142,7 +142,7 @@ def _missing(at: Floats) -> Counts:
 
 
 BLOCK_S = 0.5
-"""Time within which errors of line stamps are correlated, s, because one stall causes them."""
+"""Time, s, within which the errors of time stamps are correlated: one stall causes them all."""
 
 LEAST_LINES, ALIKE = 20, 0.99
 """Limits for the fit that separates the noise of the gyro from its scale error.

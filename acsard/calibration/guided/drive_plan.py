@@ -294,8 +294,8 @@ def setup(config: Config) -> Setup:
     speed = min(speed, wheel)
     if speed < LEAST_SPEED or limits.angular_speed < LEAST_TURN:
         raise GuideError(
-            f"the calibration must drive at {LEAST_SPEED} m/s and turn at {LEAST_TURN} rad/s, but "
-            "the configured limits are too low: either raise limits.linear_speed, "
+            f"the calibration needs at least {LEAST_SPEED} m/s and {LEAST_TURN} rad/s, but the "
+            "configured limits are lower: either raise limits.linear_speed, "
             "limits.angular_speed, limits.wheel_speed or limits.linear_deceleration, or "
             "record a drive and use --log"
         )

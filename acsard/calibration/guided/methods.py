@@ -268,7 +268,7 @@ def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
             f"and the same distance from its {other} edge, facing the far edge. Make two marks on "
             "the floor: one exactly beside the middle of the robot's left side, one exactly beside "
             f"the middle of its right side. The robot drives a square with sides of {edge:.2f} m "
-            f"and turns to the {to}, and ends about where it started.",
+            f"and all turns to the {to}, and ends about where it started.",
             (STOP, *(setup.ahead(edge), STOP, corner, STOP) * 4),
             ends,
             (
@@ -292,7 +292,7 @@ def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
         once_round(
             setup,
             "exactly when it has turned one full circle and faces as before; the tool then asks "
-            "how far the robot has turned on.",
+            "how far past that point the robot has turned.",
             (
                 Ask(
                     "How many degrees past a full circle did the robot turn (negative if less)?",

@@ -75,7 +75,8 @@ class GyroFollower:
     def _follow(self, who: str, now_ns: int) -> bool:
         """Follow the sender `who`, and return whether it replaces another one.
 
-        Raises `DecodeError` if the gyro in use is not silent.
+        Raises `DecodeError` if another gyro is in use that is not silent, or that belongs to the
+        daemon's own simulator.
         """
         other = who != self._followed
         if other and (self._own or now_ns - self._heard_ns < FOLLOWED_NS):

@@ -136,7 +136,8 @@ class Queries:
 
         The list is empty if the daemon has no value for the query. Raises `DecodeError` for a ROS
         request that cannot be served; `refused` builds the reply to such a request. `current`
-        returns the present message of a published key, and `outputs` are those of the last step.
+        returns the present message of a published key. `outputs` are those of the last step, or
+        None before the first step.
         """
         if query.via != "native":
             return self._ros(query, 0 if outputs is None else outputs.now.wall_ns)
@@ -331,7 +332,10 @@ def topic_table(config: Config) -> Topics:
 
 
 def interfaces(config: Config, outputs: Outputs | None) -> Interfaces:
-    """Return the command and state interfaces of the joints, named as in ros2_control."""
+    """Return the command and state interfaces of the joints, named as in ros2_control.
+
+    `outputs` are those of the last step, or None before the first step.
+    """
     linked = outputs is not None and outputs.linked
     claimed = outputs is not None and outputs.mode == "driving"
     joints = config.joints.as_tuple()

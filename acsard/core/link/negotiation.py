@@ -1,8 +1,8 @@
 """Negotiates with the board whether lines have a check: a sequence number and a CRC.
 
 The negotiation runs when the port is opened, and again after a gap in the lines. A question is a
-stop line with the check (`checksum.py`). A board that knows the check answers in the same form. The
-states of the negotiation are:
+stop line with the check (`checked_line.py`). A board that knows the check answers in the same form.
+The states of the negotiation are:
 
 - off: mcu.link_check is "off". Lines are plain, and the daemon does not ask for the check.
 - waking: the daemon sends only stops. The board has not answered yet, so its silence proves
@@ -161,8 +161,8 @@ class EchoDetector:
     board that reports exactly the commanded speeds. A run of at least `REPORTS` reports is an echo
     under two conditions:
 
-    - Each report equals, byte for byte, one of the last `LINES` sent lines. The number of lines
-      that were sent after the equal line is the same for all reports of the run.
+    - Each report equals, byte for byte, one of the last `LINES` sent lines, and successive
+      reports equal successive lines.
     - The speed changes in the run add up to at least `CHANGE`. At rest every board looks like an
       echo, so a run without changes proves nothing.
 

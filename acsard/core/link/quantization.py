@@ -102,8 +102,10 @@ class Coarseness:
         """Filtered jump of each wheel, rad per line, and the wheel examined in the last line."""
 
     def add(self, speeds: Motors, own: float) -> bool:
-        """Process speeds in rad/s, `own` s after the last line. Return whether an encoder is
-        coarse."""
+        """Take in the speeds of a line, rad/s. Return whether an encoder is coarse.
+
+        `own` is the time since the line before, s.
+        """
         (older, before), self._rows = self._rows, (self._rows[1], speeds)
         if speeds == NOTHING == before or own > LONGEST_LINE:
             return False

@@ -436,7 +436,7 @@ BATCH_NS = 2_000_000
 class PromptedTimes:
     """The sample times of a prompted board, from the commands that its replies answer.
 
-    In this class, "line" always means a command that the daemon wrote. A plain reply does not say
+    In this class, a line is a command that the daemon wrote. A plain reply does not say
     which line it answers. However, a board that answers each line takes its sample when the line
     arrives. So the sample times are the times at which the lines were written, plus a usual delay.
     The time between two samples is the time between their lines, even if the host reads the replies
@@ -478,8 +478,8 @@ class PromptedTimes:
         """Time at which the last answered command was written, ns. If the board replied to that
         command later or sooner than usual, the time is shifted by the difference."""
         self._passed = self._line = 0
-        """Times at which two commands were written, ns. `_line` belongs to the last line that was
-        answered, and `_passed` to the last line that was answered or given up."""
+        """`_line` is the time, ns, at which the last answered line was written. `_passed` is that
+        time for the last line that was answered or given up."""
         self._lost = False
         """Whether the last read with a single reply showed that an earlier reply was lost."""
         self._given: list[int] = []
@@ -519,7 +519,10 @@ class PromptedTimes:
         self._left.append(at_ns)
 
     def read(self, at_ns: int, lines: int, cut: bool = False) -> None:
-        """Process a read of `lines` lines at `at_ns`. If `cut`, a part of another line follows."""
+        """Process a read of `lines` replies. `cut` says whether a part of one more reply follows.
+
+        The last of these replies was complete at the monotonic time `at_ns`.
+        """
         alone, since = lines == 1, at_ns - self._at
         self._at, self._alone, self._since = at_ns, alone, since
         self._several += FAST * ((not alone) - self._several)

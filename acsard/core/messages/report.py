@@ -287,9 +287,9 @@ class Report:
         return round((first(self.certificate_ends)[1] - now.wall_ns) / DAY_NS, 2)
 
     def _battery(self, outputs: Outputs, snapshot: Snapshot) -> Battery | None:
-        """Return the message about the battery, or None if no battery is reported.
+        """Return the message about the battery, or None if the board has never reported one.
 
-        Its stamp is the time of the board's last report, or of the step if there was no report.
+        Its stamp is the time of the board's last report, or of the step if the reports have ended.
         """
         battery, now = snapshot.battery, outputs.now
         if battery is None:

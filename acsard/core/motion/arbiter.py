@@ -93,8 +93,8 @@ class _Source:
     def doubt(self, name: str, was_set: bool) -> None:
         """React to doubt about the sender's clock.
 
-        If the clock was set, the sender must send a zero again. Otherwise the clock is unproven,
-        and zeros with its stamps no longer arm the sender.
+        If the clock was set, the sender must send a zero again. Otherwise the clock is unproven:
+        undo the effect of the zeros that it has stamped so far. Later zeros arm as usual.
         """
         sender = self.senders.get(name)
         if sender is None:
@@ -259,9 +259,10 @@ class Arbiter:
 
     @property
     def forgiven_ns(self) -> int:
-        """Sum of the rises, ns, of the delay of commands that were trusted within the budget.
+        """Sum of the trusted rises, ns, of the delay of commands that no stamp explains.
 
-        The stamps do not show whether the sender's clock was set or the network held commands back.
+        A rise is trusted within the budget, or after a pause of the sender. A rise that the stamps
+        show to be an adjustment of the sender's clock does not count.
         """
         return self._freshness.forgiven_ns
 

@@ -74,9 +74,9 @@ class Bumpers(BoardInput):
 
     @property
     def latching(self) -> bool:
-        """Whether the present state latches a stop.
+        """Whether bumpers that count as pressed latch a stop.
 
-        If the robot may drive away from bumpers, only the silence of the board latches a stop.
+        If the robot may drive away from bumpers, only the silence of the board does.
         """
         return not self._away or self.state == "silent"
 

@@ -102,8 +102,8 @@ class ConsistencyChecks:
     def taken_back(self, turn: float) -> float:
         """Tell the gyro that recomputing the pose has changed the heading by `turn` rad.
 
-        Only lines with `on_trial` are included. Return the angle that the caller must
-        subtract from the heading, rad.
+        Only lines with `on_trial` are included. Return the angle that the caller must subtract from
+        the heading, rad: `turn` if the gyro is proven by now, otherwise 0.
         """
         return 0.0 if self.gyro is None else self.gyro.taken_back(turn)
 

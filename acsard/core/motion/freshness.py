@@ -53,8 +53,9 @@ commands back."""
 EVEN, CREPT = 200, 20
 """A proof (a test whether the delay is constant) compares the minimum delays of its two halves.
 The minima may differ by the duration of the proof divided by `EVEN`, or by `CREPT` if the delay
-creeps (see `CREEP`). So the delay may change by 10 ms per second, or by 100 ms per second if it
-creeps. NTP slews a clock by up to 83 ms per second."""
+creeps (see `CREEP`). The centres of the halves are half the duration apart, so the delay may change
+by 10 ms per second, or by 100 ms per second if it creeps. NTP slews a clock by up to 83 ms per
+second."""
 
 CREEP, JITTER_NS = 10, NS_PER_S // 200
 """A delay creeps if its change between two commands is at most the time between them divided by
@@ -399,5 +400,5 @@ class Freshness:
 
 
 def _oldest(held: dict[str, _Clock]) -> _Clock:
-    """Return the first clock of the dictionary, which has been silent for the longest time."""
+    """Return the clock that has been silent longest: each command moves its clock to the end."""
     return next(iter(held.values()))

@@ -91,8 +91,8 @@ class Turn(Struct, frozen=True, gc=False):
     may include samples that arrived late."""
     rate_variance: float
     wheels: float | None = None
-    """Turn that wheels without a fault would report, rad. It is usually larger than `angle`,
-    because wheels skid in a turn."""
+    """Turn that wheels without a fault would report, rad: `angle` divided by the learned ratio of
+    the configured to the true effective track."""
     slips: bool = False
     """Whether the turns of wheels and gyro have contradicted each other in the last `SLIP_S` s."""
 

@@ -324,8 +324,8 @@ def number_after_restart(kept: int, now: Instant) -> int:
 
 def _not_in_force(number: int, still: str, call: str) -> str:
     return (
-        f"this call names latch {number}, which is not the latest one; the robot is still {still}: "
-        f"look at the robot, then call {call} again with the latest number"
+        f"this call names latch {number}, but {call} would release another one; the robot is still "
+        f"{still}: look at the robot, then call {call} again with the present `latch` in `state`"
     )
 
 

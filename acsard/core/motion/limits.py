@@ -91,7 +91,8 @@ class Limiter:
         """Slow down towards rest for `dt` s, and return the allowed twist.
 
         Linear and angular speed fall in the same proportion. If `stop` is true, the limits
-        `*_stop_deceleration` apply. A negative `dt` counts as 0.
+        `*_stop_deceleration` apply. A negative `dt` counts as 0, so that it cannot speed up the
+        robot.
         """
         dt, twist = max(0.0, dt), self.twist
         seconds = max(

@@ -8,7 +8,8 @@
     driving   the robot follows a fresh command
     ready     the robot could drive, but there is no command to follow
 
-The first mode of this list whose condition holds is the robot's mode. No mode is stored.
+The first mode of this list whose condition holds is the robot's mode. It follows from the latches,
+the link and the commands alone, so no transition can be forgotten.
 """
 
 from __future__ import annotations

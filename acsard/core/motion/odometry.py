@@ -125,7 +125,10 @@ class Odometry:
             self._twist_uncertainty.bend()
 
     def set_pose(self, pose: Pose) -> None:
-        """Set the pose of base_link in odom, with the uncertainty of an initial pose."""
+        """Set the pose of base_link in odom, with the uncertainty of an initial pose.
+
+        The angles of the wheels do not change.
+        """
         self._path.set(pose)
         self._steps.clear()
         self._uncertainty.set(pose.yaw)

@@ -115,7 +115,7 @@ class Suspect:
         """Take in a line of feedback, and return whether the wheel now shows a sign of a fault.
 
         `own` and `other` are the angles that this wheel and the other wheel of its side rolled, and
-        `count` is the angle of an encoder count, rad. `same` is true if this wheel repeats the
+        `count` is the angle per encoder count, rad. `same` is true if this wheel repeats the
         speed of the line before.
         """
         sign = self._sign(own, other, same, count)
@@ -165,7 +165,7 @@ class Suspect:
     def is_faulty(self, count: float) -> bool:
         """Return whether this wheel, and not the other one, is faulty.
 
-        `count` is the angle of an encoder count, rad.
+        `count` is the angle per encoder count, rad.
         """
         enough = FAULT_COUNTS * count + FAULT_ANGLE
         if self._lines < FAULT_LINES or self._seconds < FAULT_S or abs(self._apart) < enough:
@@ -233,7 +233,7 @@ def stands(own: float, other: float) -> bool:
 def reverses(own: float, other: float, count: float) -> bool:
     """Return whether a wheel that turned `own` rad turned about as far as the other, but backwards.
 
-    The other wheel turned `other` rad. `count` is the angle of an encoder count, rad.
+    The other wheel turned `other` rad. `count` is the angle per encoder count, rad.
     """
     return own * other < 0.0 and abs(own + other) <= REVERSED * abs(other) + FAULT_COUNTS * count
 

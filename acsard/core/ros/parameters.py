@@ -226,7 +226,7 @@ def failure(service: str, why: str, request: bytes = b"") -> bytes:
     """Return the reply to a request that is refused.
 
     Without a reply, the client would wait for ever. If the request sets parameters, the reply gives
-    the reason `why` for each parameter. Other replies have no field for a reason, so they are
+    the reason `why`. Other replies have no field for a reason, so they are
     empty, as in rclcpp.
     """
     refused = SetParametersResult(False, why)

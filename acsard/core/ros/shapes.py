@@ -81,7 +81,8 @@ class Counter(Struct, frozen=True):
 class Source(Struct, frozen=True):
     """A command source.
 
-    `age` is the time since the last accepted command of the source, s; None before the first one.
+    `age` is the time since the last accepted command of the source, s. It is None if no command was
+    accepted since the senders last had to return to neutral.
     """
 
     name: str

@@ -380,9 +380,10 @@ class FakeMcu(Faults):
         return self._input("estop", "ok")
 
     def estop_pressed(self, after_s: float, length_s: float) -> Fault:
-        """Press the emergency stop `after_s` s after this fault is switched on.
+        """Make the board report the emergency stop as pressed, and before and after as released.
 
-        The stop is released `length_s` s later. If `length_s` is 0, the stop stays pressed.
+        The press begins `after_s` s after this fault is switched on, and lasts `length_s` s (0: for
+        ever). The motors keep their power.
         """
         return self._input("estop", "pressed", after_s, length_s)
 
@@ -402,9 +403,10 @@ class FakeMcu(Faults):
         return self._input("bumpers", self._bumpers)
 
     def bumper_pressed(self, number: float, after_s: float, length_s: float) -> Fault:
-        """Press bumper `number` (from 1) `after_s` s after this fault is switched on.
+        """Make the board report bumper `number` (from 1) as pressed, before and after as released.
 
-        The bumper is released `length_s` s later. If `length_s` is 0, the bumper stays pressed.
+        The press begins `after_s` s after this fault is switched on, and lasts `length_s` s (0: for
+        ever). The motors keep their power.
         """
         marks = ["X" if i == number else mark for i, mark in enumerate(self._bumpers, 1)]
         return self._input("bumpers", "".join(marks), after_s, length_s)

@@ -170,7 +170,8 @@ class _Keys:
     def _least(self, endpoint: Endpoint) -> Role | None:
         """Return the lowest role that may use a ROS endpoint; None if its source is not configured.
 
-        A ROS key cannot contain a certificate's name, so every role that may command may use it.
+        A ROS key cannot contain a certificate's name, so every role that may command may use the
+        ROS key of a command. Raises `LookupError` if the table of keys lacks the native key.
         """
         native = endpoint.native
         if native.startswith(PARAMETERS):

@@ -145,8 +145,8 @@ def _opened(settings: dict[str, object], where: tuple[str, ...]) -> zenoh.Sessio
     except zenoh.ZError as error:
         raise InUseError(
             f"cannot listen on {', '.join(where)}: {first_line(error)}; if another daemon or "
-            "router uses the address, stop that program, or give this daemon another address with "
-            "--listen or in bus.listen",
+            "router uses the address, stop that program, or choose another one with --listen or in "
+            "bus.listen",
         ) from error
 
 

@@ -35,8 +35,8 @@ STUCK_NS = NS_PER_S
 millisecond."""
 
 FIRST_NS = 5 * NS_PER_S
-"""Time within which the daemon must connect after the session has been opened, ns. It is longer
-than `ALONE_NS`, because all other clients connect at that time too."""
+"""Time within which the daemon must connect after the session has been opened, ns; otherwise this
+process restarts. It is longer than `ALONE_NS`, because all other clients connect then too."""
 
 ALONE_NS = NS_PER_S
 """Time within which the daemon must connect again after its connection was lost, ns. If it does
@@ -126,8 +126,8 @@ class SessionHealth:
             return Event(self._events["stuck"], text, "error")
         if observed.at_ns - self._linked_ns > self._patience_ns:
             text = (
-                "the TLS gateway has lost its connection to the daemon; the gateway restarts, "
-                "which disconnects all clients"
+                "the TLS gateway has no connection to the daemon; the gateway restarts, which "
+                "disconnects all clients"
             )
             return Event(self._events["alone"], text, "warning")
         if observed.unanswered >= MAX_UNANSWERED:

@@ -238,7 +238,7 @@ class SerialPort:
     # Closing.
 
     async def __aexit__(self, *_: object) -> None:
-        """Send STOP as the last line and close the port, within `FAREWELL_S`."""
+        """Send STOP as the last line and close within `FAREWELL_S`, also after an exception."""
         deadline_ns = clock.now().mono_ns + int(FAREWELL_S * 1e9)
         while self.is_open and self.offer(self._stop, clock.now()) == "superseded":
             if clock.now().mono_ns > deadline_ns:

@@ -165,7 +165,7 @@ def test_a_missing_part_that_a_new_robot_lacks_too_gives_a_message(tmp_path: Pat
     recording = of_older_code(tmp_path / "old.mcap", forget)
     words = (
         r"old\.mcap: this version of acsard cannot read the robot state at the start of the "
-        r"recording: .*'arrived_ns'.* by acsard"
+        r"recording: .*'arrived_ns'.* replay it: acsard"
     )
     with pytest.raises(RecordingError, match=words):
         replay_file(recording)

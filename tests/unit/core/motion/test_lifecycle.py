@@ -177,7 +177,7 @@ def test_a_number_is_not_used_again_after_a_restart_with_a_wall_clock_that_went_
     second = Lifecycle(active=True, latches=first.latches.after_restart())
     second.stop("joe", ns(3.0), Instant(ns(3.0), 0))
     assert number(second) > max(numbers)
-    with pytest.raises(RefusedError, match=f"latch {numbers[0]}, which is not the latest one"):
+    with pytest.raises(RefusedError, match=f"latch {numbers[0]}, but srv/clear would"):
         second.clear(numbers[0], ns(3.1), Instant(ns(3.1), 0))
 
 
@@ -274,9 +274,9 @@ def test_a_release_that_names_another_latch_is_refused(held: Held, none: bool) -
     with pytest.raises(RefusedError) as caught:
         {"clear": clear, "activate": activate}[held.verb](life, 20.0, seen)
     assert str(caught.value) == (
-        f"this call names latch {seen}, which is not the latest one; the robot is still "
-        f"{held.said} by joe: look at the robot, then call srv/{held.verb} again with the latest "
-        "number"
+        f"this call names latch {seen}, but srv/{held.verb} would release another one; the robot "
+        f"is still {held.said} by joe: look at the robot, then call srv/{held.verb} again with the "
+        "present `latch` in `state`"
     )
     assert mode(life) is held.mode
 
@@ -478,8 +478,9 @@ def test_a_press_after_a_release_is_a_new_latch() -> None:
     with pytest.raises(RefusedError) as caught:
         clear(life, 9.0, seen)
     assert str(caught.value) == (
-        f"this call names latch {seen}, which is not the latest one; the robot is still stopped "
-        f"({PRESSED}): look at the robot, then call srv/clear again with the latest number"
+        f"this call names latch {seen}, but srv/clear would release another one; the robot is "
+        f"still stopped ({PRESSED}): look at the robot, then call srv/clear again with the present "
+        "`latch` in `state`"
     )
 
 
@@ -520,7 +521,9 @@ def test_an_activate_of_an_active_robot_changes_nothing_whatever_it_names() -> N
 
 def test_a_robot_that_starts_switched_off_has_the_number_0() -> None:
     life = ready(active=False)
-    with pytest.raises(RefusedError, match="latch 7, which is not the latest one; the robot"):
+    with pytest.raises(
+        RefusedError, match="latch 7, but srv/activate would release another one; the"
+    ):
         activate(life, 1.0, 7)
     assert activate(life, 1.0, 0)
 
