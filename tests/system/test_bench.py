@@ -101,7 +101,7 @@ def test_commands_that_never_reach_the_wire_end_it_with_the_daemons_own_reason()
     config = bench_config(Config(), simulated=True)
     config = replace(config, control=ControlConfig(auto_activate=False))
     with pytest.raises(
-        MendableError, match=r"none of the \d+ commands .* says: switched off"
+        MendableError, match=r"none of the \d+ commands, .* reports: switched off"
     ) as told:
         measure(config, "", 1.0)
     assert told.value.code == Exit.FAILURE

@@ -144,7 +144,7 @@ async def test_a_link_with_fewer_permissions_replaces_a_cookie_only_if_asked_to(
             url = f"{page.away}/token"
             async with phone.post(url, json=form, allow_redirects=False) as answer:
                 status, told = answer.status, await answer.text()
-            assert status == 303 or "my-operator (operator) already" in told
+            assert status == 303 or "already signed in as my-operator (operator)" in told
             async with phone.get(f"{page.away}/api/whoami") as answer:
                 return status, (await answer.json())["role"]
 

@@ -663,7 +663,7 @@ def test_a_computer_that_is_late_blames_no_board_and_proposes_nothing(
     for finding in checked.findings:
         if finding.figure == "not judged":
             late = f"this computer was late by up to {1000 * late_s:.0f} ms"
-            assert finding.text == f"{late}, so the check does not judge this"
+            assert finding.text == f"{late}, so the check does not judge this step"
             assert "real-time priority" in finding.mend
     assert not checked.left_turning
 

@@ -183,7 +183,7 @@ def test_the_options_of_a_bag_choose_its_sensor(
     log = write_bag(tmp_path / "bag", usual())
     assert of_bag(tmp_path, log, "--topic", "/imu/data", "--yaw-axis=z") == 0
     assert json.loads(capsys.readouterr().out)["reference"] == "yaw_rate"
-    with pytest.raises(MendableError, match="no topic /imu to use"):
+    with pytest.raises(MendableError, match="no topic /imu that can be used"):
         of_bag(tmp_path, log, "--topic", "/imu")
 
 
