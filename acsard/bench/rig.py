@@ -77,7 +77,7 @@ def processor_ns(pid: int) -> int:
 
 def resident_mb(pid: int) -> float:
     status = Path(f"/proc/{pid}/status").read_text()
-    return int(status.partition("VmRSS:")[2].split()[0]) / 1024
+    return int(status.partition("VmRSS:")[2].split()[0]) * 1024 / 1e6  # from KiB
 
 
 T = TypeVar("T")

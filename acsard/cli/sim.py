@@ -76,6 +76,9 @@ def _make_link(link: Path, device: str) -> None:
     """Make a symbolic link to the device. It may replace an older link but no other file."""
     try:
         if link.is_symlink():
+            if link.exists():
+                before = os.readlink(link)
+                print(f"{link} now leads to {device}, no longer to {before}", file=sys.stderr)
             link.unlink()
         link.symlink_to(device)
     except OSError as error:

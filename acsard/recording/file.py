@@ -51,7 +51,7 @@ from acsard.recording.mcap_records import GROWING_HEAD, MAGIC, GrowingChunk, Mes
 from acsard.recording.recorded_steps import Unfinished, UnfinishedError, unfinished
 from acsard.recording.rows import FORMAT, Batch, Row, first_of
 from acsard.recording.state import Checkpoint
-from acsard.recording.timeline import INCIDENTS, TimelineEntry, summary
+from acsard.recording.timeline import INCIDENT_WORDS, TimelineEntry, summary
 
 CHUNK_NS = 10 * NS_PER_S
 """Longest time that an MCAP chunk covers, ns. Longer chunks would save little space, and damage to
@@ -146,8 +146,8 @@ class EndRecordBuilder:
                 self._starts = self._starts or unfinished(data).number == 0
 
     def event(self, event: TimelineEntry) -> None:
-        """Add an event to the summary if it is one of `INCIDENTS`."""
-        if event.name in INCIDENTS:
+        """Add an event to the summary if it is one of `INCIDENT_WORDS`."""
+        if event.name in INCIDENT_WORDS:
             self._incidents.append(event)
 
     def end_record(self, cut: str = "", why: str = "") -> EndRecord:

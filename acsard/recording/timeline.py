@@ -423,7 +423,7 @@ class TimelineWriter:
         return f"{self._distance_m:.2f} m in {seconds:.1f} s"
 
 
-INCIDENTS = {
+INCIDENT_WORDS = {
     "fault": "fault",
     "stop": "stop",
     "emergency_stop": "emergency stop",
@@ -461,7 +461,7 @@ def summary(events: Iterable[TimelineEntry], starts: bool = False) -> str:
     stopped: list[str] = []
     losses = LinkLosses()
     for event in events:
-        word = INCIDENTS.get(event.name)
+        word = INCIDENT_WORDS.get(event.name)
         # A `wheel_fault` of level `info` reports the end of a fault: the wheel counts again.
         ended = event.name == "wheel_fault" and event.level == "info"
         if losses.repeated(event.name) or not word or ended:

@@ -548,6 +548,7 @@ def test_a_simulator_does_not_remove_the_link_of_the_one_that_replaced_it(tmp_pa
         before = os.readlink(link)
         with Program(acsard("sim", "--link", "mcu"), tmp_path) as second:
             second.says("acsard run --port mcu")
+            assert f"no longer to {before}" in second.stderr
             first.signal(signal.SIGINT)
             assert first.ended(3.0) == 0
             assert os.readlink(link) != before
