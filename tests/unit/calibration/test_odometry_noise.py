@@ -366,7 +366,7 @@ def test_noise_is_written_beside_the_geometry_and_told(found: Calibration) -> No
     assert after.distance_variance_per_metre < before.distance_variance_per_metre
     told = plain(*parts(report("a.csv", found, DriveConfig(), ""), found, "f"), width=SENTENCES)
     assert "random heading error that the odometry messages state after 10 m of driving: " in told
-    assert "random errors of the distance after 10 m" in told
+    assert "random distance error that the odometry messages state after 10 m" in told
 
 
 @pytest.mark.slow
