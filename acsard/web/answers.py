@@ -10,7 +10,8 @@ import asyncio
 import base64
 import gzip
 import hashlib
-from collections.abc import Mapping, Sequence
+import zlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import msgspec
@@ -101,11 +102,43 @@ async def sent_in_pieces(
         return web.Response(body=body, headers=headers)
     answer = web.StreamResponse(headers=headers)
     answer.content_length = len(body)
+    pieces = (memoryview(body)[begin : begin + PIECE] for begin in range(0, len(body), PIECE))
+    return await _sent(request, answer, pieces, within)
+
+
+async def sent_unpacked(
+    request: web.Request, packed: bytes, headers: Mapping[str, str], within: float
+) -> web.StreamResponse:
+    """Send what the gzip data `packed` contains, for a client that does not take gzip.
+
+    Each piece is unpacked only when the client has taken the pieces before it, so slow clients cost
+    little memory. If sending takes longer than `within` s, cut the connection.
+    """
+    answer = web.StreamResponse(headers=headers)
+    if request.method == "HEAD":
+        return web.Response(headers=headers)
+    return await _sent(request, answer, _unpacked(packed), within)
+
+
+def _unpacked(packed: bytes) -> Iterator[bytes]:
+    unpack = zlib.decompressobj(zlib.MAX_WBITS | 16)
+    while packed and not unpack.eof:
+        yield unpack.decompress(packed, PIECE)
+        packed = unpack.unconsumed_tail
+    yield unpack.flush()
+
+
+async def _sent(
+    request: web.Request,
+    answer: web.StreamResponse,
+    pieces: Iterable[bytes | memoryview],
+    within: float,
+) -> web.StreamResponse:
     try:
         async with asyncio.timeout(within):
             await answer.prepare(request)
-            for begin in range(0, len(body), PIECE):
-                await answer.write(memoryview(body)[begin : begin + PIECE])
+            for piece in pieces:
+                await answer.write(piece)
     except TimeoutError:
         if request.transport is not None:
             request.transport.abort()

@@ -10,7 +10,6 @@ import asyncio
 import socket
 from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
-from gzip import decompress
 from typing import Annotated, Any
 from urllib.parse import parse_qsl
 
@@ -39,6 +38,7 @@ from acsard.web.answers import (
     reply,
     sent,
     sent_in_pieces,
+    sent_unpacked,
     takes_gzip,
 )
 from acsard.web.callers import PROTOCOL, RefusedError, cookie_name, tokens_offered
@@ -54,6 +54,9 @@ from acsard.web.viewer import HEARTBEAT_S, Parts, Viewer
 
 BODY_S = 5.0
 """Time limit for receiving the body of a request, s. A usual body has a few hundred bytes."""
+
+REPORT_S = 300.0
+"""Time limit for sending a report to a client that does not take gzip, s."""
 
 DRAWN: dict[State, int] = {"drawing": 202, "busy": 202, "ready": 200, "failed": 503}
 """HTTP status of the answer for each state of the report of a recording."""
@@ -321,7 +324,7 @@ class Page:
         }
         if takes_gzip(request):
             return web.Response(body=body, headers=headers | {"Content-Encoding": "gzip"})
-        return web.Response(body=await in_thread(lambda: decompress(body), None), headers=headers)
+        return await sent_unpacked(request, body, headers, REPORT_S)
 
     async def _value(self, key: str) -> bytes:
         try:

@@ -34,6 +34,8 @@ POLICY = (
 origin. The browser also enforces the report's own policy, which names the allowed scripts by their
 hashes."""
 
+LISTED_NS = NS_PER_S // 4
+
 NICE = 19
 
 DRAW_S = 600.0
@@ -85,12 +87,24 @@ class BlackBox:
 
     def __init__(self, robots: Robots) -> None:
         self._robots = robots
+        self._listing: asyncio.Future[list[Recording]] | None = None
+        self._listed_ns = 0
+        """Monotonic time at which `_listing` began, ns."""
 
     async def rows(self) -> list[Recording]:
-        """Return all recordings, oldest first."""
-        place = self._place()
+        """Return all recordings, oldest first. The list may be `LISTED_NS` old.
+
+        All requests within this time share one list. To read the files takes processor time, which
+        a client that asks without end would otherwise take from the stops of others.
+        """
+        place, now_ns = self._place(), clock.mono_ns()
+        old = now_ns - self._listed_ns > LISTED_NS
+        if self._listing is None or (old and self._listing.done()):
+            self._listing = asyncio.ensure_future(in_thread(lambda: rows(place), READ_S))
+            self._listing.add_done_callback(lambda listing: listing.exception())  # all may be gone
+            self._listed_ns = now_ns
         try:
-            return await in_thread(lambda: rows(place), READ_S)
+            return await asyncio.shield(self._listing)
         except (OSError, TimeoutError) as error:
             raise _unread(place, error) from None
 

@@ -211,7 +211,12 @@ class Viewer:
         except FrameError as error:
             self._out.refuse(error.about, "malformed", str(error))
         else:
-            urgent = isinstance(frame, Press) or (isinstance(frame, Call) and frame.call == "stop")
+            # What lets go or stops is obeyed beyond the limit.
+            urgent = (
+                isinstance(frame, Press)
+                or (isinstance(frame, Call) and frame.call == "stop")
+                or (isinstance(frame, Command) and not frame.moves)
+            )
             if room or urgent:
                 self._obey(frame)
             else:

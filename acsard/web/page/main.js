@@ -214,8 +214,9 @@ function stated({ detail }) {
   if (other) permitted();
   heard = drive.heard = performance.now() - detail.age;
   silent = "";
-  // The daemon's stop does not end a running check, so it confirms STOP only if none is running.
-  if (LATCHED.includes(state.mode) && !guide.going) stopping.heard(heard - link.lag);
+  // The mode `fault` hides whether a stop is latched too. The daemon's stop does not end a running check, so it confirms
+  // STOP only if none is running.
+  if (state.mode === "stopped" && !guide.going) stopping.heard(heard - link.lag);
   views.banner(state, Boolean(hello?.barred.clear), OTHER, hello?.sender);
   releasable();
   readied();

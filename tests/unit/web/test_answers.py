@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from aiohttp.test_utils import make_mocked_request
 
-from acsard.web.answers import INLINED, PAGE, Files, sent
+from acsard.web.answers import INLINED, PAGE, PIECE, Files, _unpacked, sent
 
 
 @pytest.fixture
@@ -126,3 +126,10 @@ def test_a_page_whose_stop_changed_is_another(page: Path) -> None:
 def test_a_page_without_its_stop_is_not_sent(page: Path) -> None:
     (page / "stop.js").unlink()
     assert Files(page).get("index.html") is None
+
+
+def test_a_report_is_unpacked_in_pieces_that_cost_little_memory() -> None:
+    body = b"".join(b"%d " % number for number in range(300_000))
+    pieces = list(_unpacked(gzip.compress(body)))
+    assert b"".join(pieces) == body
+    assert max(map(len, pieces)) <= PIECE

@@ -7,12 +7,22 @@ import gzip
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from acsard.core.values import NS_PER_S
 from acsard.web import recordings as reports
-from acsard.web.recordings import BYTES, KEEP_NS, NICE, Reports, ReportState, rows
+from acsard.web.recordings import (
+    BYTES,
+    KEEP_NS,
+    NICE,
+    BlackBox,
+    Recording,
+    Reports,
+    ReportState,
+    rows,
+)
 from tests.each import each
 
 
@@ -25,6 +35,27 @@ def test_a_file_in_place_of_the_directory_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "record").write_text("")
     with pytest.raises(NotADirectoryError):
         rows(tmp_path / "record")
+
+
+async def test_many_requests_at_once_read_the_disk_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A viewer that asks without end must not take processor time from the stops of others."""
+    looked: list[Path] = []
+
+    def look(place: Path) -> list[Recording]:
+        looked.append(place)
+        return []
+
+    monkeypatch.setattr(reports, "rows", look)
+    robots: Any = None
+    box = BlackBox(robots)
+    monkeypatch.setattr(box, "_place", lambda: tmp_path)
+    assert await asyncio.gather(*(box.rows() for _ in range(40))) == [[]] * 40
+    assert looked == [tmp_path]
+    monkeypatch.setattr(reports, "LISTED_NS", -1)
+    await box.rows()
+    assert len(looked) == 2
 
 
 PATIENCE_S = 30.0

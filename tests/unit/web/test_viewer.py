@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import json
+from types import SimpleNamespace
 from typing import Any
+
+import aiohttp
 
 from acsard.client import Client
 from acsard.client.commander import Commander, Sender, Wish
 from acsard.core.messages.signature import unpack
 from acsard.core.values import Twist
+from acsard.daemon.bus.address import Address
+from acsard.web.callers import Who
+from acsard.web.guide import Guide, Reach
 from acsard.web.limits import COMMANDS
 from acsard.web.metrics import Counts
-from acsard.web.viewer import ViewerCommands
+from acsard.web.robots import About, Robots
+from acsard.web.viewer import Parts, Viewer, ViewerCommands
 
 PATIENCE_S = 20.0
 
@@ -66,3 +74,46 @@ def test_a_token_that_commands_without_end_is_refused_except_a_zero_after_a_spee
     assert commands.give("token", "teleop", driving, sender, rest)
     assert not commands.give("token", "teleop", driving, sender, rest)
     assert commands.give("another", "teleop", other, sender, AHEAD)
+
+
+async def test_a_zero_is_obeyed_beyond_the_limit_on_messages() -> None:
+    """A burst of other messages, as after a gap of the network, must not keep a robot moving."""
+    put: list[tuple[float, str]] = []
+
+    class Fake:
+        certificate, session = "", None
+
+        def like(self, *_: object) -> Fake:
+            return self
+
+        def put(self, twist: Any, _: Any, source: str) -> None:
+            put.append((twist.linear.x, source))
+
+    counts = Counts()
+    about = About("1", True, 1.0, 4.0, 10.0, "", {"slow": 10.0})
+    fake: Any = Fake()
+    robots = Robots(Address("tcp/127.0.0.1:1", "acsar", ""), lambda: fake, about, counts)
+    robots.client = fake
+    parts = Parts(robots, Guide(Reach("", "", "", ""), ""), counts)
+    request: Any = SimpleNamespace(transport=None)
+    socket: Any = SimpleNamespace()
+    viewer = Viewer(
+        socket, request, Who("operator", "bob", "token", "1.2.3.4"), parts, camera=False
+    )
+
+    def take(said: dict[str, Any]) -> None:
+        message: Any = SimpleNamespace(type=aiohttp.WSMsgType.TEXT, data=json.dumps(said))
+        viewer._take(message)
+
+    def drive(speed: float, stamp: float) -> None:
+        wish = {"linear_x": speed, "angular_z": 0.0}
+        take({"cmd": wish, "stamp": stamp, "source": "slow"})
+
+    drive(0.5, 1000.0)
+    parts.commands.outbox.flush(PATIENCE_S)
+    for number in range(700):
+        take({"ping": number})
+    drive(0.5, 1050.0)
+    drive(0.0, 1100.0)
+    parts.commands.outbox.flush(PATIENCE_S)
+    assert put == [(0.5, "slow"), (0.0, "slow")]
