@@ -5,11 +5,14 @@ from __future__ import annotations
 import random
 from typing import get_args
 
+import msgspec
 import pytest
 
+from acsard.core.incoming.commands import Arrival
+from acsard.core.incoming.queries import Query
 from tests.each import each
 from tests.scenarios.speakers import SHARED, STAMPED, Speaker, Way, moved
-from tests.scenarios.world import World
+from tests.scenarios.world import SIGNED, World
 
 OWN: tuple[Way, ...] = ("client", "signed", "rmw", "zenoh")
 
@@ -192,3 +195,28 @@ def test_a_zero_that_was_proven_never_outlives_the_speeds_behind_it(count: int) 
             world.run(max(0.0, arrival - max(sent, held)))
             speeds.deliver(message)
         assert not moved(world, start_ns), seed
+
+
+@each("stall", [0.02, 0.1])
+def test_a_zero_from_before_a_restart_of_the_board_arms_nobody(stall: float) -> None:
+    """A clear, a zero and the restart come while the loop stands. One step then obeys them all."""
+    world = quiet()
+    world.drive(0.4, seconds=0.5)
+    world.call("stop")
+    world.run(3.0)
+    payload = msgspec.json.encode({"latch": world.state.latch})
+    at_ns, ms = world.now_ns, 1_000_000
+    clear = Query(999, "srv/clear", "srv/clear", "", payload, "", at_ns + ms)
+    zero = msgspec.json.encode({"linear": {"x": 0.0}, "angular": {"z": 0.0}})
+    came = Arrival("cmd/app", True, zero, "", at_ns + 2 * ms, None, "", attachment=SIGNED)
+    world.bus.queries.append(clear)
+    world.bus.arrivals.append(came)
+    world.stall(stall / 2)
+    world.mcu.reset(world.now_ns, deaf_ns=2 * ms)
+    world.stall(stall / 2)
+    since_ns = world.now_ns
+    for _ in range(60):
+        world.send(0.4)
+        world.run(0.05)
+    assert not moved(world, since_ns)
+    assert world.state.reason.startswith("send a zero first")

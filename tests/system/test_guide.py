@@ -102,7 +102,7 @@ async def test_a_key_stops_the_leg_and_all_others_see_that_it_goes_on(
         for number in range(150):
             await guided.ours.say(reply=number, value="start")
         refused = await guided.ours.find(lambda said: said.get("refused") == "reply")
-        assert "is over" in refused["reason"]
+        assert "is not open on this page" in refused["reason"]
         assert (standing.state()["linear"] or 0.0) > 0.25
         pressed = time.monotonic()
         await guided.ours.say(press="key")

@@ -163,9 +163,9 @@ class Arbiter:
 
         Only a zero that arrives at the monotonic time `since_ns` or later arms a sender. An older
         zero, for example from before a stop was cleared, does not show that the sender wants the
-        robot to rest now.
+        robot to rest now. Of several calls in one step, the latest time counts.
         """
-        self._since_ns = since_ns
+        self._since_ns = max(self._since_ns, since_ns)
         for source in self._ranking:
             source.require_neutral()
         self._holder = self._followed = None

@@ -257,6 +257,16 @@ def test_what_arrived_before_neutral_was_asked_for_makes_no_sender_neutral_nor_h
     assert bench.driver() == ""
 
 
+def test_an_older_demand_for_a_zero_takes_nothing_from_a_newer_one() -> None:
+    """As if the board restarts, and a clear from before the restart is obeyed in the same step."""
+    bench = Bench(HIGH, armed=False)
+    bench.arbiter.require_neutral(bench.now_ns + 100 * MS)
+    bench.arbiter.require_neutral(bench.now_ns)
+    bench.wait(50).send(HIGH, REST, "a")
+    bench.wait(100).send(HIGH, GO, "a")
+    assert bench.driver() == ""
+
+
 def test_without_neutral_first_the_first_sender_to_come_is_followed() -> None:
     bench = Bench(HIGH, neutral_first=False, armed=False)
     bench.send(HIGH, GO, "a")
