@@ -25,7 +25,15 @@ from tests import pictures
 from tests.pictures import VIEWS
 from tests.system.browser import NAME, TRUSTING, Hands, Page, answer, hands
 from tests.system.bystander import lost
-from tests.system.chromium import CHROMIUM, DESKTOP, PHONE, SIDEWAYS, Browser, browsing
+from tests.system.chromium import (
+    CHROMIUM,
+    DESKTOP,
+    HAS_WINDOWS,
+    PHONE,
+    SIDEWAYS,
+    Browser,
+    browsing,
+)
 from tests.system.harness import Bus, Daemon, Peer, Program, until
 
 pytestmark = [
@@ -501,6 +509,7 @@ LOCKS = """
 """
 
 
+@pytest.mark.skipif(not HAS_WINDOWS, reason="needs the whole chromium")
 @pytest.mark.nightly
 def test_the_screen_stays_on_while_the_stick_is_held_and_no_longer(page: Phone) -> None:
     browser = page.browser

@@ -27,7 +27,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 from acsard.machine.authority import Authority
 from tests.system.browser import Page, hands, run
 from tests.system.bystander import lost
-from tests.system.chromium import CHROMIUM, PHONE, browsing
+from tests.system.chromium import CHROMIUM, HAS_WINDOWS, PHONE, browsing
 from tests.system.harness import ZERO_LINE, Daemon, FarPeer, Heard, until, wheels
 from tests.system.hosts import Hosts, inside, on
 
@@ -430,6 +430,8 @@ TIMES = pytest.mark.parametrize(
 def test_whoever_lets_go_in_whatever_way_the_robot_brakes(
     field: Field, way: Way, times: int
 ) -> None:
+    if way is tab_hidden and not HAS_WINDOWS:
+        pytest.skip("needs the whole chromium")
     if times > 1:
         field.longest_s = 30.0
     tell(way.__name__, [field.lets_go(way, number) for number in range(times)])
