@@ -114,17 +114,18 @@ async def sent_unpacked(
     Each piece is unpacked only when the client has taken the pieces before it, so slow clients cost
     little memory. If sending takes longer than `within` s, cut the connection.
     """
-    answer = web.StreamResponse(headers=headers)
     if request.method == "HEAD":
         return web.Response(headers=headers)
-    return await _sent(request, answer, _unpacked(packed), within)
+    return await _sent(request, web.StreamResponse(headers=headers), _unpacked(packed), within)
 
 
 def _unpacked(packed: bytes) -> Iterator[bytes]:
     unpack = zlib.decompressobj(zlib.MAX_WBITS | 16)
-    while packed and not unpack.eof:
-        yield unpack.decompress(packed, PIECE)
-        packed = unpack.unconsumed_tail
+    for begin in range(0, len(packed), PIECE):
+        left = packed[begin : begin + PIECE]
+        while left:
+            yield unpack.decompress(left, PIECE)
+            left = unpack.unconsumed_tail
     yield unpack.flush()
 
 

@@ -101,7 +101,10 @@ class BlackBox:
         old = now_ns - self._listed_ns > LISTED_NS
         if self._listing is None or (old and self._listing.done()):
             self._listing = asyncio.ensure_future(in_thread(lambda: rows(place), READ_S))
-            self._listing.add_done_callback(lambda listing: listing.exception())  # all may be gone
+            # All clients may be gone by the time an error comes; nobody would then read it.
+            self._listing.add_done_callback(
+                lambda listing: listing.cancelled() or listing.exception()
+            )
             self._listed_ns = now_ns
         try:
             return await asyncio.shield(self._listing)
