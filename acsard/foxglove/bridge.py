@@ -53,7 +53,7 @@ class Bridge:
         facts = learn(robot)
         ros = facts.config.ros
         self._shown = Shown(self._wake.set)
-        self._settings = Settings(robot, self._notices, facts.tables)
+        self._settings = Settings(robot, self._notices, facts.tables, self._wake.set)
         topic = full_name(ros.namespace, "cmd_vel")
         self._drives = Drives(self._viewer, topic, self._notices, facts.forbidden)
         self._drives.timeout_s = self._timeout_s(facts)
@@ -119,7 +119,7 @@ class Bridge:
         self._relay.pass_on()
         self._follow(bool(driving) and here)
         self._object(driving)
-        if here and (news := self._settings.refresh()):
+        if news := self._settings.refresh(here):
             self._server.publish_parameter_values(as_parameters(news))
         self._notices.send(self._server, self._relay.log, newcomers=bool(fresh))
 

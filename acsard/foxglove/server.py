@@ -30,6 +30,10 @@ from acsard.foxglove.drives import Drives
 from acsard.foxglove.notices import Notices
 from acsard.host import clock
 from acsard.host.errors import InUseError, NotPermittedError
+from acsard.host.mailbox import Mailbox
+
+WISHES = 16
+"""Largest number of changes of settings that wait for the daemon."""
 
 POLL_NS = 5 * NS_PER_S
 """Time between two queries for the robot's settings, which other clients may change, ns."""
@@ -68,13 +72,17 @@ class Shown:
 class Settings:
     """The settings of the robot that viewers can read and change while the daemon runs.
 
-    The main thread calls `refresh`, and the server's threads call `get`, `follow`, `unfollow` and
-    `set`. Both call `learn`: the server's threads through `set`.
+    The main thread calls `learn` and `refresh`, and the server's threads call `get`, `set`,
+    `follow` and `unfollow`. Only the main thread waits for the daemon, because the server's threads
+    also carry the stops of the viewers.
     """
 
-    def __init__(self, robot: Robot, notices: Notices, tables: object) -> None:
+    def __init__(
+        self, robot: Robot, notices: Notices, tables: object, wake: Callable[[], None]
+    ) -> None:
         self._robot, self._notices = robot, notices
         self._lock = Lock()
+        self._wishes = Mailbox[dict[str, Any]](WISHES, wake)
         self._known: dict[str, Any] = {}
         self._read_ns = clock.mono_ns()
         self._asked = False
@@ -105,30 +113,55 @@ class Settings:
         with self._lock:
             self._followed.difference_update(names)
 
-    def set(self, wishes: Mapping[str, Any]) -> dict[str, Any]:
-        """Change all of these settings or none, and return their values afterwards.
+    def set(self, wishes: dict[str, Any]) -> dict[str, Any]:
+        """Queue a change of these settings, and return their present values.
 
-        A notice tells all viewers whether it succeeded. This call may wait for the daemon.
+        `refresh` makes the change. A notice tells all viewers whether it succeeded.
         """
+        with self._lock:
+            full = len(self._wishes.waiting) >= WISHES
+            if not full:
+                self._wishes.put(wishes)
+        if full:
+            text = f"not set: {WISHES} earlier changes wait for the daemon; try again"
+            self._notices.say("error", "set", text)
+        with self._lock:
+            return asked(self._known, wishes.keys()) if wishes else {}
+
+    def _change(self, wishes: dict[str, Any]) -> dict[str, Any]:
+        """Change all of these settings or none. Return those that differ from the last known ones.
+
+        The result also has the settings in `wishes`, because a viewer may show them as changed.
+        """
+        news = dict[str, Any]()
         try:
             if any(value is None for value in wishes.values()):
                 raise AcsardError("a setting cannot be removed, only changed")
             reply = self._robot.set(wishes)
             said, done = reply.message, reply.success
             if self._readable:
-                self.learn(self._robot.get("config"))
+                news = self.learn(self._robot.get("config"))
         except AcsardError as error:
             said, done = str(error), False
         self._notices.say("info" if done else "error", "set", said if done else f"not set: {said}")
         with self._lock:
-            return asked(self._known, wishes.keys()) if wishes else {}
+            return news | (asked(self._known, wishes.keys()) if wishes else {})
 
-    def refresh(self) -> dict[str, Any]:
-        """Query the settings again if a viewer needs them; return the settings that changed."""
+    def refresh(self, here: bool) -> dict[str, Any]:
+        """Make the waiting changes, or query the settings again if a viewer needs them.
+
+        `here` is false if the daemon is gone. Return the settings that changed. This call may wait
+        for the daemon.
+        """
+        if self._wishes.waiting:
+            news = dict[str, Any]()
+            for wishes in self._wishes.take():
+                news |= self._change(wishes)
+            return news
         with self._lock:
             age_ns = clock.mono_ns() - self._read_ns
             due = (self._asked and age_ns > NS_PER_S) or (self._followed and age_ns > POLL_NS)
-        if not due or not self._readable:
+        if not (due and here and self._readable):
             return {}
         try:
             return self.learn(self._robot.get("config"))

@@ -416,9 +416,11 @@ def test_services_answer_in_the_daemon_s_words(viewer: Viewer, bus: Bus) -> None
 @SLOW
 def test_parameters_are_the_live_settings_and_errors_are_reported(viewer: Viewer, bus: Bus) -> None:
     assert viewer.get()["limits.linear_speed"] == 1.0
-    assert viewer.set({"limits.linear_speed": 2}) == {"limits.linear_speed": 2.0}
+    viewer.follow("limits.linear_speed")
+    viewer.set({"limits.linear_speed": 2})
+    until(lambda: viewer.parameters["limits.linear_speed"] == 2.0, 5.0, "the published change")
     assert bus.get("config")["limits"]["linear_speed"] == 2.0
-    # It sends the current value, so that the panel shows that again.
+    # The reply has the present value, so that the panel shows that again.
     assert viewer.set({"limits.linear_speed": 99}) == {"limits.linear_speed": 2.0}
     assert "a number from 0 to 10 m/s" in viewer.status("not set: limits.linear_speed")["message"]
     viewer.set({"drive.wheel_radius": 1.0})

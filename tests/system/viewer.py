@@ -175,8 +175,12 @@ class Viewer:
         """Return all parameters."""
         return self._asked("getParameters", parameterNames=[])
 
+    def follow(self, *names: str) -> None:
+        """Subscribe to changes of parameters. The changes appear in `parameters`."""
+        self._say("subscribeParameterUpdates", parameterNames=names)
+
     def set(self, wishes: Mapping[str, Any]) -> dict[str, Any]:
-        """Set these parameters; return the server's resulting values."""
+        """Ask for these values; return the present values of the parameters."""
         wanted = [{"name": name, "value": value} for name, value in wishes.items()]
         return self._asked("setParameters", parameters=wanted)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -10,9 +12,20 @@ from acsard.client import Client
 from acsard.core.config.live import LIVE
 from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
+from acsard.core.messages.schema import ServiceReply
+from acsard.core.values import AcsardError
 from acsard.foxglove.drives import Drives
 from acsard.foxglove.notices import Notices
-from acsard.foxglove.server import POLL_NS, Listener, Settings, Shown, asked, changes, live_settings
+from acsard.foxglove.server import (
+    POLL_NS,
+    WISHES,
+    Listener,
+    Settings,
+    Shown,
+    asked,
+    changes,
+    live_settings,
+)
 from acsard.host import clock
 
 KEY, OTHER = "rates.odom", "rates.joint_states"
@@ -23,17 +36,38 @@ NOW = live_settings(effective(Config()))
 class Robot:
     """A client of a robot whose setting somebody else has changed."""
 
+    def __init__(self) -> None:
+        self.asked: list[dict[str, Any]] = []
+        """The changes that the daemon was asked for."""
+
+    def set(self, wishes: dict[str, Any]) -> ServiceReply:
+        self.asked.append(wishes)
+        if wishes[KEY] > 100:
+            raise AcsardError("no answer from the daemon")
+        return ServiceReply(True, "set")
+
     def get(self, key: str) -> Any:
         tables: Any = effective(Config())
         tables["rates"]["odom"] = 7.0
         return tables
 
 
+def of_robot(robot: Robot) -> tuple[Settings, Callable[[], list[str]]]:
+    """Return the settings of a robot, and a function that returns what the viewers were told."""
+    told = list[str]()
+    notices = Notices(told.append, lambda: None)
+
+    def words() -> list[str]:
+        server: Any = SimpleNamespace(publish_status=lambda *_: None)
+        notices.send(server, lambda _: None, newcomers=False)
+        return told
+
+    return Settings(cast(Client, robot), notices, effective(Config()), lambda: None), words
+
+
 def settings_after(monkeypatch: pytest.MonkeyPatch, *calls: tuple[str, list[str]]) -> Settings:
     """Return the settings after these calls of the server, at a time at which a poll is due."""
-    made = Settings(
-        cast(Client, Robot()), Notices(lambda _: None, lambda: None), effective(Config())
-    )
+    made, _ = of_robot(Robot())
     listener = Listener(Shown(lambda: None), cast(Drives, None), made)
     for name, keys in calls:
         getattr(listener, f"on_parameters_{name}")(keys)
@@ -45,7 +79,35 @@ def settings_after(monkeypatch: pytest.MonkeyPatch, *calls: tuple[str, list[str]
 def test_a_change_reaches_a_viewer_that_follows_a_parameter(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    assert settings_after(monkeypatch, ("subscribe", [KEY])).refresh() == {KEY: 7.0}
+    assert settings_after(monkeypatch, ("subscribe", [KEY])).refresh(here=True) == {KEY: 7.0}
+
+
+def test_a_change_waits_for_the_daemon_outside_the_threads_that_carry_stops() -> None:
+    robot = Robot()
+    made, words = of_robot(robot)
+    assert made.set({KEY: 7.0}) == {KEY: NOW[KEY]}
+    assert not robot.asked
+    assert made.refresh(here=True) == {KEY: 7.0}
+    assert robot.asked == [{KEY: 7.0}]
+    assert made.refresh(here=True) == {}
+    assert words() == ["set"]
+
+
+def test_a_change_that_fails_gives_the_viewers_the_present_value_and_the_reason() -> None:
+    made, words = of_robot(Robot())
+    made.set({KEY: 999.0})
+    assert made.refresh(here=False) == {KEY: NOW[KEY]}
+    assert words() == ["not set: no answer from the daemon"]
+
+
+def test_changes_beyond_the_limit_are_refused_in_words() -> None:
+    robot = Robot()
+    made, words = of_robot(robot)
+    for _ in range(WISHES + 1):
+        made.set({KEY: 7.0})
+    assert words() == [f"not set: {WISHES} earlier changes wait for the daemon; try again"]
+    made.refresh(here=True)
+    assert len(robot.asked) == WISHES
 
 
 def test_the_end_of_one_subscription_does_not_end_the_others(
@@ -54,14 +116,14 @@ def test_the_end_of_one_subscription_does_not_end_the_others(
     made = settings_after(
         monkeypatch, ("subscribe", [KEY]), ("subscribe", [OTHER]), ("unsubscribe", [OTHER])
     )
-    assert made.refresh() == {KEY: 7.0}
+    assert made.refresh(here=True) == {KEY: 7.0}
 
 
 def test_without_a_follower_the_robot_is_not_queried(monkeypatch: pytest.MonkeyPatch) -> None:
     made = settings_after(
         monkeypatch, ("subscribe", [KEY, OTHER]), ("unsubscribe", [OTHER]), ("unsubscribe", [KEY])
     )
-    assert made.refresh() == {}
+    assert made.refresh(here=True) == {}
 
 
 def test_they_are_the_settings_that_may_be_set_and_no_others() -> None:
