@@ -189,6 +189,11 @@ class Commander:
             stamp_ns += now_ns - self._came_ns
         return Wish(REST, stamp_ns, self._last.steady)
 
+    @property
+    def moves(self) -> bool:
+        """Whether the last command that arrived has requested a speed, however long ago."""
+        return self._asked_ns is not None
+
     def drives(self, now_ns: int) -> bool:
         """Return whether the sender has requested a speed within the last `DRIVES_NS`."""
         return self._asked_ns is not None and now_ns - self._asked_ns <= DRIVES_NS

@@ -88,11 +88,10 @@ class ViewerCommands:
 
         `owner` is the client's token, or the public name of a viewer on the robot itself. If the
         owner exceeds the rate limit `COMMANDS`, return False and queue nothing. However, a zero
-        that ends a drive is always queued.
+        that follows a speed is always queued.
         """
-        now_ns = clock.mono_ns()
-        ends = wish.twist == REST and commander.drives(now_ns)
-        if not self._rates.take(owner, now_ns) and not ends:
+        ends = wish.twist == REST and commander.moves
+        if not self._rates.take(owner, clock.mono_ns()) and not ends:
             return False
         replaced = commander.replaced
         self.outbox.take(commander, partial(self._put, source, sender), wish)
