@@ -11,7 +11,7 @@ from collections.abc import Iterable
 
 from acsard.host.errors import Exit, MendableError, NotPermittedError
 from acsard.machine import service_installation as service
-from acsard.machine.service_installation import Step, misplaced
+from acsard.machine.service_installation import Step, lacking, misplaced
 from acsard.terminal.output import show, table
 
 
@@ -46,7 +46,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def main_install(args: argparse.Namespace) -> int:
     _ready(args)
-    trouble = misplaced()
+    trouble = misplaced() or lacking()
     if trouble:
         print(f"acsard: {trouble}", file=sys.stderr)
         if not (args.dry_run or args.force):

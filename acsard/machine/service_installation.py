@@ -7,6 +7,7 @@ the text of every step before the steps are carried out.
 
 from __future__ import annotations
 
+import grp
 import os
 import re
 import shutil
@@ -26,6 +27,10 @@ from acsard.host.processes import called
 HOME = "/opt/acsard/venv"
 """Path of the venv in the unit files of `deploy/`. The installation replaces it by the path of the
 venv that runs acsard."""
+
+GROUP, SETPRIV = "dialout", "/usr/bin/setpriv"
+"""The group that the units name, and the program with which the daemon's unit runs `acsard-stop`.
+"""
 
 OUT_OF_SIGHT = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
 """Directories that are hidden from the service."""
@@ -58,6 +63,23 @@ def misplaced(
                 f"the service's user may not enter {closed}, but needs {path}; run `chmod o+rx "
                 f"{closed}`, or {_anew(prefix)}"
             )
+    return ""
+
+
+def lacking(group: str = GROUP, program: str = SETPRIV) -> str:
+    """Return what the units need and this system does not have, or "" if it has all of it."""
+    if not os.access(program, os.X_OK):
+        return (
+            f"{program} is missing, with which the service stops the wheels after the daemon's "
+            "end; install the package util-linux"
+        )
+    try:
+        grp.getgrnam(group)
+    except KeyError:
+        return (
+            f"this system has no group {group}, which gives the service the serial port; run "
+            f"`groupadd --system {group}`, or see deploy/systemd/README.md for another group"
+        )
     return ""
 
 

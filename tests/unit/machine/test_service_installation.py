@@ -11,8 +11,10 @@ from acsard.host.errors import MendableError
 from acsard.machine.service_installation import (
     GATEWAY,
     GONE,
+    GROUP,
     INSTALLED,
     PAGE,
+    SETPRIV,
     STATES,
     STOP,
     UNIT,
@@ -25,8 +27,10 @@ from acsard.machine.service_installation import (
     admitted,
     files,
     installing,
+    lacking,
     misplaced,
     present,
+    source,
     strangers,
     uninstalling,
 )
@@ -75,6 +79,15 @@ def test_a_directory_that_others_may_not_enter_is_named(tmp_path: Path) -> None:
     told = misplaced(str(venv), "/usr", PROGRAM, hidden=())
     assert "may not enter" in told
     assert "chmod o+rx" in told
+
+
+def test_a_system_without_what_the_units_name_is_told_so() -> None:
+    assert lacking(group="root", program=PROGRAM) == ""
+    assert "groupadd --system nobodyhome" in lacking(group="nobodyhome", program=PROGRAM)
+    assert "install the package util-linux" in lacking(program="/nowhere/setpriv")
+    unit = (source() / "systemd" / UNIT).read_text()
+    assert f"ExecStopPost=+{SETPRIV} " in unit
+    assert f"SupplementaryGroups={GROUP}" in unit
 
 
 ETC = Path("/etc/x")
