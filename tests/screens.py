@@ -14,8 +14,8 @@ from acsard.core.messages.schema import BatterySummary
 from acsard.core.motion.arbiter import Choice
 from acsard.core.motion.arbiter_text import chosen
 from acsard.top.drive_screen import lines
-from acsard.top.roster import table
-from tests.unit.top import test_drive_screen, test_roster
+from acsard.top.fleet_table import table
+from tests.unit.top import test_drive_screen, test_fleet_table
 from tests.unit.top.screens import BEFORE, SEEN, STATE, lines_of
 
 WIDTHS = (40, 80, 160)
@@ -40,13 +40,15 @@ WARNED = replace(
 def screens(width: int) -> dict[str, list[str]]:
     """Return the lines of each screen, by verb."""
     states = {"robot2": WAITING, "robot3": WARNED}
-    robots = [replace(test_roster.ROW, robot_id=name, state=one) for name, one in states.items()]
+    robots = [
+        replace(test_fleet_table.ROW, robot_id=name, state=one) for name, one in states.items()
+    ]
     return {
         "drive": [
             one.plain for one in lines(replace(test_drive_screen.SEEN, state=WAITING), width)
         ],
         "top": lines_of(replace(SEEN, state=WARNED, before=BEFORE), width),
-        "fleet": table([test_roster.ROW, *robots], width),
+        "fleet": table([test_fleet_table.ROW, *robots], width),
         "echo state --short": [short(STATE), short(WAITING), short(WARNED)],
     }
 

@@ -21,7 +21,7 @@ from acsard.daemon.bus.robot_discovery import ALL
 from acsard.host.errors import Exit, UnreachableError
 from acsard.terminal.output import has_screen
 from acsard.top import terminal
-from acsard.top.roster import Roster, table
+from acsard.top.fleet_table import Roster, table
 from acsard.top.terminal import output_size
 
 

@@ -14,7 +14,7 @@ from acsard.core.config.editing import edited
 from acsard.core.config.parsing import ConfigError, parse
 from acsard.core.config.settings import Config
 from acsard.host.atomic_file import replace, sync
-from acsard.host.edit_process import edited_apart
+from acsard.host.config_edit_process import edited_apart
 from acsard.host.errors import Exit, ExitError, MendableError
 from acsard.host.extras import install
 

@@ -27,8 +27,8 @@ from acsard.host.terminal_modes import one_by_one
 from acsard.terminal.output import has_screen, plain
 from acsard.top.drive_screen import HELP, Teleop, lines, moves, news, parting
 from acsard.top.feed import Feed
+from acsard.top.fleet_table import Roster, table
 from acsard.top.keyboard import Ride
-from acsard.top.roster import Roster, table
 from acsard.top.screen import screen
 
 PERIOD_S = 0.25

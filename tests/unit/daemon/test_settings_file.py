@@ -20,9 +20,9 @@ from acsard.core.config.settings import Config
 from acsard.core.values import Answer, Event, Latches, Plain, Request
 from acsard.daemon import settings_file as module
 from acsard.daemon.settings_file import SettingsFile, keeps
-from acsard.host import config_file, edit_process
+from acsard.host import config_edit_process, config_file
+from acsard.host.config_edit_process import edited_apart
 from acsard.host.config_file import Edit
-from acsard.host.edit_process import edited_apart
 from tests.system.harness import until
 
 TEXT = "[limits]\nlinear_speed = 0.5\n"
@@ -484,15 +484,15 @@ def test_the_text_is_computed_where_the_priority_cannot_be_lowered(
     def refuse(increment: int) -> int:
         raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
 
-    task = msgspec.json.encode(edit_process.Task(TEXT, {"limits.linear_speed": 0.8}))
+    task = msgspec.json.encode(config_edit_process.Task(TEXT, {"limits.linear_speed": 0.8}))
     given, answer = io.TextIOWrapper(io.BytesIO(task)), io.TextIOWrapper(io.BytesIO())
     monkeypatch.setattr(os, "nice", refuse)
     monkeypatch.setattr(sys, "stdin", given)
     monkeypatch.setattr(sys, "stdout", answer)
-    edit_process.main()
+    config_edit_process.main()
     answer.seek(0)
-    made = msgspec.json.decode(answer.read(), type=edit_process.Result)
-    assert made == edit_process.Result(TEXT.replace("0.5", "0.8"))
+    made = msgspec.json.decode(answer.read(), type=config_edit_process.Result)
+    assert made == config_edit_process.Result(TEXT.replace("0.5", "0.8"))
 
 
 def test_git_does_not_read_the_repository_of_another_user(

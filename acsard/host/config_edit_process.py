@@ -46,7 +46,7 @@ def edited_apart(text: str, keys: Mapping[str, object]) -> str:
     """
     task = msgspec.json.encode(Task(text, dict(keys)))
     # With -P Python ignores the working directory, so it runs the installed package.
-    words = [sys.executable, "-P", "-m", "acsard.host.edit_process"]
+    words = [sys.executable, "-P", "-m", "acsard.host.config_edit_process"]
     try:
         done = subprocess.run(
             words, input=task, capture_output=True, env=environment(), timeout=EDIT_S

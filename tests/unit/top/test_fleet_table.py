@@ -18,7 +18,7 @@ from acsard.client.fleet import Row
 from acsard.client.follower import FLEET_ASK_S
 from acsard.core.messages.schema import BatterySummary, Info, Time
 from acsard.daemon.bus.address import Address
-from acsard.top.roster import HEADS, Roster, table
+from acsard.top.fleet_table import HEADS, Roster, table
 from tests.each import each
 from tests.unit.top.screens import STATE, sample_of
 
