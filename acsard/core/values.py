@@ -6,6 +6,7 @@ a reference cycle.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal, get_args
 
 from msgspec import Struct
@@ -395,6 +396,18 @@ class Latch(Struct, frozen=True):
     """Reason in words, such as "stopped by NAME" or the cause of a fault."""
     kept: bool = False
     """True if the latch was set before the daemon's last start."""
+    earlier: tuple[Latch, ...] = ()
+    """The earlier causes of the same stop, the newest first. Each is the latch that the next cause
+    replaced, and has no earlier causes of its own."""
+
+    @property
+    def causes(self) -> tuple[Latch, ...]:
+        """This latch and the earlier causes of the same stop, the newest first."""
+        return (self, *self.earlier)
+
+    def each(self, change: Callable[[Latch], Latch]) -> Latch:
+        """Return this latch with `change` applied to it and to each earlier cause."""
+        return replace(change(self), earlier=tuple([change(cause) for cause in self.earlier]))
 
 
 class Latches(Struct, frozen=True):
@@ -419,7 +432,7 @@ class Latches(Struct, frozen=True):
     def after_restart(self) -> Latches:
         """Return these latches for the next start of the daemon, each marked as kept."""
         stop, fault, inactive = (
-            None if latch is None else replace(latch, kept=True)
+            None if latch is None else latch.each(lambda cause: replace(cause, kept=True))
             for latch in (self.stop, self.fault, self.inactive)
         )
         return Latches(stop, fault, inactive, self.lowered)

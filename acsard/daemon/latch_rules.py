@@ -7,13 +7,13 @@ latch is written when it is set, so it does not matter how the process ends. Thi
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import msgspec
 from msgspec import Struct
 from msgspec.structs import replace
 
-from acsard.core.motion.lifecycle import number_after_restart
+from acsard.core.motion.lifecycle import number_after_restart, with_causes
 from acsard.core.values import NS_PER_S, AcsardError, Event, Instant, Latch, Latches
 
 FORMAT = 1
@@ -33,6 +33,10 @@ BY = "acsard"
 """Name in place of a client's name in a stop that the daemon itself sets."""
 
 
+EMPTY = ("earlier", ())
+"""The field of a latch that has one cause. Most latches have one, so the file leaves it out."""
+
+
 class LatchFileError(AcsardError):
     """The bytes are not a latch file of this version and of this robot."""
 
@@ -46,11 +50,11 @@ class _Content(Struct, frozen=True):
 def encode(robot: str, latches: Latches) -> bytes:
     """Return the content of a robot's latch file, as indented JSON."""
     stop, fault, inactive = (
-        None if latch is None else replace(latch, by=_safe(latch.by), why=_safe(latch.why))
+        None if latch is None else latch.each(_with_safe_text)
         for latch in (latches.stop, latches.fault, latches.inactive)
     )
     content = _Content(FORMAT, robot, Latches(stop, fault, inactive, latches.lowered))
-    return msgspec.json.format(msgspec.json.encode(content), indent=2) + b"\n"
+    return msgspec.json.format(msgspec.json.encode(_plain(content)), indent=2) + b"\n"
 
 
 def decode(robot: str, data: bytes) -> Latches:
@@ -76,7 +80,7 @@ def decode(robot: str, data: bytes) -> Latches:
         raise LatchFileError(f"it is damaged ({error})") from None
     if content.robot != robot:
         raise LatchFileError(f"it belongs to the robot {_safe(content.robot)!r:.60}")
-    if msgspec.to_builtins(content) != raw:
+    if _plain(content) != raw:
         raise LatchFileError("it is damaged (a field name is missing or unknown)")
     return content.latches.after_restart()
 
@@ -168,13 +172,15 @@ class Handover:
     def take_stops(self, latches: Latches, by: list[str], now: Instant) -> None:
         """Hand these latches to the keeper, with a stop if `by` is not empty.
 
-        `by` names the clients of the stops that no control step has processed. The added stop has a
-        new number, so that a `clear` of an earlier stop does not release it.
+        `by` names the clients of the stops that no control step has processed. The stop has a new
+        number, so that a `clear` of an earlier stop does not release it, and it names all clients.
         """
-        if by:
-            before = -1 if latches.stop is None else latches.stop.number
-            text = f"stopped by {by[0] or 'request'}"
-            latches = stopped(replace(latches, stop=None), text, now, by[0], before)
+        for name in reversed(by):
+            last, text = latches.stop, f"stopped by {name or 'request'}"
+            before = -1 if last is None else last.number
+            latches = stopped(replace(latches, stop=None), text, now, name, before)
+            assert latches.stop is not None
+            latches = replace(latches, stop=with_causes(latches.stop, last))
         self.take(latches)
 
     @property
@@ -200,6 +206,22 @@ class Handover:
         None without a keeper, which means that latches are not stored.
         """
         return None if self._keeper is None else self._keeper.trouble
+
+
+def _plain(content: Any) -> Any:
+    """Return the content as JSON data. Only a latch with several causes has the field `earlier`."""
+    match msgspec.to_builtins(content):
+        case dict() as fields:
+            pairs = fields.items()
+            return {name: _plain(value) for name, value in pairs if (name, value) != EMPTY}
+        case tuple() as items:
+            return [_plain(item) for item in items]
+        case value:
+            return value
+
+
+def _with_safe_text(latch: Latch) -> Latch:
+    return replace(latch, by=_safe(latch.by), why=_safe(latch.why))
 
 
 def _safe(text: str) -> str:

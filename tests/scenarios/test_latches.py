@@ -108,6 +108,22 @@ def test_every_stop_is_a_new_latch_also_while_one_holds(world: World) -> None:
     assert msgspec.json.decode(msgspec.json.encode(float(seen[-1]))) == seen[-1]
 
 
+def test_a_bumper_does_not_hide_who_stopped_the_robot(world: World) -> None:
+    with world.mcu.bumpers():
+        world.run(0.2)
+        call(world, "stop", "joe")
+        seen = world.state.latch
+        with world.mcu.bumper_pressed(1, 0.0, 0.0):
+            world.run(0.2)
+        world.run(0.2)
+        assert world.state.latch > seen
+        assert "bumper 1 pressed (latched at 2027" in world.state.reason
+        assert f"; also stopped by {JOE} (native) at 2027" in world.state.reason
+        assert not call(world, "clear", "ann", seen).success
+        assert call(world, "clear", "ann", world.state.latch).success
+        assert world.state.mode == "ready"
+
+
 def test_a_stop_that_arrives_ahead_of_its_query_is_one_latch(world: World) -> None:
     world.put("stop", b"", attachment=msgspec.json.encode({"sender": "joe"}))
     arrived_ns, ahead = world.now_ns, world.state.latch

@@ -422,8 +422,8 @@ FAULTS = (
         "lifecycle repeated",
         "a second stop does not get a number of its own",
         LIFECYCLE,
-        "self.latches.stop is not None and asked_ns <= self._stop_asked_ns",
-        "self.latches.stop is not None",
+        "        if not (named and asked_ns <= self._stop_asked_ns):\n",
+        "        if latch is None:\n",
     ),
     fault(
         "lifecycle off",

@@ -12,6 +12,9 @@ or a `deactivate` that its sender has not seen, even if the network delivers the
 
 A pressed emergency stop at the robot, a pressed bumper and an empty battery latch a stop too, and a
 fault of a motor driver latches a fault. `clear` releases nothing while one of these causes lasts.
+
+There is one latch for all causes of a stop. Each new cause gives it a new number, and the latch
+keeps the earlier causes, so that the operator reads all of them before `clear` releases the latch.
 """
 
 from __future__ import annotations
@@ -27,6 +30,11 @@ from acsard.core.values import NS_PER_S, Instant, Latch, Latches
 LOOK_FIRST_S = 2.0
 """For this many seconds after a stop, a `deactivate` or the start of the daemon, a request must
 name the number of the latch. The network seldom takes longer to deliver a packet."""
+
+MAX_CLIENTS = 4
+"""Largest number of clients among the earlier causes of a stop. Of more clients, the first ones are
+kept, so that a flood of stops neither fills the reason in `state` nor hides who stopped first. The
+board has only a few causes."""
 
 LONG_AGO_NS = -(2**62)
 """A monotonic time that is earlier than every real one, ns. It stands for "never"."""
@@ -56,7 +64,7 @@ class Lifecycle:
         self._cleared_ns = LONG_AGO_NS
         """Monotonic time at which a fault was last cleared, ns (see `_require_seen_stop`)."""
         self._stop_asked_ns = LONG_AGO_NS
-        """Monotonic time at which the request for the last stop arrived, ns."""
+        """Latest monotonic time at which a client's request for a stop arrived, ns."""
         self._off_ns = LONG_AGO_NS
         """Monotonic time at which the robot was last switched off, ns."""
         self._held = self._mend = ""
@@ -92,8 +100,8 @@ class Lifecycle:
 
     def press(self, why: str, now: Instant) -> None:
         """Latch a stop that the board causes, under a new number. `why` names the cause."""
-        self._stopped_ns = self._stop_asked_ns = now.mono_ns
-        self._latch(stop=self._made(now, "", why))
+        self._stopped_ns = now.mono_ns
+        self._latch(stop=self._stop(now, "", why))
 
     def hold(self, why: str, mend: str, now_ns: int) -> None:
         """Record why the state of the board forbids the call `clear` now.
@@ -126,14 +134,16 @@ class Lifecycle:
     def stop(self, by: str, asked_ns: int, now: Instant) -> str:
         """Latch a stop under a new number, and return a text for the client.
 
-        If the latched stop was requested at the same time as this one or later, keep that latch.
-        `asked_ns` is the monotonic time at which the request arrived. `by` is "" if the client is
-        unknown.
+        If the latch already names this client and a stop that arrived at the same time as this one
+        or later, keep that latch. `asked_ns` is the monotonic time at which the request arrived.
+        `by` is "" if the client is unknown.
         """
-        repeated = self.latches.stop is not None and asked_ns <= self._stop_asked_ns
-        if not repeated:
-            self._stopped_ns, self._stop_asked_ns = now.mono_ns, asked_ns
-            self._latch(stop=self._made(now, by, f"stopped by {by or 'request'}"))
+        latch, why = self.latches.stop, f"stopped by {by or 'request'}"
+        named = latch is not None and any(cause.why == why for cause in latch.causes)
+        if not (named and asked_ns <= self._stop_asked_ns):
+            self._stopped_ns = now.mono_ns
+            self._stop_asked_ns = max(self._stop_asked_ns, asked_ns)
+            self._latch(stop=self._stop(now, by, why))
         if self._shutting_down:
             return f"stopped and latched; {GOING_DOWN}"
         if self.latches.fault is not None:
@@ -166,7 +176,7 @@ class Lifecycle:
             set_ns = max(self._stopped_ns, self._faulted_ns)
         else:
             if number != latch.number:
-                still = f"in fault ({latch.why})" if latches.fault else _stopped(latch)
+                still = f"in fault ({latch.why})" if latches.fault else _still(latch)
                 raise RefusedError(_not_in_force(number, still, "srv/clear"))
             set_ns = self._stopped_ns if latches.fault is None else self._faulted_ns
         if asked_ns <= set_ns or now.mono_ns == set_ns:
@@ -181,9 +191,7 @@ class Lifecycle:
         self._latch(fault=None)
         if latches.stop is None:
             return "cleared; each sender must send a zero before it drives"
-        return (
-            f"fault cleared, but the robot is still {_stopped(latches.stop)}: call srv/clear again"
-        )
+        return f"fault cleared, but the robot is still {_still(latches.stop)}: call srv/clear again"
 
     def activate(self, number: int | None, asked_ns: int, now: Instant) -> bool:
         """Switch the robot on; return True if it was off.
@@ -233,12 +241,12 @@ class Lifecycle:
         if latches.next is not None:
             fault, stop = latches.fault, latches.stop
             parts = [] if fault is None else [f"{fault.why}, latched {_when(fault)}"]
-            if held and held not in [latch.why for latch in (fault, stop) if latch]:
-                # The cause that lasts is not the latched one: since then a client has stopped the
-                # robot, or the board has reported another cause.
+            causes = () if stop is None else stop.causes
+            if held and held not in [latch.why for latch in (fault, *causes) if latch]:
+                # The cause that lasts is not a latched one: the board reports another cause now, as
+                # when one of two pressed bumpers is released.
                 parts.append(held)
-            if stop is not None:
-                parts.append(_said(stop))
+            parts += [_said(cause) for cause in causes]
             before = f"{self._mend}, then " if held else ""
             twice = " twice" if fault and stop else ""
             return f"{'; also '.join(parts)}; {before}call srv/clear{twice}"
@@ -258,6 +266,9 @@ class Lifecycle:
         else:
             self._numbered, self._number = True, number_after_restart(self._number, now)
         return Latch(self._number, now.wall_ns, by, why)
+
+    def _stop(self, now: Instant, by: str, why: str) -> Latch:
+        return with_causes(self._made(now, by, why), self.latches.stop)
 
     def _latch(self, **changes: Latch | None) -> None:
         before = self.latches
@@ -284,7 +295,7 @@ class Lifecycle:
             # The network may have delivered one call twice.
             raise RefusedError(
                 f"a latch was cleared less than {LOOK_FIRST_S:g} s ago; the robot is still "
-                f"{_stopped(stop)}: look at the robot, then call srv/clear again"
+                f"{_still(stop)}: look at the robot, then call srv/clear again"
             )
         self._require_seen(stop, self._stopped_ns, asked_ns, "srv/clear")
 
@@ -303,11 +314,22 @@ class Lifecycle:
         if set_ns < began_ns:
             # An earlier run set the latch. Its age is unknown, because the monotonic clock may have
             # restarted and the wall clock may have been set since.
-            came = f"the daemon started {age_s:.1f} s ago and the robot is still {_stopped(latch)}"
+            came = f"the daemon started {age_s:.1f} s ago and the robot is still {_still(latch)}"
         raise RefusedError(
             f"{came}: look at the robot, then call {call} again when {LOOK_FIRST_S:g} s have "
             "passed since then, or name the number of the latch that you have seen"
         )
+
+
+def with_causes(latch: Latch, before: Latch | None) -> Latch:
+    """Return the new `latch` of a stop, with the causes of the stop `before` that it replaces.
+
+    A cause that has come again is named once, as the new latch. See `MAX_CLIENTS` for its bound.
+    """
+    causes = () if before is None else before.causes
+    earlier = [replace(cause, earlier=()) for cause in causes if cause.why != latch.why]
+    surplus = [cause for cause in earlier if cause.by][:-MAX_CLIENTS]
+    return replace(latch, earlier=tuple([cause for cause in earlier if cause not in surplus]))
 
 
 def number_after_restart(kept: int, now: Instant) -> int:
@@ -329,8 +351,13 @@ def _not_in_force(number: int, still: str, call: str) -> str:
     )
 
 
+def _still(latch: Latch) -> str:
+    """Return all causes of a latch as the end of the sentence "the robot is still ..."."""
+    return " and ".join([_stopped(cause) for cause in latch.causes])
+
+
 def _stopped(latch: Latch) -> str:
-    """Return the reason of a latch as the end of the sentence "the robot is still ..."."""
+    """Return the newest cause of a latch as the end of the sentence "the robot was ..."."""
     return latch.why if _asked_for(latch) else f"stopped ({latch.why})"
 
 

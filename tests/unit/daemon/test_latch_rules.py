@@ -231,11 +231,40 @@ def test_latches_are_held_once_the_keeper_holds_these() -> None:
     assert handover.held
 
 
-def test_a_stop_that_no_step_served_is_latched_with_the_name_of_its_client() -> None:
+def test_each_stop_that_no_step_served_is_latched_with_the_name_of_its_client() -> None:
     keeper = Keeper()
-    Handover(Latches(), keeper).take_stops(Latches(), ["joe", "page"], NOW)
+    Handover(Latches(), keeper).take_stops(Latches(), ["joe", "page", "joe"], NOW)
     (latches,) = keeper.given
-    assert latches.stop == Latch(NOW.wall_ns // 1_000_000, NOW.wall_ns, "joe", "stopped by joe")
+    assert latches.stop is not None
+    assert [cause.by for cause in latches.stop.causes] == ["joe", "page"]
+    assert [cause.why for cause in latches.stop.causes] == ["stopped by joe", "stopped by page"]
+
+
+def test_a_stop_that_no_step_served_keeps_the_causes_of_the_stop_before_it() -> None:
+    keeper = Keeper()
+    life = Lifecycle(active=True)
+    life.stop("ann", 1, NOW)
+    life.press("a bumper is pressed", NOW)
+    Handover(life.latches, keeper).take_stops(life.latches, ["joe"], NOW)
+    (latches,) = keeper.given
+    assert latches.stop is not None
+    assert [cause.why for cause in latches.stop.causes] == [
+        "stopped by joe", "a bumper is pressed", "stopped by ann",
+    ]  # fmt: skip
+
+
+def test_every_cause_of_a_stop_is_in_the_file_and_cut_off_like_the_others() -> None:
+    life = Lifecycle(active=True)
+    life.stop("a" * 600, 1, NOW)
+    life.press("a bumper is pressed", NOW)
+    latches = decode("r", encode("r", life.latches))
+    assert latches.stop is not None
+    first, second = latches.stop.causes
+    assert (first.why, first.kept) == ("a bumper is pressed", True)
+    assert (second.by, second.kept) == ("a" * 500, True)
+    damaged = encode("r", life.latches).replace(b'"earlier"', b'"earliex"')
+    with pytest.raises(LatchFileError, match="a field name is missing or unknown"):
+        decode("r", damaged)
 
 
 @pytest.mark.parametrize("ahead", [-5, 0, 5])

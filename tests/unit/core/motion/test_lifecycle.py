@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import deque
 from collections.abc import Callable
 from copy import copy
@@ -201,6 +202,110 @@ def test_a_stop_after_a_clear_counts_even_if_it_arrived_before_the_last_stop() -
     assert mode(life) is Mode.STOPPED
 
 
+# several causes of one stop
+
+
+def test_a_press_keeps_the_name_of_the_client_that_stopped_the_robot() -> None:
+    life = ready()
+    stop(life, 1.0)
+    seen = number(life)
+    press(life, 2.0)
+    life.hold("", "", ns(3.0))
+    both = f"{PRESSED} (latched at {AT}:02 UTC); also stopped by ann at {AT}:01 UTC"
+    assert life.why == f"{both}; call srv/clear"
+    with pytest.raises(RefusedError) as caught:
+        clear(life, 9.0, seen)
+    assert f"still stopped ({PRESSED}) and stopped by ann: look at" in str(caught.value)
+    assert clear(life, 9.0, number(life)).startswith("cleared; ")
+    assert mode(life) is Mode.READY
+    press(life, 10.0)
+    assert "ann" not in life.why
+
+
+def test_each_client_that_stopped_the_robot_is_named_and_the_last_one_first() -> None:
+    life = ready()
+    for seconds, name in ((1.0, "ann"), (2.0, "joe"), (3.0, "ann")):
+        stop(life, seconds, name)
+    assert life.why == (
+        f"stopped by ann at {AT}:03 UTC; also stopped by joe at {AT}:02 UTC; call srv/clear"
+    )
+
+
+def test_a_cause_that_comes_many_times_is_named_once_under_the_newest_number() -> None:
+    life = ready()
+    numbers = []
+    for seconds in range(1, 50):
+        stop(life, seconds)
+        press(life, seconds + 0.5)
+        numbers.append(number(life))
+    assert numbers == sorted(set(numbers))
+    life.hold("", "", ns(60.0))
+    assert life.why == (
+        f"{PRESSED} (latched at {AT}:49 UTC); also stopped by ann at {AT}:49 UTC; call srv/clear"
+    )
+
+
+def test_a_flood_of_clients_leaves_the_first_ones_the_last_one_and_each_press() -> None:
+    life = ready()
+    press(life, 0.5)
+    life.hold("", "", ns(0.6))
+    for client in range(1000):
+        stop(life, 1.0 + client / 100, f"client {client}")
+    press(life, 20.0, SILENT)
+    life.hold("", "", ns(21.0))
+    stop(life, 30.0, "joe")
+    assert re.findall(r"(client \d+|joe|silent|pressed) ", life.why.replace(SILENT, "silent")) == [
+        "joe", "silent", "client 3", "client 2", "client 1", "client 0", "pressed",
+    ]  # fmt: skip
+
+
+def test_a_stop_in_the_step_of_a_press_is_named_although_it_arrived_before() -> None:
+    life = ready()
+    press(life, 1.0)
+    pressed = number(life)
+    life.stop("ann", ns(0.999), at(1.0))
+    assert life.why.startswith(f"stopped by ann at {AT}:01 UTC; also {PRESSED} (latched at ")
+    latched = life.latches
+    assert number(life) > pressed
+    press(life, 1.1, SILENT)
+    pressed = number(life)
+    life.stop("ann", ns(0.999), at(1.2))  # the same request again, with its reply
+    assert number(life) == pressed
+    assert life.latches is not latched
+
+
+def test_two_stops_are_named_in_whichever_order_a_step_takes_them() -> None:
+    life = ready()
+    life.stop("ann", ns(1.1), at(1.2))
+    life.stop("joe", ns(1.0), at(1.2))
+    latched = life.latches
+    assert "stopped by ann" in life.why
+    assert "stopped by joe" in life.why
+    life.stop("ann", ns(1.1), at(1.3))
+    life.stop("joe", ns(1.0), at(1.3))
+    assert life.latches is latched
+
+
+def test_every_cause_survives_restarts() -> None:
+    life = ready()
+    stop(life, 1.0)
+    press(life, 2.0)
+    for _ in range(3):
+        life = Lifecycle(active=True, latches=life.latches.after_restart())
+        assert life.why == (
+            f"{PRESSED} (latched at {AT}:02 UTC, before the restart); also was stopped by ann at "
+            f"{AT}:01 UTC, before the restart; call srv/clear"
+        )
+    press(life, 5.0, SILENT)
+    life = Lifecycle(active=True, latches=life.latches.after_restart())
+    press(life, 6.0)
+    life.hold("", "", ns(7.0))
+    assert life.why == (
+        f"{PRESSED} (latched at {AT}:06 UTC); also {SILENT} (latched at {AT}:05 UTC, before the "
+        f"restart); also was stopped by ann at {AT}:01 UTC, before the restart; call srv/clear"
+    )
+
+
 # clear
 
 
@@ -211,14 +316,16 @@ class Held(NamedTuple):
     mode: Mode
     hold: Callable[[Lifecycle, float, str], object]
     verb: str
+    before: str
+    """Words for an earlier cause of the same latch."""
 
 
 HELD = each(
     "held",
     [
-        Held("stopped", Mode.STOPPED, stop, "clear"),
+        Held("stopped", Mode.STOPPED, stop, "clear", " and stopped by ann"),
         Held("switched off", Mode.INACTIVE, lambda life, s, by: life.deactivate(by, at(s)),
-             "activate"),
+             "activate", ""),
     ],
 )  # fmt: skip
 
@@ -275,8 +382,8 @@ def test_a_release_that_names_another_latch_is_refused(held: Held, none: bool) -
         {"clear": clear, "activate": activate}[held.verb](life, 20.0, seen)
     assert str(caught.value) == (
         f"this call names latch {seen}, but srv/{held.verb} would release another one; the robot "
-        f"is still {held.said} by joe: look at the robot, then call srv/{held.verb} again with the "
-        "present `latch` in `state`"
+        f"is still {held.said} by joe{held.before}: look at the robot, then call srv/{held.verb} "
+        "again with the present `latch` in `state`"
     )
     assert mode(life) is held.mode
 
@@ -431,15 +538,18 @@ def test_a_stop_and_a_fault_beside_a_pressed_emergency_stop_are_named_with_it() 
     life = ready()
     press(life, 1.0)
     stop(life, 2.0, "joe")
-    stopped = f"stopped by joe at {AT}:02 UTC"
-    assert life.why == (f"{PRESSED}; also {stopped}; release it at the robot, then call srv/clear")
+    stopped = f"stopped by joe at {AT}:02 UTC; also {PRESSED} (latched at {AT}:01 UTC)"
+    assert life.why == f"{stopped}; release it at the robot, then call srv/clear"
     life.fault("a wheel is dead", at(3.0))
     assert life.why == (
-        f"a wheel is dead, latched at {AT}:03 UTC; also {PRESSED}; also {stopped}; release it "
-        "at the robot, then call srv/clear twice"
+        f"a wheel is dead, latched at {AT}:03 UTC; also {stopped}; release it at the robot, then "
+        "call srv/clear twice"
     )
     life.hold("", "", ns(8.0))
-    assert clear(life, 9.0).startswith("fault cleared, but the robot is still stopped by joe: ")
+    assert clear(life, 9.0) == (
+        "fault cleared, but the robot is still stopped by joe and "
+        f"stopped ({PRESSED}): call srv/clear again"
+    )
     assert life.why == f"{stopped}; call srv/clear"
 
 
