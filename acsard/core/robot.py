@@ -321,9 +321,7 @@ class Robot:
             self._limiter.cut()
             self._speeds, self._made_of = STILL, None
             self._made = self._said = (self._limiter.state, self._made_ns)
-        # While the emergency stop is pressed, ignore the fault: the emergency stop cuts the power
-        # of the motor driver, and a driver without power reports a fault.
-        if not estop.why and any(status.driver_fault for _, status in statuses):
+        if estop.driver_fault:
             self._fault(DRIVER_FAULT, now, events)
             self._life.caused_again(now.mono_ns)
         battery = self._battery

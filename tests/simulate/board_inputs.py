@@ -422,15 +422,19 @@ class Inputs:
             self._press(known, true_ns, self._away and known is self.bumpers)
 
     def _driver(self, faulty: bool, certain: bool, true_ns: int) -> None:
-        """Take the report about the motor drivers, which counts until the next one."""
-        driver = self.driver
+        """Take the report about the motor drivers, which counts until the next one.
+
+        A fault that the board reports while its emergency stop is pressed latches nothing.
+        """
+        driver, estop = self.driver, self.estop
         driver.marks, driver.sure = b"X" if faulty else b".", certain
         if not faulty or not certain:
             driver.pressed_ns = None
         elif driver.pressed_ns is None:
             driver.pressed_ns = true_ns
-        self._witness.driver_fault |= faulty
-        self._driver_faulted |= faulty and certain
+        self._witness.driver_fault |= faulty and not (estop.sure and estop.marks == b"X")
+        free = not estop.marks or (estop.known and estop.marks == b".")
+        self._driver_faulted |= faulty and certain and free
 
     def _silence(self, known: _Input, decided_ns: int, offset: int, calm_ns: int) -> None:
         """Take a silence: it counts as a press, at the latest when the host has had time."""
@@ -527,7 +531,8 @@ class Inputs:
         free = not estop.marks and not self._fresh
         free |= estop.known and estop.marks == b"." and not self._fresh
         pressed = estop.pressed_ns is not None and estop.pressed_ns < self._stepped_ns
-        began = seen.mode == "fault" != self._mode and DRIVER in seen.reason
+        pressed |= not self._witness.driver_fault
+        began = seen.mode == "fault" != self._mode and DRIVER in seen.reason.partition(";")[0]
         if self._driver_faulted and free:
             if seen.mode not in ("fault", "shutdown"):
                 text = f"{seen.mode}: {seen.reason}"
@@ -536,7 +541,7 @@ class Inputs:
                 self._witness.counts["driver fault"] += 1
                 self._ramps(true_ns, "a fault of a motor driver")
         if began and pressed and self._mode:
-            text = f"the emergency stop is pressed since {estop.pressed_ns} ns"
+            text = f"{seen.reason}, the emergency stop is pressed since {estop.pressed_ns} ns"
             raise BrokenError("drivers without power are no fault", true_ns, text)
 
     def _stopping(self) -> Iterator[tuple[str, int]]:

@@ -729,7 +729,7 @@ FAULTS = (
         "driver ignored",
         "a fault of a motor driver that the board reports does not stop the robot",
         ROBOT,
-        "        if not estop.why and any(status.driver_fault for _, status in statuses):\n",
+        "        if estop.driver_fault:\n",
         "        if not estop.why and estop.pressed_now:\n",
     ),
     fault(
@@ -743,7 +743,7 @@ FAULTS = (
         "driver without power",
         "a pressed emergency stop latches a fault of the motor drivers",
         ROBOT,
-        "        if not estop.why and any(status.driver_fault for _, status in statuses):\n",
+        "        if estop.driver_fault:\n",
         "        if any(status.driver_fault for _, status in statuses):\n",
     ),
     fault(

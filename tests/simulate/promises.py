@@ -432,7 +432,7 @@ class Witness:
                 recent.remove("pushed")  # a hand turns wheels that were at rest: never a fault
             # Echoes pass the lines that a stalled adapter holds, and contradict them.
             caused = not set(recent) <= HARMLESS or {"echo", "stalls"} <= set(recent)
-            if DRIVER in reason:
+            if DRIVER in reason.partition(";")[0]:
                 caused = self.driver_fault
             if self.mode and self.fault_ns is None and not caused:
                 raise BrokenError("no fault without a cause", at_ns, f"{reason} (board: {recent})")

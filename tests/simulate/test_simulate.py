@@ -401,6 +401,11 @@ GOOD, FAULTY = b"!status driver=ok\r\n", b"!status driver=fault\r\n"
         (OK, FAULTY + PRESSED, "stopped", ""),
         (PRESSED, FAULTY, "stopped", ""),
         (PRESSED, FAULTY, "fault", "drivers without power are no fault"),
+        (PRESSED, FAULTY + OK, "stopped", ""),
+        (PRESSED, FAULTY + OK, "fault", "drivers without power are no fault"),
+        (PRESSED, OK + FAULTY, "fault", ""),
+        (PRESSED, OK + FAULTY, "stopped", "a fault of a motor driver stops the robot"),
+        (OK, PRESSED + FAULTY + OK, "fault", "drivers without power are no fault"),
     ],
 )
 def test_a_fault_of_a_motor_driver_stops_the_robot_unless_its_emergency_stop_is_pressed(

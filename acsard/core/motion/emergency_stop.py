@@ -13,7 +13,7 @@ button is released.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Sequence
 from itertools import zip_longest
 from typing import Literal
 
@@ -102,7 +102,7 @@ class BoardInput(ABC):
         """Whether the robot needs the inputs, and the board has never reported them."""
         return self.use == "required" and not self.state
 
-    def look(self, reports: Iterable[tuple[int, BoardStatus]], now_ns: int) -> list[Event]:
+    def look(self, reports: Sequence[tuple[int, BoardStatus]], now_ns: int) -> list[Event]:
         """Process the status lines since the last step, and return the events of the changes.
 
         Each item of `reports` is the monotonic time of arrival, ns, and the status line.
@@ -160,6 +160,29 @@ class EmergencyStop(BoardInput):
     """The state of the emergency stop."""
 
     silent, events = SILENT, ("emergency_stop", "emergency_stop_released")
+
+    def __init__(self, use: EstopUse) -> None:
+        super().__init__(use)
+        self.driver_fault = False
+        """Whether a line of the last `look` reports a fault of a motor driver that counts.
+
+        A fault does not count while the emergency stop is pressed: the emergency stop cuts the
+        power of the driver, and a driver without power reports a fault.
+        """
+
+    def look(self, reports: Sequence[tuple[int, BoardStatus]], now_ns: int) -> list[Event]:
+        """Process the status lines since the last step, and return the events of the changes.
+
+        Each item of `reports` is the monotonic time of arrival, ns, and the status line.
+        """
+        self.driver_fault, pressed = False, bool(self.why)
+        for _, status in reports:
+            if self.use != "off" and status.estop is not None:
+                pressed = status.estop
+            self.driver_fault |= bool(status.driver_fault) and not pressed
+        events = super().look(reports, now_ns)
+        self.driver_fault &= not self.why
+        return events
 
     def read(self, status: BoardStatus) -> tuple[bool, ...] | None:
         """Return `(status.estop,)`, or None if the status line does not report `estop`."""

@@ -604,6 +604,46 @@ def test_a_driver_without_power_behind_the_emergency_stop_is_no_fault() -> None:
     assert bench.answer("clear").success
 
 
+@each(
+    ("pressed_before", "lines", "mode"),
+    [
+        (False, (PRESSED_LINE, DRIVER_FAULT, OK_LINE, DRIVER_OK), "stopped"),
+        (False, (b"!status estop=pressed driver=fault\r\n", b"!status estop=ok driver=ok\r\n"),
+         "stopped"),
+        (True, (DRIVER_FAULT, OK_LINE, DRIVER_OK), "stopped"),
+        (True, (b"!status driver=fault estop=pressed\r\n", OK_LINE, DRIVER_OK), "stopped"),
+        (False, (DRIVER_FAULT, PRESSED_LINE), "stopped"),
+        (False, (PRESSED_LINE, OK_LINE, DRIVER_FAULT, DRIVER_OK), "fault"),
+        (True, (OK_LINE, DRIVER_FAULT, DRIVER_OK), "fault"),
+        (True, (b"!status estop=ok driver=fault\r\n", DRIVER_OK), "fault"),
+        (False, (DRIVER_FAULT, PRESSED_LINE, OK_LINE, DRIVER_OK), "fault"),
+    ],
+)  # fmt: skip
+def test_a_driver_fault_counts_if_the_button_was_released_at_its_line(
+    pressed_before: bool, lines: tuple[bytes, ...], mode: str
+) -> None:
+    bench = Button(OK_LINE + DRIVER_OK)
+    bench.linked()
+    if pressed_before:
+        bench.status(PRESSED_LINE + DRIVER_OK).step()
+    assert bench.status(b"".join(lines)).step().mode == mode
+
+
+def test_with_an_ignored_button_a_driver_fault_always_counts() -> None:
+    bench = Button(PRESSED_LINE + DRIVER_FAULT, Config(safety=SafetyConfig(estop="off")))
+    bench.linked()
+    assert bench.mode() == "fault"
+
+
+def test_a_driver_fault_of_a_silent_button_is_none() -> None:
+    bench = Button(OK_LINE + DRIVER_OK)
+    bench.linked()
+    bench.status(b"")
+    for _ in range(60):
+        bench.step()
+    assert bench.status(DRIVER_FAULT + OK_LINE + DRIVER_OK).step().mode == "stopped"
+
+
 # the battery
 
 
