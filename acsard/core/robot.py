@@ -272,7 +272,11 @@ class Robot:
             # sent during the start.
             self._arbiter.require_neutral(inputs.now.mono_ns if self._linked_once else 0)
         events += session.events
-        if session.statuses or self._estop.state or self._bumpers.state or self._battery.status:
+        if session.reopened:
+            for part in (self._estop, self._bumpers, self._battery):
+                part.reopen()
+        known = self._estop.state or self._bumpers.state or self._battery.status
+        if session.statuses or known or session.forgot:
             self._watch_inputs(inputs.now, events)
         if link != "up":
             # Without a link the daemon cannot ramp, so set the speeds to zero at once. When the
@@ -328,6 +332,9 @@ class Robot:
         events += battery.look(statuses, now.mono_ns)
         if battery.stopped_now:
             self._life.press(battery.why, now)
+        if self.session.forgot:
+            for part in (estop, bumpers, battery):
+                part.forget()
         held = "", ""
         if estop.why:
             held = estop.why, estop.mend

@@ -7,8 +7,16 @@ import random
 
 import pytest
 
-from acsard.core.config.settings import Config, ControlConfig, McuConfig, SafetyConfig, SimConfig
+from acsard.core.config.settings import (
+    Config,
+    ControlConfig,
+    EstopUse,
+    McuConfig,
+    SafetyConfig,
+    SimConfig,
+)
 from acsard.core.incoming.queries import Query
+from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.values import NS_PER_S, Latches, Outputs, Received
 from tests.scenarios.taped import Tape, replayed
 from tests.scenarios.world import SIGNED, World
@@ -256,6 +264,48 @@ def test_a_press_survives_a_restart_of_the_daemon_and_of_the_board() -> None:
         assert again.call("clear").success
         again.drive(0.5, seconds=0.5)
         assert again.state.mode == "driving"
+
+
+@pytest.mark.parametrize("boot_s", [0.0, 2.0])
+def test_a_cable_that_is_pulled_and_put_back_does_not_release_a_pressed_button(
+    boot_s: float,
+) -> None:
+    world = World()
+    with world.mcu.estop():
+        world.run(0.3)
+        with world.mcu.estop_pressed(0.0, 0.0):
+            world.run(0.1)
+            world.port.unplug()
+            world.run(1.0)
+            world.mcu.reset(world.now_ns, int(boot_s * NS_PER_S))
+            world.port.plug(world.mcu)
+            for _ in range(50):
+                assert not world.call("clear").success
+                world.hold(0.5, seconds=0.1)
+                assert (world.state.mode, world.state.emergency_stop) == ("stopped", "pressed")
+        world.run(0.2)
+        assert world.call("clear").success
+        world.drive(0.5, seconds=0.5)
+        assert world.state.mode == "driving"
+
+
+@pytest.mark.parametrize("estop", ["auto", "required"])
+def test_a_new_board_without_a_button_does_not_keep_the_robot_stopped_for_ever(
+    estop: EstopUse,
+) -> None:
+    world = World(Config(safety=SafetyConfig(estop=estop)))
+    with world.mcu.estop_pressed(0.0, 0.0), world.mcu.driver_fault(0.0, 0.0):
+        world.run(1.0)
+    world.port.unplug()
+    world.run(1.0)
+    world.mcu = FakeMcu(world.config, world.now_ns)
+    world.port.plug(world.mcu)
+    world.run(1.0)
+    assert (world.state.link, world.state.mode) == ("up", "stopped")
+    world.run(3.0)
+    assert world.call("clear").success
+    world.drive(0.5, seconds=0.5)
+    assert world.state.mode == ("driving" if estop == "auto" else "waiting")
 
 
 def test_a_clear_that_came_before_the_release_is_refused_also_if_one_step_takes_both() -> None:

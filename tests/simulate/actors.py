@@ -465,6 +465,7 @@ class Run:
         self.liveness.event(TROUBLE_NS if new else 0)
         if not self.product.plugged:
             self.product.plug(new)
+            self.inputs.plugged()
             self.witness.first, self._rest = True, b""
             self._boards += new
             if self.witness.blocked_ns is not None:

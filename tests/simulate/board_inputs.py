@@ -242,6 +242,8 @@ class _Input:
         """`X` for each pressed one in the last line, empty before the first line."""
         self.reported_ns: int | None = None
         """Arrival of the last line that may count, by the robot's clock."""
+        self.awaited = True
+        """No line that may count has come since the board was plugged in."""
         self.counted_ns = 0
         """Arrival of the last line that certainly counts."""
         self.pressed_ns: int | None = None
@@ -347,6 +349,10 @@ class Inputs:
         self._came.clear()
         self._held = b""
 
+    def plugged(self) -> None:
+        """Note that a board was plugged in: it must report the inputs that the robot needs."""
+        self.estop.awaited = self.bumpers.awaited = True
+
     @property
     def limiting(self) -> bool:
         """Whether a bumper may be pressed that allows only some motion."""
@@ -401,7 +407,7 @@ class Inputs:
 
     def _report(self, known: _Input, marks: bytes, certain: bool, at_ns: int, true_ns: int) -> None:
         """Take the marks of a line. One that is pressed now is a stop, or asks for zeros."""
-        known.reported_ns = at_ns
+        known.reported_ns, known.awaited = at_ns, False
         before, was_sure, was_silent = known.marks, known.sure, known.silent
         known.marks, known.sure, known.silent = marks, certain, ""
         if not certain:
@@ -505,7 +511,7 @@ class Inputs:
         self._answers(true_ns, seen, calm)
         for name in self._needed:
             known = self.estop if name == "estop" else self.bumpers
-            if known.reported_ns is None and (moving or seen.mode in ("ready", "driving")):
+            if known.awaited and (moving or seen.mode in ("ready", "driving")):
                 text = f"{seen.mode}, and the board has not reported {name}"
                 raise BrokenError("a robot waits for its inputs", true_ns, text)
         self._empty(true_ns, seen)

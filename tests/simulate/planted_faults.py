@@ -517,8 +517,8 @@ FAULTS = (
         "session reopened",
         "a port that was opened again asks no sender for a zero",
         SESSION,
-        "self.restarted = opened != self._opened",
-        "self.restarted = False",
+        "        self.restarted = self.reopened = opened != self._opened\n",
+        "        self.reopened = opened != self._opened\n",
     ),
     fault(
         "session unplugged",

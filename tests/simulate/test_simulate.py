@@ -286,6 +286,16 @@ def test_an_input_that_perhaps_never_was_reported_is_not_silent() -> None:
     bench.inputs.cleared(3 * NS)
 
 
+def test_a_robot_waits_for_its_inputs_behind_each_plugging() -> None:
+    bench = Bench(estop="required")
+    bench.step(1.0, OK, "ready")
+    bench.inputs.plugged()
+    bench.step(1.1, b"", "waiting")
+    with pytest.raises(BrokenError, match="a robot waits for its inputs"):
+        bench.step(1.2, b"", "ready")
+    bench.step(1.3, OK, "ready")
+
+
 @pytest.mark.parametrize("silent", [True, False])
 def test_a_late_answer_to_a_clear_does_not_end_the_doubt_about_a_silence(silent: bool) -> None:
     bench = Bench()

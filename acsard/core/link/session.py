@@ -3,6 +3,11 @@
 The session turns received bytes into feedback, and speeds into lines for the board.
 `negotiation.py` decides whether lines are plain or checked, and `link_state.py` decides whether the
 link may carry motion. The link does not come up while the session asks the board for checked lines.
+
+The status lines belong to the opening of the port in which they came, because another board may
+answer after the next opening. If a board does not report a field that the board before it has
+reported, the session forgets the field after `FORGET_NS`. A restart of the board without an opening
+forgets nothing: the same board has the same inputs, and its silence about one of them is a fault.
 """
 
 from __future__ import annotations
@@ -39,6 +44,12 @@ BLOCKED_NS = int(WATCHDOG_S * NS_PER_S)
 """Time without a written line after which the output is reported as blocked, ns. By then the MCU
 has stopped the motors by itself."""
 
+FORGET_NS = 3 * NS_PER_S
+"""The fields of the status lines from before the last opening of the port are forgotten when the
+link has been up, and this computer on time, for this time, ns. A board reports each field at least
+once a second. Until then a field keeps its value, so a pressed emergency stop holds the latch of
+its stop while the cable is pulled and put back."""
+
 IDENTITY = b"!acsard-mcu "
 """First bytes of the line with which an MCU with acsard's firmware identifies itself after
 booting."""
@@ -65,8 +76,17 @@ class McuSession:
         self.statuses: list[tuple[int, BoardStatus]] = []
         """The status lines of the last `update`, each with its monotonic time of arrival, ns."""
         self.status = BoardStatus()
-        """The last received value of each field of the status lines."""
+        """The last received value of each field of the status lines, until it is forgotten."""
         self.status_ns: int | None = None
+        """Monotonic time of arrival of the last status line that is not forgotten, ns."""
+        self._reported: tuple[BoardStatus, int | None] = (BoardStatus(), None)
+        """`status` and `status_ns` as the lines since the last opening of the port make them."""
+        self._awaiting, self._unsettled_ns = True, 0
+        """Whether fields may have to be forgotten, and the monotonic time of the last update in
+        which the link was not up or this computer was late, ns."""
+        self.reopened = self.forgot = False
+        """Whether the last `update` found the port opened again, and whether it forgot the fields
+        that the board has not reported since the opening."""
         self.quiet_ns = int(NS_PER_S * max(0.1, 4 / rate_hz, 3 * mcu.reply_period))
         """Duration of silence after which the link is stale, ns."""
         self.negotiation = Negotiation(mcu, self.codec.stop)
@@ -123,6 +143,7 @@ class McuSession:
         to writing it, ns.
         """
         self.restarted, self._starting_over, self.events = False, False, []
+        self.reopened = self.forgot = False
         if self.statuses:
             self.statuses = []
         self._settle(not unsent, port_open, late_ns)
@@ -213,7 +234,9 @@ class McuSession:
 
     def _begin(self, port_open: bool, opened: int, now_ns: int) -> None:
         self._link.sign("opened" if port_open else "closed")
-        self.restarted = opened != self._opened
+        self.restarted = self.reopened = opened != self._opened
+        if self.reopened:
+            self._reported, self._awaiting = (BoardStatus(), None), True
         self._opened = opened
         self._left_ns, self._held_up, self.blocked = now_ns, False, False
         if port_open:
@@ -247,6 +270,11 @@ class McuSession:
         # see a lost link first.
         link.judge(now_ns, may_rise=not self._starting_over)
         up = link.state == "up"
+        if not up or self.lateness.step_s:
+            self._unsettled_ns = now_ns
+        elif self._awaiting and now_ns - self._unsettled_ns >= FORGET_NS:
+            self._awaiting, self.forgot = False, True
+            self.status, self.status_ns = self._reported
         quiet = not up and link.silent(now_ns) and now_ns - check.settled_ns > self.quiet_ns
         if quiet and (check.state == "plain" or check.checked):
             check.begin()
@@ -330,6 +358,7 @@ class McuSession:
                 self._reject(error.reason, line)
                 continue
             self.status, self.status_ns = merged(self.status, status), at_ns
+            self._reported = merged(self._reported[0], status), at_ns
             self.statuses.append((at_ns, status))
             if self._link.state != "up":
                 self._hearing.now.statuses += 1

@@ -5,8 +5,8 @@
 - ERROR: a condition keeps the robot from driving.
 
 Each message has the same rows, because rqt_robot_monitor shows a missing row as stale. The rows of
-the board and of its battery appear when the board first reports a value for them, and then they
-stay.
+the board and of its battery appear when the board first reports a value for them. They stay until
+another board is connected that reports none.
 """
 
 from __future__ import annotations

@@ -85,6 +85,8 @@ class Battery:
         """Whether the level fell to "stop" in the last `look`."""
         self._values: dict[str, tuple[float, int]] = {}
         """The last values by name, each with its monotonic time of arrival, ns."""
+        self._awaited = True
+        """Whether the board has not reported `battery.measure` since the port was opened."""
         self._known: BatteryLevel = "ok"
         """The last level that was not "unknown": silence of the board does not end a stop."""
         self._told: BatteryLevel | None = None
@@ -111,6 +113,18 @@ class Battery:
         """What the operator must do to end the level "stop", in words without measured values."""
         config = self._config
         return f"charge the battery to {_with_unit(config, config.stop_below + config.hysteresis)}"
+
+    def reopen(self) -> None:
+        """Record that the port was opened: another board may answer now."""
+        self._awaited = True
+
+    def forget(self) -> None:
+        """Forget the level, unless the board has reported the measure since the port was opened."""
+        if self._awaited:
+            self._known, self._told, self._mean = "ok", None, None
+            self._values.pop(self._config.measure, None)
+            if not ("volts" in self._values or "percent" in self._values):
+                self.status = None
 
     def look(self, reports: Iterable[tuple[int, BoardStatus]], now_ns: int) -> list[Event]:
         """Process the status lines since the last step, and return an event if the level changed.
@@ -146,7 +160,9 @@ class Battery:
         self._values[name] = value, at_ns
         if name != self._config.measure:
             self._since_ns = at_ns if first else self._since_ns
-        elif self._mean is None:
+            return
+        self._awaited = False
+        if self._mean is None:
             self._mean, self._since_ns, self._mean_ns = value, at_ns, at_ns
             self._stood_ns = 0
         elif at_ns > self._mean_ns:

@@ -5,6 +5,9 @@ that has reported an input once must continue to report it. If it does not repor
 the input counts as pressed: a cable may be cut, or the emergency stop may have cut the board's own
 supply. `lifecycle.py` keeps the latch of the stop, which only the call `clear` releases.
 
+When the port is opened again, another board may answer, which need not have the input. The state of
+the input then lasts until the board reports it, or until `session.py` finds that it does not.
+
 This software is not the safety function. The hardware emergency stop cuts the power of the motors
 by itself. The daemon only learns of that, commands zeros, and keeps the robot stopped after the
 button is released.
@@ -80,6 +83,8 @@ class BoardInput(ABC):
         """The state of the inputs; "" if the board has never reported them."""
         self.pressed: tuple[bool, ...] | None = None
         """Whether each input counts as pressed, None if the board has never reported them."""
+        self._awaited = True
+        """Whether the board has not reported the inputs since the port was opened."""
         self.pressed_now = ""
         """Why an input began to count as pressed in the last `look`, in words; "" if none did."""
         self._reported_ns = self._looked_ns = 0
@@ -99,8 +104,17 @@ class BoardInput(ABC):
 
     @property
     def missing(self) -> bool:
-        """Whether the robot needs the inputs, and the board has never reported them."""
-        return self.use == "required" and not self.state
+        """Whether the robot needs the inputs, and `_awaited` is true."""
+        return self.use == "required" and self._awaited
+
+    def reopen(self) -> None:
+        """Record that the port was opened: another board may answer now."""
+        self._awaited = True
+
+    def forget(self) -> None:
+        """Forget the inputs, unless the board has reported them since the port was opened."""
+        if self._awaited:
+            self.state, self.pressed = "", None
 
     def look(self, reports: Sequence[tuple[int, BoardStatus]], now_ns: int) -> list[Event]:
         """Process the status lines since the last step, and return the events of the changes.
@@ -114,7 +128,7 @@ class BoardInput(ABC):
         for at_ns, status in reports:
             pressed = self.read(status)
             if pressed is not None:
-                self._reported_ns, self._excused = at_ns, False
+                self._reported_ns, self._excused, self._awaited = at_ns, False, False
                 events += self._take("pressed" if any(pressed) else "ok", pressed)
         late, self._looked_ns = now_ns - self._looked_ns > LATE_NS, now_ns
         if self.pressed is not None and now_ns - self._reported_ns > _SILENT_NS:

@@ -644,6 +644,106 @@ def test_a_driver_fault_of_a_silent_button_is_none() -> None:
     assert bench.status(DRIVER_FAULT + OK_LINE + DRIVER_OK).step().mode == "stopped"
 
 
+# another board
+
+
+def replugged(bench: Button, status: bytes, closed_steps: int = 100) -> Button:
+    """Plug in a board that sends this status line, and wait until the link is up."""
+    bench.unplug()
+    for _ in range(closed_steps):
+        bench.step()
+    bench.status(status).replug().linked()
+    return bench
+
+
+@each("line", [DRIVER_FAULT, PRESSED_LINE, b"!status bumpers=X.\r\n", b"!status estop=ok\r\n"])
+def test_a_board_that_reports_no_input_does_not_inherit_those_of_the_board_before(
+    line: bytes,
+) -> None:
+    bench = Button(line)
+    bench.linked()
+    replugged(bench, b"")
+    mode = "fault" if line == DRIVER_FAULT else "stopped"
+    for _ in range(290):
+        bench.step(GO)
+        assert bench.mode() == mode
+    assert not bench.answer("clear").success
+    for _ in range(20):
+        assert bench.step(GO).mode == mode
+    snapshot = bench.robot.snapshot(bench.now_ns)
+    assert (snapshot.estop, snapshot.bumpers, snapshot.board) == ("", None, {})
+    while bench.out.latches.next:
+        assert bench.answer("clear").success
+    bench.step(REST)
+    assert bench.step(GO).mode == "driving"
+
+
+def test_a_button_that_is_pressed_while_the_board_is_plugged_in_again_is_never_released() -> None:
+    bench = Button(PRESSED_LINE)
+    bench.linked()
+    replugged(bench, b"")
+    for _ in range(100):
+        assert not bench.answer("clear").success
+    bench.status(PRESSED_LINE)
+    for _ in range(500):
+        assert not bench.answer("clear").success
+    bench.status(OK_LINE).step()
+    assert bench.answer("clear").success
+
+
+def test_a_port_that_opens_again_and_again_still_latches_the_silence() -> None:
+    bench = Button()
+    bench.linked()
+    bench.reply = None
+    for _ in range(12):
+        bench.unplug().step()
+        bench.replug()
+        for _ in range(10):
+            bench.step()
+    assert (bench.mode(), bench.robot.snapshot(bench.now_ns).estop) == ("stopped", "silent")
+
+
+def test_each_board_must_report_a_required_input_before_the_robot_is_ready() -> None:
+    bench = Button(OK_LINE, Config(safety=SafetyConfig(estop="required", bumpers=("front",))))
+    bench.status(b"!status estop=ok bumpers=.\r\n").linked()
+    assert bench.mode() == "ready"
+    replugged(bench, b"", closed_steps=3)
+    out = bench.step()
+    assert (out.mode, out.link, out.reason[:14]) == ("waiting", "up", "safety.estop =")
+    out = bench.status(OK_LINE).step()
+    assert (out.mode, out.link, out.reason[:14]) == ("waiting", "up", "safety.bumpers")
+    # A board with another number of bumpers is refused, also behind a board with the right one.
+    for _ in range(400):
+        assert bench.status(b"!status estop=ok bumpers=..\r\n").step().mode != "ready"
+    assert (bench.mode(), bench.answer("clear").success, bench.mode()) == (
+        "stopped", True, "waiting",
+    )  # fmt: skip
+    assert bench.status(b"!status estop=ok bumpers=.\r\n").step().mode == "ready"
+
+
+def test_a_board_that_restarts_must_still_report_its_inputs() -> None:
+    """A board that only restarts has the same firmware, so its silence is a broken wire."""
+    bench = Button(PRESSED_LINE)
+    bench.linked()
+    bench.status(b"!acsard-mcu 1\r\n").step()
+    bench.status(b"")
+    for _ in range(1000):
+        bench.step()
+    assert bench.out.link == "up"
+    assert not bench.answer("clear").success
+
+
+def test_a_late_step_leaves_a_new_board_the_whole_time_for_its_reports() -> None:
+    bench = Button(DRIVER_FAULT)
+    bench.linked()
+    replugged(bench, b"")
+    bench.step(ms=5000)
+    assert not bench.answer("clear").success
+    for _ in range(310):
+        bench.step()
+    assert bench.answer("clear").success
+
+
 # the battery
 
 

@@ -326,3 +326,27 @@ def test_the_words_before_the_level_is_known_say_so() -> None:
     pack = Pack()
     pack.at(24.0, 1.0)
     assert words(CONFIG, pack.status) == "24.00 V; the level is known after 3 s of reports"
+
+
+# another board
+
+
+def test_a_stop_level_is_forgotten_unless_the_new_board_reports_the_measure() -> None:
+    pack = Pack()
+    pack.at(19.0, 20.0)
+    assert pack.battery.held
+    pack.battery.reopen()
+    pack.step(BoardStatus(volts=19.0))
+    pack.battery.forget()
+    assert pack.battery.held
+    pack.battery.reopen()
+    pack.step(BoardStatus(charge=0.9, amps=-1.0))
+    pack.battery.forget()
+    assert not pack.battery.held
+    assert pack.step(BoardStatus(charge=0.9)) == "unknown"
+    pack.quiet(6.0)
+    pack.battery.reopen()
+    pack.battery.forget()
+    assert pack.quiet(1.0) is None
+    assert pack.at(24.0, 5.0) == "ok"
+    assert pack.stops == 1

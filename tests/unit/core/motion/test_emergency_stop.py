@@ -104,6 +104,30 @@ def test_the_first_report_may_be_a_press() -> None:
     assert pin.estop.pressed_now == PRESSED
 
 
+@each("before", [True, False])
+def test_a_new_board_must_report_a_required_input_itself(before: bool) -> None:
+    pin = Input("required")
+    pin.step(before)
+    pin.estop.reopen()
+    assert pin.estop.missing
+    assert pin.step() == ("pressed" if before else "released")
+    pin.step(False)
+    assert not pin.estop.missing
+
+
+def test_the_input_is_forgotten_unless_the_new_board_reports_it() -> None:
+    pin = Input()
+    pin.step(True)
+    pin.estop.reopen()
+    pin.step(True)
+    pin.estop.forget()
+    assert pin.step() == "pressed"
+    pin.estop.reopen()
+    pin.estop.forget()
+    assert pin.quiet(2000) == ""
+    assert (pin.estop.pressed, pin.events) == (None, ["emergency_stop"])
+
+
 def test_half_a_second_without_the_input_counts_as_pressed() -> None:
     pin = Input()
     pin.step(False)
