@@ -23,7 +23,7 @@ from msgspec import Struct
 
 from acsard.core.config.settings import CommandsConfig, Source
 from acsard.core.motion.freshness import LONGEST_PROOF_NS, Freshness
-from acsard.core.motion.neutral import Sender
+from acsard.core.motion.neutral import Sender, is_zero
 from acsard.core.values import NS_PER_S, REST, Command, SourceStatus, Twist, Wait
 
 MAX_SENDERS = 16
@@ -89,6 +89,11 @@ class _Source:
         sender = self.senders[name]
         armed = sender.armed(now_ns)
         return armed and sender.live(now_ns), armed, sender.noticed_ns
+
+    def cancel_zeros(self, at_ns: int) -> None:
+        """Record a message that may be a speed of any sender with a shared identity."""
+        for sender in self.senders.values():
+            sender.cancel_zero(at_ns)
 
     def doubt(self, name: str, was_set: bool) -> None:
         """React to doubt about the sender's clock.
@@ -176,6 +181,8 @@ class Arbiter:
         if source is None:
             return "unknown_source"
         twist, known = command.twist, source.senders.get(command.sender)
+        if command.shared and not is_zero(command):
+            source.cancel_zeros(command.arrived_ns)
         if not (math.isfinite(twist.linear) and math.isfinite(twist.angular)):
             self.notice(command.source, command.sender, command.arrived_ns)
             return "not_finite"
@@ -198,18 +205,18 @@ class Arbiter:
     def notice(self, source: str, sender: str, arrived_ns: int) -> None:
         """Record a lost or unusable message, which may have commanded motion.
 
-        If several programs share the identity of the sender, and `commands.neutral_pause` after
-        the zero is not over yet, this zero no longer counts. If `sender` is "", the message may
-        come from any sender of `source`.
+        If its sender is unknown or has a shared identity, the message cancels the zeros of all
+        shared identities of `source` for which `commands.neutral_pause` is not over yet. `sender`
+        is "" and `arrived_ns` is 0 for messages that were lost.
         """
         known = self._sources.get(source)
         if known is None:
             return
-        if not sender:
-            for each in known.senders.values():
-                each.missed()
-        elif sender in known.senders:
-            known.senders[sender].notice(arrived_ns)
+        one = known.senders.get(sender)
+        if one is not None:
+            one.noticed_ns = arrived_ns
+        if one is None or one.shared:
+            known.cancel_zeros(arrived_ns)
 
     def choose(self, now_ns: int) -> Choice:
         """Return the command that the robot follows now, or the reason why it follows none."""

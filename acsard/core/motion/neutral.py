@@ -5,10 +5,13 @@ does not. The sender stays armed until `require_neutral` or `unlearn` is called.
 
 - If no other program shares the sender's identity, a zero arms the sender at once, even directly
   after speeds.
-- Programs share an identity if they send through one bridge, or on one key without a sender id.
-  Then a zero arms the identity only if no speed follows for `commands.neutral_pause`. Further zeros
+- Programs without a sender id or a GID may share an identity. A zero arms a shared identity only if
+  no speed of any shared identity of the source follows for `commands.neutral_pause`. Further zeros
   and silence do not restart this time. Without the pause, the zero of one program would arm another
   program that never stopped.
+- One program without a sender id may have several shared identities in turn, because its identity
+  depends on the Zenoh session that stamps its commands. Therefore a speed of one identity cancels
+  the zeros of all.
 """
 
 from __future__ import annotations
@@ -27,8 +30,8 @@ class Sender:
         self._zero_ns: int | None = None
         """Arrival of the zero after which `commands.neutral_pause` runs, monotonic ns.
 
-        None if there is no such zero or a speed has followed it. Only a shared identity needs this
-        value.
+        None if there is no such zero or `cancel_zero` has followed it. Only a shared identity needs
+        this value.
         """
         self._proven_zero_ns: int | None = None
         self.name = ""
@@ -75,27 +78,24 @@ class Sender:
         """Undo the effect of zeros with unproven stamps, which the network may have delayed."""
         self._armed, self._zero_ns = self._proven_armed, self._proven_zero_ns
 
-    def notice(self, at_ns: int) -> None:
-        """Record a refused message. Like a lost message, it cancels a zero (see `missed`)."""
-        self._settle(at_ns)
-        self._zero_ns = self._proven_zero_ns = None
-        self.noticed_ns = at_ns
+    def cancel_zero(self, at_ns: int) -> None:
+        """Record that a program with a shared identity may have sent a speed at `at_ns`.
 
-    def missed(self) -> None:
-        """Record that messages of this sender were lost. They may have commanded motion.
-
-        If several programs share the identity of the sender, and `commands.neutral_pause` after
-        the last zero is not over yet, this zero no longer arms the sender.
+        If this identity is shared, and `commands.neutral_pause` after its zero was not over at this
+        monotonic time, the zero no longer arms the sender.
         """
+        self._settle(at_ns)
         self._zero_ns = self._proven_zero_ns = None
 
     def refuse(self, command: Command, why: Verdict) -> None:
         """Record a command that was refused because of its stamp. `why` is the verdict on it."""
-        self.notice(command.arrived_ns)
+        self.noticed_ns = command.arrived_ns
         self._doubt(command, why)
 
     def take(self, command: Command, since_ns: int, verdict: Verdict = "fresh") -> None:
         """Process a command that was not refused. `verdict` is the verdict on its stamp.
+
+        Before a speed of a shared identity, call `cancel_zero` of each sender of the source.
 
         A command from an unproven clock ("first", "unproven") does not drive the robot yet, but a
         zero with such a verdict arms the sender until `unlearn`. A zero that arrived before the
@@ -105,12 +105,11 @@ class Sender:
         self._settle(now_ns)
         self.noticed_ns, self.shared = now_ns, command.shared
         unarmed = not self._armed
-        if not zero:
-            self._zero_ns = self._proven_zero_ns = None
-        elif now_ns >= since_ns and not command.shared:
-            self._armed = True
-        elif now_ns >= since_ns and self._zero_ns is None:
-            self._zero_ns = now_ns
+        if zero and now_ns >= since_ns:
+            if not command.shared:
+                self._armed = True
+            elif self._zero_ns is None:
+                self._zero_ns = now_ns
         if verdict in ("first", "unproven"):
             if zero and unarmed:
                 # When this zero arms the sender, an earlier speed must not drive the robot. With a

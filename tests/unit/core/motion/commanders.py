@@ -41,9 +41,18 @@ class Bench:
         self.now_ns += int(ms * MS)
         return self
 
-    def send(self, source: Source | str, twist: Twist = GO, sender: str = "") -> str:
+    def send(
+        self,
+        source: Source | str,
+        twist: Twist = GO,
+        sender: str = "",
+        shared: bool = False,
+        cancelled: bool = False,
+    ) -> str:
         name = source if isinstance(source, str) else source.name
-        return self.arbiter.accept(Command(name, twist, self.now_ns, sender=sender))
+        return self.arbiter.accept(
+            Command(name, twist, self.now_ns, sender=sender, cancelled=cancelled, shared=shared)
+        )
 
     def stamped(
         self,
@@ -52,11 +61,12 @@ class Bench:
         clock: str = "",
         twist: Twist = GO,
         sender: str = "",
+        shared: bool = False,
     ) -> str:
         """Send a command that the sender stamped `late_ms` ago."""
         stamp_ns = self.now_ns + self.offset_ns - int(late_ms * MS)
         return self.arbiter.accept(
-            Command(source.name, twist, self.now_ns, stamp_ns, clock, sender)
+            Command(source.name, twist, self.now_ns, stamp_ns, clock, sender, shared=shared)
         )
 
     def known(self, source: Source, clock: str = "", sender: str = "") -> Bench:
