@@ -124,8 +124,9 @@ class Command(Struct, frozen=True):
     """Number that the sender gave to this command, or None. Gaps between the numbers of a sender
     mean lost commands."""
     shared: bool = False
-    """Whether several programs may have the same `sender`, because they are behind a bridge or
-    because the daemon knows only the key of their commands."""
+    """Whether several programs may have the same `sender`, because the program has stated neither a
+    sender id nor a GID. The daemon then knows only the session that stamped the command, which may
+    be that of a router or a bridge, or only the key."""
     ros: bool = False
     """Whether the command came from ROS. ROS tools do not send a zero command by themselves."""
     stamp_replaced: bool = False

@@ -16,12 +16,12 @@ from acsard.core.ros.attachments import Attachment
 from acsard.core.values import NS_PER_S, Outputs
 from tests.scenarios.world import World
 
-Way = Literal["client", "signed", "rmw", "header", "zenoh", "plain", "bridge"]
+Way = Literal["client", "signed", "rmw", "header", "zenoh", "routed", "plain", "bridge"]
 FOREIGN: tuple[Way, ...] = ("signed", "rmw", "header", "zenoh")
 """Routes on which messages have wall-clock stamps. Our own client stamps by a steady clock."""
 STAMPED: tuple[Way, ...] = ("client", *FOREIGN)
-SHARED: tuple[Way, ...] = ("header", "plain", "bridge")
-"""Routes on which all programs on a key share one identity."""
+SHARED: tuple[Way, ...] = ("header", "zenoh", "routed", "plain", "bridge")
+"""Routes on which a program has no identity of its own, because it sends no sender id or GID."""
 
 AHEAD_NS = NS_PER_S // 2
 """Zenoh replaces a timestamp that is further ahead of the receiver's clock than this."""
@@ -38,11 +38,8 @@ class Speaker:
         self._sent = 0
         self.key = "cmd/app"
         self.via: Via = way if way in ("rmw", "bridge") else "native"
-
-    @property
-    def session(self) -> str:
-        """The id of its Zenoh session."""
-        return f"session of {self.name}"
+        self.session = "session of a router" if way == "routed" else f"session of {name}"
+        """The id of the Zenoh session that stamps its messages."""
 
     def slew(self, rate: float) -> None:
         """Set the rate of its clock from now on."""
@@ -77,7 +74,8 @@ class Speaker:
             if way == "client":
                 signature["steady"] = True
             attachment = msgspec.msgpack.encode(signature)
-        if way in ("client", "signed", "zenoh") and stamp_ns - world.instant.wall_ns <= AHEAD_NS:
+        by_zenoh = way in ("client", "signed", "zenoh", "routed")
+        if by_zenoh and stamp_ns - world.instant.wall_ns <= AHEAD_NS:
             sender, told_ns = self.session, stamp_ns
         kind = "TwistStamped" if headed else "Twist"
         encoding = f"application/cdr;geometry_msgs/msg/{kind}"

@@ -14,7 +14,7 @@ from tests.each import each
 from tests.scenarios.speakers import SHARED, STAMPED, Speaker, Way, moved
 from tests.scenarios.world import SIGNED, World
 
-OWN: tuple[Way, ...] = ("client", "signed", "rmw", "zenoh")
+OWN: tuple[Way, ...] = ("client", "signed", "rmw")
 
 
 def quiet() -> World:
@@ -60,6 +60,48 @@ def test_the_zeros_of_one_program_never_release_another(way: Way, count: int) ->
             (zeros, speeds)[number].send((0.0, 0.5)[number])
             due[number] += 1 / (zero_hz, speed_hz)[number] * dice.uniform(0.9, 1.1)
         assert not moved(world, start_ns), seed
+
+
+@pytest.mark.parametrize("count", [10, pytest.param(100, marks=pytest.mark.slow), long(1000)])
+def test_programs_whose_stamps_come_from_several_routers_never_release_each_other(
+    count: int,
+) -> None:
+    """One program sends zeros, and another one always sends speeds.
+
+    The session that stamps their messages changes between those of two routers and that of the
+    program. Some messages have no stamp.
+    """
+    for seed in range(count):
+        dice = random.Random(seed)
+        world = quiet()
+        start_ns, at_s = world.now_ns, 0.0
+        programs = [Speaker(world, "routed", name) for name in ("zeros", "speeds")]
+        hz, changes = (dice.choice((5.0, 10.0, 20.0)), 10.0), [0.0, 0.0]
+        while at_s < 8.0:
+            for number, speaker in enumerate(programs):
+                if at_s >= changes[number]:
+                    changes[number] = at_s + dice.choice((0.05, 0.3, 1.2, 2.5))
+                    ways: tuple[Way, ...] = ("routed", "routed", "zenoh", "plain")
+                    speaker.way = dice.choice(ways)
+                    names = ("router 1", "router 2")
+                    own = f"session of {speaker.name}"
+                    speaker.session = dice.choice(names) if speaker.way == "routed" else own
+                if dice.random() < hz[number] / 20.0:
+                    speaker.send((0.0, 0.5)[number])
+                world.run(0.025)
+                at_s += 0.025
+        assert not moved(world, start_ns), seed
+
+
+def test_a_program_whose_stamping_router_changes_must_send_a_zero_again_and_then_drives() -> None:
+    world = quiet()
+    speaker = Speaker(world, "routed")
+    speaker.open()
+    speaker.session = "another router"
+    speaker.hold(0.4, 1.5)
+    assert world.state.mode == "ready"
+    assert "send a zero first: app must send a zero, and no speed for 1 s" in world.state.reason
+    speaker.open()
 
 
 @pytest.mark.parametrize("way", SHARED)

@@ -522,7 +522,7 @@ def driving_again(world: World, speaker: Speaker, within: float = 3.0) -> bool:
     speaker.hold(0.4, within)
     # A zero of an identity that programs may share counts after a second. So does one whose stamp
     # Zenoh replaced because its clock is ahead.
-    speaker.hold(0.0, 1.2 if speaker.way in (*SHARED, "zenoh") else 0.5)
+    speaker.hold(0.0, 1.2 if speaker.way in SHARED else 0.5)
     for _ in range(5):
         speaker.hold(0.4, 0.1)
         if world.state.mode == "driving":

@@ -220,12 +220,13 @@ import zenoh
 config = zenoh.Config()
 config.insert_json5("mode", '"router"')
 config.insert_json5("listen/endpoints", json.dumps([sys.argv[1]]))
+config.insert_json5("connect/endpoints", json.dumps(sys.argv[2:]))
 config.insert_json5("scouting/multicast/enabled", "false")
 session = zenoh.open(config)
 print("routing", repr(time.monotonic()), flush=True)
 time.sleep(600)
 """
-"""A Zenoh router at an address."""
+"""A Zenoh router at an address, connected to the routers at the other addresses."""
 
 BUSY = "while True: pass"
 """Keeps a core busy."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -123,23 +124,33 @@ def test_a_daemon_that_connects_to_nobody_says_nothing_of_routers(tmp_path: Path
         assert daemon.events("router_missing") == []
 
 
-def test_what_a_router_stamps_is_nobody_s_name(tmp_path: Path) -> None:
-    """All programs without a sender identity look like one, also behind the router."""
-    meeting = free_endpoint()
-    with (
-        router(tmp_path, meeting),
-        Daemon(tmp_path, config={"bus": {"connect": [meeting]}}) as daemon,
-        Bus(daemon.endpoint) as bus,
-        zenoh.open(client_config(meeting)) as plain,
-    ):
+@pytest.mark.parametrize("routers", [1, 2])
+def test_the_zeros_of_a_program_behind_routers_release_no_other_program(
+    tmp_path: Path, routers: int
+) -> None:
+    """The first router stamps all messages. If there are two, the daemon has no link to it."""
+    ends = [free_endpoint() for _ in range(routers)]
+    with ExitStack() as stack:
+        for place, endpoint in enumerate(ends):
+            one = Program(words(ROUTER, endpoint, *ends[:place][-1:]), tmp_path)
+            stack.enter_context(one).says("routing")
+        daemon = stack.enter_context(Daemon(tmp_path, config={"bus": {"connect": ends[-1:]}}))
+        bus = stack.enter_context(Bus(daemon.endpoint))
+        zeros, speeds = [stack.enter_context(zenoh.open(client_config(ends[0]))) for _ in range(2)]
         told(daemon, "router_found", 1)
         bus.linked()
         begun = time.monotonic()
 
-        def driven() -> Any:
-            """Send zeros first, until the delays are known and the zeros count."""
-            wish = twist(0.1 if time.monotonic() > begun + 2.0 else 0.0)
-            plain.put("acsard/acsar/cmd/app", json.dumps(wish))
-            return bus.state()["sender"]
+        def sends() -> Any:
+            """Send zeros all the time, and speeds in the first and the last part of it."""
+            zeros.put("acsard/acsar/cmd/app", json.dumps(twist(0.0)))
+            if not 4.0 < time.monotonic() - begun < 6.0:
+                speeds.put("acsard/acsar/cmd/app", json.dumps(twist(0.1)))
+            return bus.state()
 
-        assert until(driven, 10.0, "it drives") == "native/app"
+        while time.monotonic() < begun + 4.0:
+            assert sends()["mode"] != "driving"
+            time.sleep(0.05)
+        assert bus.count("commands") > 20
+        state = until(lambda: (found := sends())["mode"] == "driving" and found, 10.0, "it drives")
+        assert state["sender"].startswith("session ")

@@ -766,7 +766,8 @@ PERSON = """import('/page/words.js').then(({person}) => [
     person('here/0123456789abcdef', 'here/fedcba9876543210'),
     person('phone/0123456789abcdef [robot]', 'here/fedcba9876543210'),
     person('phone/0123456789abcdef [robot]', 'phone/fedcba9876543210 [robot]'),
-    person('0123456789abcdef'), person('0123456789abcdef [laptop]'), person('0b5d (rmw)')])"""
+    person('0123456789abcdef'), person('session 0123456789abcdef'),
+    person('session 0123456789abcdef [laptop]'), person('0b5d (rmw)')])"""
 
 
 def test_a_sender_has_the_name_that_a_person_knows(page: Phone) -> None:
@@ -775,6 +776,7 @@ def test_a_sender_has_the_name_that_a_person_knows(page: Phone) -> None:
         "another page on the robot itself",
         "phone",
         "another page of phone",
+        "a program without a name",
         "a program without a name",
         "laptop",
         "0b5d (rmw)",

@@ -201,7 +201,7 @@ def test_a_stop_in_a_fault_says_that_it_is_latched_behind_it(
 
 NAMES = """import('/page/words.js').then(({person, named, logged}) => [
     person('unnamed'), named('stopped by unnamed (native) at noon'),
-    named('held by 0123456789abcdef [laptop]'), named('held by 0123456789abcdef'),
+    named('held by 0123456789abcdef [laptop]'), named('held by session 0123456789abcdef'),
     logged('commander/0123456789abcdef -> commander/fedcba9876543210')])"""
 
 

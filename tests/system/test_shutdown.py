@@ -20,7 +20,9 @@ from tests.system.harness import (
     Heard,
     Peer,
     Program,
+    Tables,
     environment,
+    free_endpoint,
     running,
     silence,
     until,
@@ -180,7 +182,9 @@ def test_a_bug_in_a_thread_of_the_bus_ends_the_daemon_with_stop_last(
     (there / "sitecustomize.py").write_text(BUG.format(module=module, kind=kind, method=method))
     bug = tmp_path / "bug"
     env = environment(PYTHONPATH=f"{there}:{ROOT}", BUG=str(bug))
-    with Daemon(tmp_path, peer.path, env=env) as daemon, Bus(daemon.endpoint) as bus:
+    # Without an address in `bus.connect`, the thread of `RouterLinks` does not run.
+    config: Tables = {"bus": {"connect": [free_endpoint()]}}
+    with Daemon(tmp_path, peer.path, config=config, env=env) as daemon, Bus(daemon.endpoint) as bus:
         bus.linked()
         with bus.follow("odom"), bus.commanding(0.5):
             until(lambda: peer.lines[-1].line.startswith(b"ap10.00"), 5.0, "steady driving")

@@ -101,9 +101,8 @@ class Arrival(Struct, frozen=True):
     stamp_ns: int | None
     """Zenoh's timestamp by the wall clock, ns, if the sender or a router set it."""
     sender: str
-    """Id of the Zenoh session that stamped the sample, usually the session of the sender. It is ""
-    if the sample has no stamp, or if the daemon's own session stamped it. On a native key, it is
-    also "" if a connected router stamped it."""
+    """Id of the Zenoh session that stamped the sample: that of its sender, a router or a bridge. It
+    is "" if the sample has no stamp, or if the daemon's own session stamped it."""
     via: Via = "native"
     attachment: bytes = b""
     received_ns: int | None = None
@@ -303,10 +302,10 @@ def identify(arrival: Arrival) -> Identity:
     - on a key of rmw_zenoh: the GID
     - on a key of a bridge: the session that stamped the sample, the key
 
-    If only the key is known, all programs on that key look like one sender. So do all ROS nodes
-    behind a bridge, and all programs whose samples a router stamps. A GID does not prove the
-    identity: ROS discovery publishes it, so a program that may put on a key of rmw_zenoh can claim
-    any GID.
+    Only a program's sender id or GID is its own. Other identities may be shared: a router or a
+    bridge stamps the samples of all programs behind it, and the daemon cannot tell its session from
+    that of a program. A GID does not prove the identity: ROS discovery publishes it, so a program
+    that may put on a key of rmw_zenoh can claim any GID.
     """
     if arrival.via == "rmw":
         rmw = unpack(arrival.attachment)
@@ -314,21 +313,20 @@ def identify(arrival: Arrival) -> Identity:
     if arrival.via == "bridge":
         name = f"bridge/{public_name(arrival.sender)}" if arrival.sender else _by_key(arrival)
         return Identity(name, arrival.stamp_ns, shared=True)
-    signed, sender_id, stamp_ns = signature.unpack(arrival.attachment), arrival.sender, None
-    if signed is not None:
-        sender_id, stamp_ns = signed.sender, signed.stamp
-    steady = signed is not None and signed.steady and signed.stamp is not None
-    if stamp_ns is None:
-        stamp_ns = arrival.stamp_ns
-    if not sender_id:
-        return Identity(_by_key(arrival), stamp_ns, shared=True)
     kind, _, certificate = parts(arrival.key)
+    signed = signature.unpack(arrival.attachment)
+    if signed is None:
+        name = _by_key(arrival)
+        if arrival.sender:
+            # No sender id has such a public name: behind a prefix there is always a slash.
+            name = f"session {public_name(arrival.sender, certificate)}"
+        return Identity(name, arrival.stamp_ns, shared=True)
     return Identity(
-        public_name(sender_id, certificate),
-        stamp_ns,
-        None if signed is None else signed.sequence,
-        steady=steady,
-        signed=public_name(sender_id) if kind in COMMANDS else "",
+        public_name(signed.sender, certificate),
+        arrival.stamp_ns if signed.stamp is None else signed.stamp,
+        signed.sequence,
+        steady=signed.steady and signed.stamp is not None,
+        signed=public_name(signed.sender) if kind in COMMANDS else "",
     )
 
 

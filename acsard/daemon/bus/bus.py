@@ -50,7 +50,7 @@ class ZenohBus:
         self._replies = Replies(prefix)
         sources = tuple(source.name for source in config.commands.sources)
         self._inbox = Inbox(prefix, self._replies, sources, waker)
-        self._outlets, self._links = Outlets(), RouterLinks(config.bus, self._inbox)
+        self._outlets, self._links = Outlets(), RouterLinks(config.bus)
         self._session: zenoh.Session
         self._kept: list[object] = []
         """The declared entities. Zenoh undeclares an entity when nothing refers to it."""

@@ -152,9 +152,6 @@ class Inbox:
         self.own_id: zenoh.TimestampId | None = None
         """The id that the daemon's session writes into timestamps. A timestamp with this id is not
         from the sender: the session stamps each sample that comes without a timestamp."""
-        self.routers: frozenset[str] = frozenset()
-        """The ids that the connected routers write into timestamps. Such a timestamp says when a
-        sample passed the router, and does not identify its sender."""
         self._prefix, self._replies = prefix, replies
         self._arrivals: dict[str, Mailbox[Arrival]] = {
             key: Mailbox(ARRIVALS, self._commanded)
@@ -232,8 +229,6 @@ class Inbox:
                 received_ns = at_ns
             else:
                 stamp_ns, sender = at_ns, str(session)
-                if via == "native" and sender in self.routers:
-                    sender = ""
         arrival = Arrival(
             key,
             put,

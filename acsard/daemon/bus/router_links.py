@@ -1,4 +1,4 @@
-"""Watches the links of the daemon's session to the endpoints of `bus.connect` and to routers."""
+"""Watches the links of the daemon's session to the endpoints of `bus.connect`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import zenoh
 from acsard.core.config.settings import BusConfig
 from acsard.core.values import RoutersStatus
 from acsard.daemon.bus.bus_thread import BusThread
-from acsard.daemon.bus.inbox import Inbox
 from acsard.host.mailbox import Mailbox
 
 POLL_S = 0.5
@@ -27,9 +26,8 @@ class RouterLinks:
     separate thread polls Zenoh, because the call may block.
     """
 
-    def __init__(self, bus: BusConfig, inbox: Inbox) -> None:
-        """Prepare the thread, which writes the ids of connected routers to `inbox.routers`."""
-        self._bus, self._inbox = bus, inbox
+    def __init__(self, bus: BusConfig) -> None:
+        self._bus = bus
         self._status: RoutersStatus | None = None
         self._changes = Mailbox[RoutersStatus](1, lambda: None)
         self._over = Event()
@@ -45,9 +43,10 @@ class RouterLinks:
         self._thread.check()
 
     def start(self, session: zenoh.Session) -> None:
-        """Start polling, even without `bus.connect`, because a router may connect to the daemon."""
+        """Start polling, unless `bus.connect` is empty."""
         self._session = session
-        self._thread.start()
+        if self._bus.connect:
+            self._thread.start()
 
     def stop(self) -> None:
         """Stop polling, without waiting for a name lookup that is under way."""
@@ -56,16 +55,12 @@ class RouterLinks:
             self._thread.join(STOP_S)
 
     def _run(self) -> None:
-        # The first poll reports no change, because Zenoh has had no time to connect yet.
-        reports = False
-        while True:
+        # The first wait gives Zenoh the time to connect.
+        while not self._over.wait(POLL_S):
             status = self._poll()
-            if reports and status != self._status:
+            if status != self._status:
                 self._status = status
                 self._changes.put(status)
-            reports = bool(self._bus.connect)
-            if self._over.wait(POLL_S):
-                return
 
     def _poll(self) -> RoutersStatus:
         endpoints = self._bus.connect
@@ -76,8 +71,6 @@ class RouterLinks:
         except zenoh.ZError:
             # The session is closing.
             return self._status or RoutersStatus()
-        routers = (zid for zid, kind in kinds.items() if kind == zenoh.WhatAmI.ROUTER)
-        self._inbox.routers = frozenset(routers)
         missing = unreached(self._bus.mode, endpoints, set(zids))
         connected = tuple(endpoint for endpoint in endpoints if endpoint not in missing)
         peer_ends = {end for end, zid in zids.items() if kinds.get(zid) == zenoh.WhatAmI.PEER}

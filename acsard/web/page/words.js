@@ -63,10 +63,10 @@ export function yaw(q) {
   return 2 * Math.atan2(q.z, q.w);
 }
 
-/** Return a sender's public name, "NAME/DIGITS [CERTIFICATE]", in a person's words. `own` is the public name of
- *  this page, "" if it is not known. */
+/** Return a sender's public name, "NAME/DIGITS [CERTIFICATE]" or "session DIGITS [CERTIFICATE]", in a person's
+ *  words. `own` is the public name of this page, "" if it is not known. */
 export function person(sender, own = "") {
-  const [, name, certificate] = sender.match(/^(?:(.*)\/)?[0-9a-f]{16}(?: \[(.*)\])?$/) ?? [null, sender];
+  const [, name, certificate] = sender.match(/^(?:(.*)\/|session )?[0-9a-f]{16}(?: \[(.*)\])?$/) ?? [null, sender];
   if (own && sender === own) return "you";
   if (name === "unnamed") return NAMELESS;
   if (name === "here") return "another page on the robot itself";
@@ -86,7 +86,7 @@ export function reason(state, elsewhere) {
 export function named(text) {
   return text
     .replace(/\/[0-9a-f]{16}\b/g, "")
-    .replace(/\b[0-9a-f]{16}\b(?: \[(.*?)\])?/g, (_, certificate) => certificate || NAMELESS)
+    .replace(/\b(?:session )?[0-9a-f]{16}\b(?: \[(.*?)\])?/g, (_, certificate) => certificate || NAMELESS)
     .replaceAll(" (native)", "")
     .replace(/\bby unnamed\b/g, `by ${NAMELESS}`)
     .replaceAll("here@page", "a page on the robot itself");

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import random
 import struct
+from itertools import product
 from typing import Any
 
 import msgspec
@@ -821,7 +822,7 @@ def test_a_stamp_that_zenoh_replaced_is_known_by_how_far_ahead_the_sender_s_own_
 
 
 GID_NAME = f"gid {public_name(GID.hex())}"
-Z1, ROUTER = public_name("z1"), public_name("router")
+Z1, ROUTER = f"session {public_name('z1')}", public_name("router")
 
 
 def ours(body: dict[str, Any], **changes: Any) -> Arrival:
@@ -834,12 +835,14 @@ IDENTITIES: dict[str, tuple[Arrival, str, str, int | None, bool]] = {
         ours(joints(1.0, 1.0, 1.0, 1.0), key="wheel_cmd/app"), "native/app", "native/app", None,
         True,
     ),
-    "the stamp of a router": (ours(twist(), stamp_ns=5), "native/app", "native/app", 5, True),
-    "a session that stamps": (ours(twist(), sender="z1", stamp_ns=5), Z1, Z1, 5, False),
+    "a session that stamps": (ours(twist(), sender="z1", stamp_ns=5), Z1, Z1, 5, True),
     "a header": (ours(stamped(12)), "native/app", HEADER_S, 12 * 10**9, True),
-    "a header, stamped": (ours(stamped(12), stamp_ns=5), "native/app", HEADER_S, 12 * 10**9, True),
+    "a header, stamped": (
+        ours(stamped(12), sender="z1", stamp_ns=5), Z1, f"{Z1}, header on native/cmd/app",
+        12 * 10**9, True,
+    ),
     "a header of zero": (ours(stamped(0)), "native/app", "native/app", None, True),
-    "a header of 0, stamped": (ours(stamped(0), stamp_ns=5), "native/app", "native/app", 5, True),
+    "a header of 0, stamped": (ours(stamped(0), sender="z1", stamp_ns=5), Z1, Z1, 5, True),
     "rmw": (by_ros("rmw", twist(), sender="router"), GID_NAME, GID_NAME, SENT_NS, False),
     "rmw, a header": (
         by_ros("rmw", stamped(12, 34)), GID_NAME, f"{GID_NAME}, header on rmw/cmd/nav",
@@ -897,7 +900,7 @@ def test_the_certificate_in_the_key_is_part_of_the_sender_s_name() -> None:
     assert (told.source, told.sender, told.clock) == ("app", *[f"{JOYSTICK} [anna]"] * 2)
     assert sender(came) == told.sender
     by_zenoh = receiver.command(replace(came, attachment=b"", sender="z1", stamp_ns=5))
-    assert by_zenoh.sender == f"{public_name('z1')} [anna]"
+    assert by_zenoh.sender == f"{Z1} [anna]"
     by_key = receiver.command(replace(came, attachment=b""))
     assert (by_key.sender, by_key.shared) == ("native/app/anna", True)
 
@@ -918,8 +921,18 @@ def test_what_many_share_and_what_comes_by_ros_is_bound_to_no_certificate() -> N
     receiver.command(arrival(written(twist(), "json"), key="cmd/app/anna", attachment=signed()))
     bridged = by_ros("bridge", twist(), key="cmd/app", attachment=signed())
     assert receiver.command(bridged).sender == "bridge/app"
-    for key in ("cmd/app", "cmd/app/anna", "cmd/app/ben"):
-        assert receiver.command(arrival(written(twist(), "json"), key=key)).shared
+    for key, session in product(("cmd/app", "cmd/app/anna", "cmd/app/ben"), ("", "z1")):
+        stamp_ns = 5 if session else None
+        came = arrival(written(twist(), "json"), key=key, sender=session, stamp_ns=stamp_ns)
+        assert receiver.command(came).shared
+
+
+def test_no_sender_id_passes_for_the_session_that_stamps_for_others() -> None:
+    """The zero of a sender id arms at once. The id of a router's session is no secret."""
+    stamped_by = command(twist(), sender="z1", stamp_ns=5).sender
+    for name in ("z1", "session z1", "session/z1", f"{stamped_by}/z1"):
+        attachment = msgspec.msgpack.encode({"sender": name})
+        assert command(twist(), attachment=attachment).sender != stamped_by
 
 
 # senders bound to certificates

@@ -10,11 +10,13 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from acsard.core.incoming.commands import Arrival
 from acsard.core.incoming.imu import FOLLOWED_NS, MAX_RATE, OWN, GyroFollower, reading
 from acsard.core.messages.encodings import FORMATS, DecodeError, Format, encode, encoding_name
 from acsard.core.messages.schema import Header, Imu, Quaternion, Time, Vector3
+from acsard.core.messages.signature import Signature
 from acsard.core.values import Event, GyroSample
 from tests.each import each
 
@@ -146,10 +148,13 @@ def test_who_comes_back_after_a_silence_is_no_other() -> None:
 def test_beside_a_gyro_of_its_own_a_robot_follows_no_other_however_long_that_is_silent() -> None:
     counters, events = Counter[str](), list[Event]()
     told = GyroFollower(own=True)
-    assert told.receive(turning(0.2, 0, "other"), counters, events) is None
-    assert told.receive(turning(0.1, 10 * FOLLOWED_NS, OWN), counters, events) is not None
+    for who in ("other", OWN):
+        # The second one has the simulator's secret as the id of its session.
+        assert told.receive(turning(0.2, 0, who), counters, events) is None
+    own = replace(turning(0.1, 10 * FOLLOWED_NS, ""), attachment=Signature(OWN).pack())
+    assert told.receive(own, counters, events) is not None
     assert told.receive(turning(0.2, 20 * FOLLOWED_NS, "other"), counters, events) is None
-    assert counters == {"imu_second_sender": 2}
+    assert counters == {"imu_second_sender": 3}
     assert "simulat" in events[0].text
 
 
