@@ -194,6 +194,8 @@ class Run:
             if sender["way"] in ("header", "bridged"):
                 seen[f"header native/{sender['source']}" if sender["way"] == "header"
                      else "session of the bridge"] += 1  # fmt: skip
+            elif sender["way"] == "routed":
+                seen.update({name for _, name in sender["routers"]})
             else:
                 for own in (sender["id"], f"session of {sender['id']}"):
                     seen[own] += 1

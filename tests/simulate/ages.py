@@ -48,7 +48,7 @@ class Sender:
 
     def __init__(self) -> None:
         self.zeros: list[int] = []
-        """Arrivals of the zeros that no speed has followed."""
+        """Arrivals of the zeros that no speed of a shared identity of the source has followed."""
         self.armed_ns = -1
 
 

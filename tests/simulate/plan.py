@@ -87,6 +87,7 @@ def made(seed: int, seconds: float | None = None) -> Plan:
             if dice.random() < 0.5:
                 first = plan["senders"][0]
                 sender.update(id=first["id"], way=first["way"], source=first["source"])
+    _draw_routers(random.Random(f"routers {seed}"), plan)
     driven = _draw_lawful_driver(random.Random(f"lawful driver {seed}"), plan)
     events = _events(dice, kinds, length, config, plan["senders"])
     if driven:
@@ -94,6 +95,28 @@ def made(seed: int, seconds: float | None = None) -> Plan:
     plan["events"] = sorted(events, key=lambda one: one["at"])
     board_inputs.add(plan)
     return plan
+
+
+def _draw_routers(dice: random.Random, plan: Plan) -> None:
+    """Put most of the senders whose sessions stamp behind routers that stamp in their place.
+
+    The session that stamps changes while the plan runs: to that of another router, of the sender,
+    or of the daemon. In a tenth of the plans, all senders are behind routers and command one
+    source.
+    """
+    senders, together = plan["senders"], dice.random() < 0.1
+    for sender in senders:
+        if not together and (sender["way"] != "zenoh" or dice.random() < 0.2):
+            continue
+        own, t = f"session of {sender['id']}", 0.0
+        names = ("session of router 1", "session of router 1", "session of router 2", own, "")
+        routers: list[list[Any]] = []
+        while t < plan["seconds"]:
+            routers.append([round(t, 3), dice.choice(names)])
+            t += dice.choice((dice.uniform(0.05, 0.5), dice.uniform(0.5, 3.0), 30.0))
+        sender.update(way="routed", routers=routers, wheels=False, churn=False)
+        if together:
+            sender["source"] = senders[0]["source"]
 
 
 def _draw_lawful_driver(dice: random.Random, plan: Plan) -> bool:

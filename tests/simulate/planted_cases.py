@@ -33,8 +33,8 @@ CASES = (
         "case 2",
         "the first zero of a shared sender arms it",
         NEUTRAL,
-        "elif now_ns >= since_ns and not command.shared:",
-        "elif now_ns >= since_ns:",
+        "            if not command.shared:\n                self._armed = True",
+        "            if True:\n                self._armed = True",
     ),
     Fault(
         "case 3",

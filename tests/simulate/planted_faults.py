@@ -204,8 +204,8 @@ FAULTS = (
         "arbiter notice",
         "a zero arms a shared sender although unreadable speeds follow it",
         ARBITER,
-        "known.senders[sender].notice(arrived_ns)",
-        "known.senders[sender].noticed_ns = 0",
+        "            known.cancel_zeros(arrived_ns)",
+        "            pass",
     ),
     fault(
         "arbiter equal",
@@ -247,9 +247,23 @@ FAULTS = (
     fault(
         "neutral speeds",
         "speeds behind the zero of a shared identity do not undo it",
-        NEUTRAL,
-        "        if not zero:\n            self._zero_ns = self._proven_zero_ns = None",
-        "        if not zero:\n            pass",
+        ARBITER,
+        "            source.cancel_zeros(command.arrived_ns)",
+        "            pass",
+    ),
+    fault(
+        "neutral identities",
+        "speeds behind the zero of a shared identity do not undo that of another one",
+        ARBITER,
+        "            source.cancel_zeros(command.arrived_ns)",
+        "            known and known.cancel_zero(command.arrived_ns)",
+    ),
+    fault(
+        "neutral session",
+        "the zero of one program behind a router that stamps arms all of them at once",
+        COMMANDS,
+        "return Identity(name, arrival.stamp_ns, shared=True)\n    return",
+        "return Identity(name, arrival.stamp_ns, shared=not arrival.sender)\n    return",
     ),
     fault(
         "neutral cancelled",
@@ -262,8 +276,8 @@ FAULTS = (
         "neutral never",
         "a zero arms no sender",
         NEUTRAL,
-        "            self._armed = True\n        elif",
-        "            pass\n        elif",
+        "                self._armed = True\n            elif",
+        "                pass\n            elif",
     ),
     fault(
         "neutral newest",

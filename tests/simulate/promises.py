@@ -216,6 +216,8 @@ class Witness:
         self.armed_since_ns = at_ns
         self.ages = Ages(at_ns)
         self.senders: dict[tuple[str, str], Sender] = {}
+        self._sharing: dict[str, list[Sender]] = {}
+        """The shared identities of each source."""
         self.wishes: deque[tuple[str, Wish]] = deque()
         self._unread: list[tuple[str, Wish | None, tuple[Any, ...]]] = []
         """Messages that no step has read yet: the key, the command if it can be read, and the
@@ -244,9 +246,7 @@ class Witness:
         source = sender["source"]
         if message.junk not in ("", "cancels"):
             if sample.shared and message.junk in MAYBE_SPEEDS:
-                other = self.senders.setdefault((source, sample.identity), Sender())
-                self._arm(other, arrived_ns)
-                other.zeros.clear()
+                self._cancel_zeros(source, arrived_ns)
             return None
         if message.junk == "cancels":
             v, w = 0.0, 0.0
@@ -261,15 +261,18 @@ class Witness:
         wish.certain = (
             not sample.clock and message.junk == "" and sender["way"] in ("plain", "bridge")
         )
-        known = self.senders.setdefault((source, sample.identity), Sender())
-        if zero:
-            if not sample.shared:
-                known.armed_ns = arrived_ns
+        known = self.senders.get((source, sample.identity))
+        if known is None:
+            known = self.senders[source, sample.identity] = Sender()
+            if sample.shared:
+                self._sharing.setdefault(source, []).append(known)
+        if zero and not sample.shared:
+            known.armed_ns = arrived_ns
+        elif zero:
             known.zeros.append(arrived_ns)
             del known.zeros[:-4000]
-        else:
-            self._arm(known, arrived_ns)
-            known.zeros.clear()
+        elif sample.shared:
+            self._cancel_zeros(source, arrived_ns)
         wish.armed_ns = known.armed_ns
         self.wishes.append((source, wish))
         return wish
@@ -292,6 +295,12 @@ class Witness:
             if wish is not None:
                 wish.fresh = self.ages.fresh(*seen)
                 self._unread[place] = key, None, ()
+
+    def _cancel_zeros(self, source: str, now_ns: int) -> None:
+        """Note what may be a speed of any program that shares its identity."""
+        for known in self._sharing.get(source, ()):
+            self._arm(known, now_ns)
+            known.zeros.clear()
 
     def _arm(self, known: Sender, now_ns: int) -> None:
         """Arm a shared identity by the latest zero that the pause has passed behind."""

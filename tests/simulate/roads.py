@@ -17,7 +17,7 @@ import msgspec
 
 NS = 1_000_000_000
 STEADY = ("client", "page")
-FOREIGN = ("signed", "rmw", "header", "zenoh", "bridged")
+FOREIGN = ("signed", "rmw", "header", "zenoh", "routed", "bridged")
 AHEAD_NS = NS // 2
 """Zenoh replaces a timestamp that is further ahead of the receiver's clock."""
 
@@ -175,12 +175,10 @@ def sample(
             )
         case "header" if stamp_counts:
             identity, shared, clock = by_key, True, f"header {by_key}"
-        case "zenoh":
-            identity = clock = f"session of {own}"
-            session, stamp_ns = identity, message.stamp_ns
-        case "bridged":
-            identity = clock = "session of the bridge"
-            session, stamp_ns, shared = identity, message.stamp_ns, True
+        case "zenoh" | "routed" | "bridged":
+            session = _stamper(sender, message, own)
+            identity, shared, clock = session or by_key, True, session
+            stamp_ns = message.stamp_ns if session else None
         case "plain":
             identity, shared, clock = by_key, True, ""
         case "bridge":
@@ -192,6 +190,16 @@ def sample(
     options.update(via=via, session=session, stamp_ns=stamp_ns)
     key, payload = _payload(sender, message, config, via, options)
     return Sample(key, payload, options, identity, shared, clock)
+
+
+def _stamper(sender: dict[str, Any], message: Message, own: str) -> str:
+    """Return the Zenoh session that stamps this message, or "" if the daemon's own session does."""
+    if sender["way"] == "bridged":
+        return "session of the bridge"
+    if sender["way"] == "routed":
+        at_s = message.sent_ns / NS
+        return next((name for since_s, name in reversed(sender["routers"]) if at_s >= since_s), "")
+    return f"session of {own}"
 
 
 @lru_cache(64)

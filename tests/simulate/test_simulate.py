@@ -750,6 +750,43 @@ def test_a_zero_before_what_may_be_a_speed_of_the_same_identity_arms_nobody(
     assert (witness.wishes[-1][1].armed_ns == NS) is armed
 
 
+@pytest.mark.parametrize(("way", "armed"), [("routed", False), ("bridge", False), ("signed", True)])
+def test_a_speed_of_another_shared_identity_of_the_source_undoes_a_zero(
+    way: str, armed: bool
+) -> None:
+    witness = witnessed()
+    plain = made(1)["senders"][0] | {"way": "plain", "source": "app", "churn": False}
+    other = plain | {"way": way, "routers": [[0.0, "session of router 1"]]}
+    for at_s, sender, v in ((1.0, plain, 0.0), (1.5, other, 0.3), (2.5, plain, 0.3)):
+        one = Message(int(at_s * NS), int(at_s * NS), v, 0.0, NS, 0, "")
+        witness.command(sender, one, sample(sender, one, PLAIN["config"], NS), one.arrives_ns)
+    assert (witness.wishes[-1][1].armed_ns == NS) is armed
+
+
+def test_a_sender_behind_routers_has_the_identity_of_the_session_that_stamps() -> None:
+    routers = [[0.0, "session of router 1"], [2.0, ""], [3.0, "session of router 2"]]
+    sender = made(1)["senders"][0] | {"way": "routed", "source": "app", "churn": False}
+    sender["routers"] = routers
+    found = []
+    for at_s in (1, 2, 4):
+        one = Message(at_s * NS, at_s * NS, 0.3, 0.0, NS, 1, "")
+        got = sample(sender, one, PLAIN["config"], NS)
+        found.append((got.identity, got.clock, got.options["session"], got.shared))
+    first, _, last = [name for _, name in routers]
+    assert found == [
+        (first, first, first, True), ("native/app", "", "", True), (last, last, last, True)
+    ]  # fmt: skip
+
+
+def test_some_plans_have_several_senders_behind_routers_on_one_source() -> None:
+    together = 0
+    for seed in range(200):
+        senders = [one for one in made(seed)["senders"] if one["way"] == "routed"]
+        assert all(one["routers"][0][0] == 0.0 for one in senders)
+        together += len(senders) > 1 and len({one["source"] for one in senders}) == 1
+    assert together > 3
+
+
 @pytest.mark.parametrize(("names", "obeyed"), [(0, False), (1001, True)])
 def test_a_late_sender_is_new_again_only_after_a_thousand_new_names(
     names: int, obeyed: bool
