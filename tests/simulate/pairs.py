@@ -23,7 +23,7 @@ from typing import Any
 
 import msgspec
 
-from tests.simulate import board_inputs
+from tests.simulate import bad_moments, board_inputs
 from tests.simulate.differences import CORRECTED, DIFFERENCES, LEFT_OUT
 from tests.simulate.plan import Plan, made
 
@@ -113,7 +113,7 @@ def comparable(plan: Plan, left_out: tuple[tuple[str, object, str], ...] = LEFT_
     events = plan["events"]
     for field, value, _ in left_out:
         events = [event for event in events if event.get(field) != value]
-    return board_inputs.removed(plan | {"events": events})
+    return bad_moments.removed(board_inputs.removed(plan | {"events": events}))
 
 
 class Side:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import random
 from typing import Any
 
-from tests.simulate import board_inputs
+from tests.simulate import bad_moments, board_inputs
 from tests.simulate.product import problems
 
 Plan = dict[str, Any]
@@ -94,6 +94,7 @@ def made(seed: int, seconds: float | None = None) -> Plan:
         events += _rare_events(random.Random(f"rare events {seed}"), plan)
     plan["events"] = sorted(events, key=lambda one: one["at"])
     board_inputs.add(plan)
+    bad_moments.add(plan)
     return plan
 
 

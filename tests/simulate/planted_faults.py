@@ -28,10 +28,12 @@ class Fault(NamedTuple):
 
     @property
     def kind(self) -> str:
-        """The kind of inputs of the plans that are played, "" for all plans."""
+        """The kind of inputs, or the moment, of the plans that are played; "" for all plans."""
         first = self.name.split()[0]
         if first == "driver":
             return "driver_fault"
+        if first == "moment":
+            return "late step"
         return first if first in ("estop", "away", "battery") else ""
 
 
@@ -223,6 +225,13 @@ FAULTS = (
         "and source.priority <= first[0].priority\n",
     ),
     # neutral
+    fault(
+        "moment older",
+        "an older demand for a zero takes the place of a newer one that came in the same step",
+        ARBITER,
+        "self._since_ns = max(self._since_ns, since_ns)",
+        "self._since_ns = since_ns",
+    ),
     fault(
         "neutral pause",
         "a zero of a shared identity arms it after half the pause",

@@ -44,8 +44,8 @@ def test_code_that_a_fault_adds_to_freshness_runs_there(fault: Fault) -> None:
     assert verdict in ("first", "unproven", "fresh")
 
 
-def test_there_are_a_hundred_and_three_faults_and_eleven_cases() -> None:
-    assert len(FAULTS) == len({fault.name for fault in FAULTS}) == 103
+def test_there_are_a_hundred_and_four_faults_and_eleven_cases() -> None:
+    assert len(FAULTS) == len({fault.name for fault in FAULTS}) == 104
     assert len(CASES) == 11
 
 
