@@ -13,7 +13,7 @@ import json
 import struct
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import msgspec
@@ -30,7 +30,7 @@ from tests.simulate.pose import LIARS, PoseWitness
 from tests.simulate.product import START_NS, WALL_OFFSET_NS, Product, Seen
 from tests.simulate.promises import DIALECTS, INPUTS, BrokenError, Witness
 from tests.simulate.reasons import Reasons
-from tests.simulate.reports import Echo, Reports, judge_pose, judge_state
+from tests.simulate.reports import Echo, HalfDuplex, Reports, judge_pose, judge_state
 from tests.simulate.roads import NS, Message, messages, parameters, read_reply, sample
 from tests.simulate.spread import Spread
 
@@ -93,6 +93,7 @@ class Run:
         self.pose = PoseWitness(plan["config"])
         self.spread, self.log_lines = Spread(self.witness), LogLines()
         self.reports, self.echo, self.damage = Reports(), Echo(), Damage()
+        self.half_duplex = HalfDuplex()
         self.followed, self.course = Followed(self.witness), Course(self.witness)
         self.counts: Counter[str] = self.witness.counts
         self.liveness = Liveness(self)
@@ -114,6 +115,8 @@ class Run:
         self._link = ""
         """Names of the active faults that the plan has begun, without dialects."""
         self._fed_ns = 0
+        self._flipped = False
+        """The next line of the board has a flipped bit, so it may be lost or not."""
         self._ended = b""
         """The last byte of the board that reached the daemon."""
         self._rest = b""
@@ -323,6 +326,8 @@ class Run:
             if not success:
                 return
             match verb:
+                case "stop":
+                    self.inputs.asked(true_ns, named(event["by"], via))
                 case "clear":
                     self.inputs.cleared(true_ns)
                     witness.cleared(true_ns, read_ns, text, event["by"])
@@ -365,6 +370,8 @@ class Run:
                 self._board()
                 if name == "echo":
                     self.echo.begin()
+                elif name == "half_duplex":
+                    self.half_duplex.begin()
                 elif name == "mute":
                     self.at(self.true_ns + NS // 2 + 2 * self.witness.period_ns, self._look)
                 self.at(after_ns, lambda: self._mended(fault))
@@ -382,12 +389,17 @@ class Run:
                 product.unplug()
                 self.pose.doubt()
                 self.at(self.true_ns + NS // 2, self._look)
-                self.at(after_ns, lambda: self.plug(event["new"]))
+                self.at(after_ns, lambda: self.plug(event["new"], event.get("without", ())))
             case "block":
                 self._block(True)
                 self.at(after_ns, lambda: self._block(False))
             case "tear":
                 product.tear(event["taken"])
+            case "flip":
+                product.flip(event["place"], event["mask"])
+                self._flipped = True
+                self._troubled("flip")
+                self.damage.forget()
             case "stall" | "stall in step":
                 self._stalled_ns = after_ns
                 self.liveness.stalls(after_ns)
@@ -450,22 +462,35 @@ class Run:
     def _mended(self, fault: tuple[str, tuple[Any, ...]]) -> None:
         if fault[0] == "endless" and self.product.alive:
             self._weigh()
+        if fault not in self.active:
+            return  # The board was replaced by one that does not report this input.
         self.active.remove(fault)
         self.liveness.event(TROUBLE_NS, disarms=fault[0] not in QUIET_FAULTS)
         self._troubled(fault[0])
         self.pose.mended(fault[0], self.true_ns)
         self._board()
         self.echo.on = "echo" in self._names
-        if fault[0] == "echo" and self.product.plugged:
+        self.half_duplex.on = "half_duplex" in self._names
+        if fault[0] in ("echo", "half_duplex") and self.product.plugged:
             # The daemon asks for this, and drives no more until it was done.
             self.inputs.lost()
             self.product.unplug()
             self.at(self.true_ns + NS // 10, lambda: self.plug(False))
 
-    def plug(self, new: bool) -> None:
-        """Plug the board in again, unless it is plugged in."""
+    def plug(self, new: bool, without: Sequence[str] = ()) -> None:
+        """Plug the board in again, unless it is plugged in.
+
+        A new board is `without` the faults whose names begin with these words: it never reports
+        such an input.
+        """
         self.liveness.event(TROUBLE_NS if new else 0)
         if not self.product.plugged:
+            if without:
+                names = tuple(without)
+                self.lasting = [one for one in self.lasting if not one[0].startswith(names)]
+                self.active = [one for one in self.active if not one[0].startswith(names)]
+                self._board()
+                self.inputs.replaced()
             self.product.plug(new)
             self.inputs.plugged()
             self.witness.first, self._rest = True, b""
@@ -474,6 +499,7 @@ class Run:
                 self.witness.blocked_ns = self.true_ns  # The new port has taken no line either.
             self.damage.forget()
             self.echo.restart()
+            self.half_duplex.restart()
             self._disarmed(self.true_ns)
             self._linked = False
 
@@ -533,6 +559,7 @@ class Run:
             self.spread.forget()
             self.inputs.new_life()
             self.echo.restart()
+            self.half_duplex.restart()
             self.pose.latest = None
             self.damage.forget()
             self.reasons.restart()
@@ -558,6 +585,9 @@ class Run:
         true_ns = at_ns - START_NS + self.slept_ns
         self.witness.reported(true_ns, lines)
         gap_ns = true_ns - self._fed_ns
+        if self._flipped:
+            self._flipped = False
+            self.liveness.event(NS // 2)
         if not self._plain and gap_ns > 6 * NS // 10:
             # The next good line is the first one with the check, for which the daemon asks again.
             self.liveness.event(NS // 2)
@@ -657,6 +687,8 @@ class Run:
             witness.line(at_ns + offset, line, self._fed_ns, seen.decided_ns + offset)
             if witness.linked:  # the daemon that has lost the link believes no line
                 self.echo.line(at_ns + offset, witness.last)
+                if self.half_duplex.on:
+                    self.half_duplex.line(witness.last)
             if any(witness.last):
                 self.moved_ns = at_ns + offset
         told = seen.mode == "driving" and not witness.pending and not self.inputs.limiting
@@ -670,6 +702,8 @@ class Run:
         if seen.estimates:
             lies, truth = self._names, self.product.truth()
             self.pose.see(true_ns, seen.estimates, truth, offset, lies)
+            if self.half_duplex.on:
+                self.half_duplex.see(true_ns, seen.mode, seen.estimates[-1][1:], truth[1:])
             if self._stalled_ns > true_ns - NS:
                 self.spread.forget()
             for estimate in seen.estimates:
@@ -692,11 +726,19 @@ class Run:
             )  # fmt: skip
 
 
+def named(by: str, via: str) -> str:
+    """Return the words by which `state` names a client that stopped the robot.
+
+    A client on a native key is named by the SHA-256 of its id, others are unnamed.
+    """
+    return hashlib.sha256(by.encode()).hexdigest()[:16] if via == "native" else f"unnamed ({via}"
+
+
 def disarms(event: dict[str, Any]) -> bool:
     """Return whether this event of a plan may ask each sender for a zero when it begins."""
     if event["do"] == "board":
         return event["fault"][0] not in QUIET_FAULTS
-    return event["do"] not in ("stall", "stall in step", "block", "tear")
+    return event["do"] not in ("stall", "stall in step", "block", "tear", "flip")
 
 
 def asks_for_zeros(verb: str, event: dict[str, Any], success: bool, text: str) -> bool:

@@ -11,6 +11,9 @@ import random
 from collections.abc import Callable
 from typing import Any
 
+from tests.simulate.board_inputs import NEVER_S
+from tests.simulate.promises import INPUTS
+
 Plan = dict[str, Any]
 Event = dict[str, Any]
 
@@ -24,9 +27,9 @@ CALL: Event = {
 
 def add(plan: Plan) -> None:
     """Give some plans a moment."""
-    for name, (share, give) in MOMENTS.items():
+    for name, (share, fits, give) in MOMENTS.items():
         dice = random.Random(f"a moment {name} {plan['seed']}")
-        if dice.random() < share:
+        if dice.random() < share and fits(plan):
             plan["moment"] = name
             give(plan, dice)
             plan["events"].sort(key=lambda one: one["at"])
@@ -45,7 +48,7 @@ def removed(plan: Plan) -> Plan:
     }
 
 
-NEW: frozenset[str] = frozenset()
+NEW = {"flip", "half_duplex", "constant_answers"}
 """Events and faults of the board that only these plans have."""
 
 
@@ -146,7 +149,157 @@ def _meeting(dice: random.Random, at: float, source: str, away: bool) -> list[Ev
     return events
 
 
-MOMENTS: dict[str, tuple[float, Callable[[Plan, random.Random], None]]] = {
-    "late step": (0.05, _late_step),
+def _alone(plan: Plan, dice: random.Random, phases: list[list[Any]]) -> dict[str, Any]:
+    """Leave one sender of the best source, and no event. Return the sender."""
+    source = _best(plan)
+    plan["config"]["control"].pop("auto_activate", None)
+    hz = 50.0 if source["timeout"] < 0.2 else 20.0
+    way = dice.choice(("client", "plain", "bridge"))
+    driver = _driver(plan, source, way=way, hz=hz, phases=phases)
+    plan["senders"], plan["events"] = [driver], []
+    return driver
+
+
+def _drives(plan: Plan, dice: random.Random, rests: float, shortest: float, longest: float) -> list[Any]:
+    """Return phases that rest for `rests` s or more, and then drive, over and over."""
+    rests += plan["config"]["commands"].get("neutral_pause", 1.0)
+    phases: list[list[Any]] = []
+    at = 0.0
+    while at < plan["seconds"]:
+        phases.append([round(at, 3), 0.0, 0.0])
+        at += rests
+        for _ in range(dice.choice((1, 2, 4))):
+            phases.append([round(at, 3), *_speed(dice)])
+            at += dice.uniform(shortest, longest)
+    return phases
+
+
+def _is_plain(plan: Plan) -> bool:
+    """Return whether the board answers each line, and neither has a check."""
+    mcu = plan["config"]["mcu"]
+    return not ("link_check" in mcu or "reply_period" in mcu or plan["board"])
+
+
+def _any(plan: Plan) -> bool:
+    return True
+
+
+def _without_check(plan: Plan) -> bool:
+    """Return whether the link has no check, so that each status line counts."""
+    return "link_check" not in plan["config"]["mcu"]
+
+
+def _may_be_ideal(plan: Plan) -> bool:
+    """Return whether the board's lag may be a few periods."""
+    config = plan["config"]
+    rate, gyro = config["control"]["rate"], config.get("odometry", {}).get("gyro")
+    return _is_plain(plan) and not gyro and isinstance(rate, float) and rate >= 20.0
+
+
+def _half_duplex(plan: Plan, dice: random.Random) -> None:
+    """Let the daemon hear its own lines beside the replies, while the motors have a load."""
+    _alone(plan, dice, _drives(plan, dice, 0.3, 1.0, 4.0))
+    fault = ["half_duplex", dice.choice((0.0, 0.2, 0.3, 0.5, 0.7))]
+    at, lasts = round(dice.uniform(2.0, 5.0), 3), round(dice.uniform(15.0, 30.0), 3)
+    plan["events"] = [{"at": at, "do": "board", "for": lasts, "fault": fault}]
+
+
+def _flip(plan: Plan, dice: random.Random) -> None:
+    """Flip a bit of a digit in the first line behind a silence, while the robot drives or stands."""
+    _alone(plan, dice, _drives(plan, dice, 2.5, 1.0, 4.0))
+    at = 3.0
+    while at < plan["seconds"] - 3.0:
+        lasts = round(dice.choice((dice.uniform(0.05, 0.95), dice.uniform(0.2, 0.9))), 3)
+        place = 8 * dice.randrange(4) + dice.choice((1, 2, 3, 3, 5, 6))
+        plan["events"] += [
+            {"at": round(at, 3), "do": "board", "for": lasts, "fault": ["mute"]},
+            {
+                "at": round(at + lasts / 2, 4), "do": "flip", "place": place,
+                "mask": dice.choice((1, 2, 4, 8)),
+            },
+        ]  # fmt: skip
+        at += dice.uniform(2.0, 6.0)
+
+
+def _ideal(plan: Plan, dice: random.Random) -> None:
+    """Give the board exact encoders, and a lag and an answer time that fit its period exactly."""
+    config = plan["config"]
+    lag = dice.choice((1, 2, 3, 4)) / config["control"]["rate"]
+    config["mcu"].pop("encoder_counts", None)
+    config["sim"]["encoder_counts"] = dice.choice((100_000, 300_000, 1_000_000))
+    config["sim"]["motor_time_constant"] = round(lag, 6)
+    plan["board"] = [["constant_answers", dice.choice((0.5, 1.3, 2.5))]]
+    _alone(plan, dice, _drives(plan, dice, 0.3, 1.0, 5.0))
+
+
+def _inputs(plan: Plan, dice: random.Random, names: tuple[str, ...]) -> str:
+    """Give the board one of these inputs, and no other, and return its name."""
+    config, name = plan["config"], dice.choice(names)
+    config.pop("battery", None)
+    config["safety"] = {}
+    plan["board"] = [one for one in plan["board"] if one[0] not in INPUTS]
+    if name == "bumpers":
+        config["safety"] = {"bumpers": [dice.choice(PLACES) for _ in range(dice.randint(1, 4))]}
+    plan["board"].append({"driver": ["driver_fault", NEVER_S, 1.0]}.get(name, [name]))
+    return name
+
+
+def _press(dice: random.Random, plan: Plan, name: str, lasts: float) -> list[Any]:
+    """Return a fault of the board that presses an input, or reports a fault of a motor driver."""
+    match name:
+        case "bumpers":
+            number = dice.randint(1, len(plan["config"]["safety"]["bumpers"]))
+            return ["bumper_pressed", number, 0.0, lasts]
+        case "estop":
+            return ["estop_pressed", 0.0, lasts]
+    return ["driver_fault", 0.0, lasts]
+
+
+def _named_stop(plan: Plan, dice: random.Random) -> None:
+    """Press an input of a robot that a client has stopped."""
+    _alone(plan, dice, _drives(plan, dice, 0.3, 1.0, 4.0))
+    name, at = _inputs(plan, dice, ("bumpers", "estop")), 4.0
+    while at < plan["seconds"] - 6.0:
+        via = dice.choice(("native", "native", "rmw", "bridge"))
+        by = f"op{dice.randrange(3)}"
+        plan["events"].append(_call(at, "stop", put=False, by=by, via=via))
+        lasts = dice.choice((0.01, 0.1, 1.0))
+        pressed = round(at + dice.choice((0.005, 0.05, 1.0)), 3)
+        fault = _press(dice, plan, name, lasts)
+        whole = round(lasts + 0.2, 3)
+        plan["events"] += [
+            {"at": pressed, "do": "board", "for": whole, "fault": fault},
+            _call(pressed + lasts + 0.5, "clear", named=True),
+            _call(pressed + lasts + 0.8, "clear", named=True),
+        ]
+        at += dice.uniform(8.0, 12.0)
+
+
+def _other_board(plan: Plan, dice: random.Random) -> None:
+    """Replace a board that reports a fault or a press by one that never reports this input."""
+    _alone(plan, dice, _drives(plan, dice, 0.3, 1.0, 4.0))
+    name = _inputs(plan, dice, ("driver", "estop"))
+    at, lasts = round(dice.uniform(3.0, 15.0), 3), round(dice.uniform(0.3, 3.0), 3)
+    gone = round(at + dice.uniform(0.05, 2.0), 3)
+    plan["events"] = [
+        {
+            "at": at, "do": "board", "for": plan["seconds"],
+            "fault": _press(dice, plan, name, plan["seconds"]),
+        },
+        {"at": gone, "do": "unplug", "for": lasts, "new": True, "without": [name]},
+        _call(gone + lasts + 5.0, "clear", named=True),
+        _call(gone + lasts + 6.0, "clear", named=True),
+    ]  # fmt: skip
+
+
+MOMENTS: dict[
+    str, tuple[float, Callable[[Plan], bool], Callable[[Plan, random.Random], None]]
+] = {
+    "late step": (0.05, _any, _late_step),
+    "half duplex": (0.03, _is_plain, _half_duplex),
+    "flip": (0.03, _is_plain, _flip),
+    "ideal board": (0.03, _may_be_ideal, _ideal),
+    "named stop": (0.02, _without_check, _named_stop),
+    "other board": (0.02, _without_check, _other_board),
 }
-"""The share of the plans that have each moment, and the function that makes them."""
+"""The share of the plans that have each moment, whether a plan can have it, and what makes it."""

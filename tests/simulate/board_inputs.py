@@ -335,6 +335,18 @@ class Inputs:
         """True time since when the battery certainly is empty."""
         self._came: deque[tuple[int, bytes]] = deque()
         self._held = b""
+        self._names: list[tuple[int, str]] = []
+        """Arrivals of the stops that clients have asked for since the last clear, and their
+        names."""
+
+    def replaced(self) -> None:
+        """Note that another board was plugged in, which does not report what this one did."""
+        self.estop, self.driver = _Input(), _Input()
+        self._doubt()
+
+    def asked(self, asked_ns: int, name: str) -> None:
+        """Note a stop that a client of this name asked for, and that has worked."""
+        self._names.append((asked_ns, name))
 
     def fed(self, at_ns: int, data: bytes) -> None:
         """Take bytes that reached the port, by the robot's clock."""
@@ -509,6 +521,7 @@ class Inputs:
             raise BrokenError("a press is a zero at once", true_ns, str(moving))
         self._drivers(true_ns, seen)
         self._answers(true_ns, seen, calm)
+        self._keeps_names(true_ns, seen)
         for name in self._needed:
             known = self.estop if name == "estop" else self.bumpers
             if known.awaited and (moving or seen.mode in ("ready", "driving")):
@@ -530,6 +543,16 @@ class Inputs:
         if seen.decided_ns - self._looked_ns > NS:
             self._looked_ns = seen.decided_ns
             self._state(true_ns, state(), seen.decided_ns)
+
+    def _keeps_names(self, true_ns: int, seen: Seen) -> None:
+        """Judge that the reason names a client that has stopped the robot, until a clear."""
+        if not self._names or seen.mode not in STOPPED:
+            self._names.clear()
+        elif seen.mode == "stopped" and not self._witness.pending:
+            self._witness.counts["names of stops"] += 1
+            if not any(name in seen.reason for _, name in self._names):
+                text = f"{[name for _, name in self._names]} asked, and it is {seen.reason!r}"
+                raise BrokenError("a stop keeps the name of its client", true_ns, text)
 
     def _drivers(self, true_ns: int, seen: Seen) -> None:
         """Judge the fault of a motor driver. A pressed emergency stop causes one that is none."""
@@ -639,6 +662,7 @@ class Inputs:
 
     def cleared(self, asked_ns: int) -> None:
         """Judge a clear that worked, at the step that has answered it."""
+        self._names = [one for one in self._names if one[0] > asked_ns]
         for name, pressed_ns in self._stopping():
             if asked_ns > pressed_ns:
                 text = f"pressed since {pressed_ns / NS:.3f} s"

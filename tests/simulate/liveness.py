@@ -238,6 +238,7 @@ class Liveness:
         run.run_to(run.true_ns + max(boots_ns, *run.witness.timeout.values()))
         if "battery" in run.plan["config"]:
             run.run_to(run.true_ns + CHARGED_NS)
+        clears_ns = run.true_ns
         for _ in range(3):
             verbs = {"fault": "clear", "stopped": "clear", "inactive": "activate"}
             verb = verbs.get(product.state()["mode"])
@@ -245,7 +246,7 @@ class Liveness:
                 run.call({"verb": verb, "named": True, "by": "op", "via": "native",
                             "late": 0.0, "lost": False, "twice": False})  # fmt: skip
             run.run_to(run.true_ns + NS // 10)
-        self._drive_lawfully()
+        self._drive_lawfully(clears_ns)
 
     def weigh(self) -> None:
         """Judge that nothing in the daemon has grown too long."""
@@ -258,7 +259,8 @@ class Liveness:
         if longest > LONGEST:
             raise BrokenError("memory is bounded", run.true_ns, f"a text of {longest} bytes")
 
-    def _drive_lawfully(self) -> None:
+    def _drive_lawfully(self, clears_ns: int) -> None:
+        """Have a lawful sender drive; an operator has cleared the latches from `clears_ns` on."""
         run = self.run
         plan, begin_ns = run.plan, run.true_ns
         source = plan["config"]["commands"]["sources"][0]["name"]
@@ -302,7 +304,7 @@ class Liveness:
             run.run_to(now_ns + step_ns)
         mode, reason = run.witness.mode, run.witness.reason
         moving = run.true_ns - run.moved_ns < NS // 5
-        if mode == "stopped" and run.witness.stops:
+        if mode == "stopped" and run.witness.stops and run.witness.stops[-1] > clears_ns:
             return  # a stop of the plan was still under way
         if mode == "inactive" and run.witness.offs and run.witness.offs[-1] > begin_ns:
             return  # a switching off of the plan was still under way (seed 182028330)

@@ -13,7 +13,7 @@ from tests.simulate.roads import NS
 LIARS = {
     "bias", "stuck_encoder", "frozen_encoder", "reversed_encoder", "reversed_motor", "dead_motor",
     "swapped_motors", "swapped_encoders", "bit_errors", "noise", "partial_line", "echo", "mute",
-    "free_running", "plain_only", "endless", "wrong_baud",
+    "free_running", "plain_only", "endless", "wrong_baud", "half_duplex",
 }  # fmt: skip
 """Board faults with which the encoders lie, or say nothing while the robot may move."""
 
@@ -29,6 +29,9 @@ GAP_NS = 3 * NS // 10
 
 MOVES = 0.1
 """Speed, m/s, from which on a robot certainly moves before a gap."""
+
+STANDS = 0.001
+"""Distance, m, and turn, rad, up to which the true pose has stayed the same."""
 
 VAGUE = 0.05
 """Variance, m2, from which on a gap may be lost in it: the variance of a robot whose heading is
@@ -101,8 +104,9 @@ class PoseWitness:
         self._last: tuple[int, Pose] | None = None
         self.latest: Pose | None = None
         """The pose of the last estimate, None if it was set since."""
-        self._before: tuple[int, Pose, Pose, float, float] | None = None
-        """Time, pose, true pose, true speed and variance at the last estimate before a silence."""
+        self._before: tuple[int, Pose, Pose, float, float, float] | None = None
+        """Time, pose, true pose, true speed and the variances of place and heading at the last
+        estimate before a silence."""
 
     def doubt(self, mute: bool = False) -> None:
         """The encoders missed a part of the drive: restart the comparison at the next estimate.
@@ -166,13 +170,13 @@ class PoseWitness:
             if not math.isfinite(ex + ey + eyaw + sum(covariance)):
                 raise BrokenError("the pose is finite", now_ns, f"{ex} {ey} {eyaw} {covariance}")
             self._one(now_ns, sampled_ns + offset_ns, (ex, ey, eyaw), covariance, lies)
-        sampled_ns, ex, ey, eyaw, (xx, _, _, yy, _, _), _ = estimates[-1]
+        sampled_ns, ex, ey, eyaw, (xx, _, _, yy, _, yawyaw), _ = estimates[-1]
         self.latest = ex, ey, eyaw
         if silent_only:
             last_ns = sampled_ns + offset_ns
             # After a stall, the sample may be much older than this step.
             true = self._true_at(last_ns)
-            self._before = true and (last_ns, self.latest, true, self._speed, xx + yy)
+            self._before = true and (last_ns, self.latest, true, self._speed, xx + yy, yawyaw)
 
     def end_step(self) -> bool:
         """Forget the pose if it was set in this step, and return whether it was."""
@@ -242,16 +246,20 @@ class PoseWitness:
     def _gap(
         self,
         now_ns: int,
-        before: tuple[int, Pose, Pose, float, float],
+        before: tuple[int, Pose, Pose, float, float, float],
         estimate: Any,
         offset_ns: int,
         true_ns: int,
         true: Pose,
     ) -> None:
         """Judge the first estimate after a gap: its covariance grew by the motion in the gap."""
-        then_ns, pose, true_then, speed, variance = before
-        sampled_ns, ex, ey, _, (xx, _, _, yy, _, _), _ = estimate
-        if sampled_ns + offset_ns - then_ns < GAP_NS or speed < MOVES:
+        then_ns, pose, true_then, speed, variance, yaw_variance = before
+        sampled_ns, ex, ey, eyaw, (xx, _, _, yy, _, yawyaw), _ = estimate
+        # A robot that stood may have been pushed in the gap, unless it stands where it stood.
+        stood = speed < MOVES
+        if sampled_ns + offset_ns - then_ns < (GAP_NS // 2 if stood else GAP_NS):
+            return
+        if stood and math.dist(true, true_then) > STANDS:
             return
         # A step that stands still reads older samples than its own time.
         if true_ns - sampled_ns > FRESH_NS:
@@ -269,6 +277,15 @@ class PoseWitness:
                 "a gap while moving is in the covariance",
                 now_ns,
                 f"{text}, sigma grew {sigma:.3f} m",
+            )
+        if not stood:
+            return
+        turned = abs(math.remainder(eyaw - pose[2], math.tau))
+        sigma = math.sqrt(max(0.0, yawyaw - yaw_variance))
+        if turned > SIGMAS * sigma + ROOM_RAD:
+            text = f"{turned:.3f} rad in {(sampled_ns + offset_ns - then_ns) / NS:.3f} s"
+            raise BrokenError(
+                "a robot that stands keeps its heading", now_ns, f"{text}, sigma {sigma:.3f}"
             )
 
     def _put(

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
+from itertools import repeat
 from typing import Any
 
 import msgspec
@@ -329,11 +330,19 @@ class Product:
             if name == "endless":
                 self._lasting.enter_context(mcu._with(ending=""))
                 continue
+            if name == "constant_answers":
+                self._lasting.enter_context(mcu._with(_processing=repeat(values[0])))
+                continue
+            if name == "half_duplex":
+                continue
             # The daemon's TX is joined to its RX, so nothing of the board arrives.
             fault = "mute" if name == "echo" else name
             self._lasting.enter_context(getattr(mcu, fault)(*values))
         self._garble(mcu, bauds[-1] if bauds else self._config.mcu.baud_rate)
         self.echo = any(name == "echo" for name, _ in faults)
+        for name, values in faults:
+            if name == "half_duplex":
+                self._half_duplex(mcu, *values)
 
     def _garble(self, mcu: FakeMcu, baud_rate: int) -> None:
         """Put a wire to this board on which its end has this baud rate."""
@@ -350,6 +359,33 @@ class Product:
             return garbled(kind.advance(mcu, at_ns), baud_rate, ours)
 
         vars(mcu).update(receive=receive, advance=advance)
+
+    def _half_duplex(self, mcu: FakeMcu, load: float) -> None:
+        """Let the daemon hear each of its lines beside the board's reply, and load the motors."""
+        receive = mcu.receive
+
+        def both(at_ns: int, data: bytes) -> None:
+            receive(at_ns, data)
+            if data.strip():
+                mcu._schedule(mcu._in_free_ns, "sent", data)
+
+        vars(mcu)["receive"] = both
+        mcu.vehicle.load = load
+        self._lasting.callback(vars(mcu).pop, "receive", None)
+        self._lasting.callback(setattr, mcu.vehicle, "load", 0.0)
+
+    def flip(self, place: int, mask: int) -> None:
+        """Have the wire flip bits of a character in the next speeds that the board reports."""
+        mcu = self._world.mcu
+        send = type(mcu)._send
+
+        def flipped(at_ns: int, data: bytes) -> None:
+            if data[:2] in (b"ap", b"an"):
+                vars(mcu).pop("_send", None)
+                data = data[:place] + bytes([data[place] ^ mask]) + data[place + 1 :]
+            send(mcu, at_ns, data)
+
+        vars(mcu)["_send"] = flipped
 
     def reset(self, deaf_ns: int) -> None:
         self._world.mcu.reset(self.now_ns, deaf_ns)

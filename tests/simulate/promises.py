@@ -56,6 +56,7 @@ STAND_NS = 2 * NS
 HARMLESS = {
     "mute", "noise", "partial_line", "lost_replies", "lost_commands", "slow_reply", "ftdi",
     "stalls", "sparse_replies", "echo", "plain_only", "endless", "wrong_baud", "reset", "suspend",
+    "flip",
 }  # fmt: skip
 """Troubles of the board for which the robot may not latch a fault."""
 
@@ -66,8 +67,10 @@ not obey is a fault. A wheel whose motor is dead first comes to rest, which may 
 CLEARLY = 4.0
 """rad/s. From this speed on, a wheel that does not obey cannot be taken for one that does."""
 
-DIALECTS = {"unpadded", "spaces", "trailing_comma", "no_sample", "no_check"}
-"""Forms of the protocol that give the daemon no trouble."""
+DIALECTS = {
+    "unpadded", "spaces", "trailing_comma", "no_sample", "no_check", "constant_answers",
+}  # fmt: skip
+"""Forms of the protocol, and habits of the board, that give the daemon no trouble."""
 
 INPUTS = {
     "estop", "estop_pressed", "estop_silent", "bumpers", "bumper_pressed", "bumpers_silent",

@@ -6,6 +6,7 @@ of its speed while the board says nothing.
 
 from __future__ import annotations
 
+import math
 from collections import Counter, deque
 from typing import Any
 
@@ -26,6 +27,9 @@ REFUSED_AS = {
 ECHO_LINES, ECHO_CHANGE = 40, 6.0
 """Lines with another speed, and rad/s of change in all, by which an echo is known as one: twice as
 many as the pages say, and three times the change."""
+
+ECHO_WAY = 0.5
+"""Way, m, by which the pose may be wrong until an echo beside a board is known."""
 
 
 class Reports:
@@ -124,13 +128,12 @@ def judge_counts(at_ns: int, state: dict[str, Any], expected: int) -> None:
         raise BrokenError("every command is counted", at_ns, text)
 
 
-class Echo:
-    """The lines while TX is joined to RX and no board answers."""
+class _Changes:
+    """The changes of speed in lines of which each is an echo."""
 
     def __init__(self) -> None:
         self.on = False
-        self._lines, self._change = 0, 0.0
-        self._last: tuple[float, ...] = ()
+        self.restart()
 
     def begin(self) -> None:
         """Note that from now on the daemon hears itself."""
@@ -139,16 +142,60 @@ class Echo:
 
     def restart(self) -> None:
         """Note that the daemon, or the opening of its port, begins anew."""
-        self._lines, self._change, self._last = 0, 0.0, ()
+        self._lines, self._change = 0, 0.0
+        self._last: tuple[float, ...] = ()
 
-    def line(self, at_ns: int, wheels: tuple[float, ...]) -> None:
-        """Judge a line: an echo through changes of speed is known as one."""
+    def take(self, wheels: tuple[float, ...]) -> bool:
+        """Take a line, and return whether the echo is surely known now."""
         if not self.on or wheels == self._last:
-            return
+            return False
         pairs = zip(wheels, self._last or wheels, strict=True)
         self._change += max(abs(new - old) for new, old in pairs)
         self._last = wheels
         self._lines += any(wheels)
-        if self._lines > ECHO_LINES and self._change > ECHO_CHANGE and any(wheels):
-            text = f"{self._lines} changes of speed, {self._change:.1f} rad/s in all, were an echo"
-            raise BrokenError("an echo is no board", at_ns, text)
+        return self._lines > ECHO_LINES and self._change > ECHO_CHANGE
+
+    @property
+    def text(self) -> str:
+        return f"{self._lines} changes of speed, {self._change:.1f} rad/s in all, were an echo"
+
+
+class Echo(_Changes):
+    """The lines while TX is joined to RX and no board answers."""
+
+    def line(self, at_ns: int, wheels: tuple[float, ...]) -> None:
+        """Judge a line: an echo through changes of speed is known as one."""
+        if self.take(wheels) and any(wheels):
+            raise BrokenError("an echo is no board", at_ns, self.text)
+
+
+class HalfDuplex(_Changes):
+    """The lines and the pose while the daemon hears its own lines beside those of the board.
+
+    The pose then has a part of the commanded motion. That must not stay unseen while the robot
+    drives at other speeds than the commanded ones.
+    """
+
+    def restart(self) -> None:
+        """Note that the daemon, or the opening of its port, begins anew."""
+        super().restart()
+        self._known = False
+        self._way = 0.0
+        self._before: tuple[float, ...] | None = None
+
+    def line(self, wheels: tuple[float, ...]) -> None:
+        """Take a line that went to the board."""
+        self._known |= self.take(wheels)
+
+    def see(
+        self, at_ns: int, mode: str, pose: tuple[float, ...], true: tuple[float, ...]
+    ) -> None:
+        """Judge a step: compare the ways since the echo began. Both tuples begin with x and y."""
+        before, self._before = self._before, (*pose[:2], *true[:2])
+        if before is None:
+            return
+        moved = math.hypot(pose[0] - before[0], pose[1] - before[1])
+        self._way += moved - math.hypot(true[0] - before[2], true[1] - before[3])
+        if self._known and mode == "driving" and abs(self._way) > ECHO_WAY:
+            text = f"{self.text}, and the pose has driven {self._way:.2f} m too far"
+            raise BrokenError("an echo beside a board is seen", at_ns, text)
