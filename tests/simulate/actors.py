@@ -115,8 +115,8 @@ class Run:
         self._link = ""
         """Names of the active faults that the plan has begun, without dialects."""
         self._fed_ns = 0
-        self._flipped = False
-        """The next line of the board has a flipped bit, so it may be lost or not."""
+        self._flipped = 0
+        """Number of lines of the board up to one with a flipped bit, which may be lost or not."""
         self._ended = b""
         """The last byte of the board that reached the daemon."""
         self._rest = b""
@@ -396,8 +396,8 @@ class Run:
             case "tear":
                 product.tear(event["taken"])
             case "flip":
-                product.flip(event["place"], event["mask"])
-                self._flipped = True
+                product.flip(event["place"], event["mask"], event["behind"])
+                self._flipped = event["behind"] + 1
                 self._troubled("flip")
                 self.damage.forget()
             case "stall" | "stall in step":
@@ -586,7 +586,7 @@ class Run:
         self.witness.reported(true_ns, lines)
         gap_ns = true_ns - self._fed_ns
         if self._flipped:
-            self._flipped = False
+            self._flipped -= 1
             self.liveness.event(NS // 2)
         if not self._plain and gap_ns > 6 * NS // 10:
             # The next good line is the first one with the check, for which the daemon asks again.

@@ -205,20 +205,29 @@ def _half_duplex(plan: Plan, dice: random.Random) -> None:
 
 
 def _flip(plan: Plan, dice: random.Random) -> None:
-    """Flip a bit of a digit in the first line behind a silence, while the robot drives or stands."""
+    """Flip a bit of a digit in one of the first lines behind a silence or a clear."""
     _alone(plan, dice, _drives(plan, dice, 2.5, 1.0, 4.0))
-    at = 3.0
-    while at < plan["seconds"] - 3.0:
-        lasts = round(dice.choice((dice.uniform(0.05, 0.95), dice.uniform(0.2, 0.9))), 3)
-        place = 8 * dice.randrange(4) + dice.choice((1, 2, 3, 3, 5, 6))
-        plan["events"] += [
-            {"at": round(at, 3), "do": "board", "for": lasts, "fault": ["mute"]},
-            {
-                "at": round(at + lasts / 2, 4), "do": "flip", "place": place,
-                "mask": dice.choice((1, 2, 4, 8)),
-            },
-        ]  # fmt: skip
-        at += dice.uniform(2.0, 6.0)
+    at = 4.0
+    while at < plan["seconds"] - 6.0:
+        place = 8 * dice.randrange(4) + dice.choice((1, 2, 2, 2, 3, 5, 6))
+        flip: Event = {
+            "do": "flip", "place": place, "mask": dice.choice((1, 2, 4, 8, 8)),
+            "behind": dice.choice((0, 0, 1, 2, 3)),
+        }  # fmt: skip
+        if dice.random() < 0.5:
+            lasts = round(dice.uniform(0.2, 0.9), 3)
+            plan["events"] += [
+                {"at": round(at, 3), "do": "board", "for": lasts, "fault": ["mute"]},
+                {"at": round(at + lasts / 2, 4), **flip},
+            ]
+        else:
+            clear = round(at + dice.uniform(2.0, 3.0), 3)
+            plan["events"] += [
+                _call(at, "stop", put=False),
+                _call(clear, "clear", named=True),
+                {"at": round(clear + 0.01 + dice.uniform(-0.015, 0.005), 4), **flip},
+            ]
+        at += dice.uniform(4.0, 7.0)
 
 
 def _ideal(plan: Plan, dice: random.Random) -> None:

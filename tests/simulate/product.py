@@ -374,13 +374,19 @@ class Product:
         self._lasting.callback(vars(mcu).pop, "receive", None)
         self._lasting.callback(setattr, mcu.vehicle, "load", 0.0)
 
-    def flip(self, place: int, mask: int) -> None:
-        """Have the wire flip bits of a character in the next speeds that the board reports."""
+    def flip(self, place: int, mask: int, behind: int) -> None:
+        """Have the wire flip bits of a character in the speeds that the board reports.
+
+        The next lines, as many as `behind` says, stay whole, and only the one behind them has that.
+        """
         mcu = self._world.mcu
-        send = type(mcu)._send
+        send, left = type(mcu)._send, behind
 
         def flipped(at_ns: int, data: bytes) -> None:
-            if data[:2] in (b"ap", b"an"):
+            nonlocal left
+            speeds = data[:2] in (b"ap", b"an")
+            left -= speeds
+            if speeds and left < 0:
                 vars(mcu).pop("_send", None)
                 data = data[:place] + bytes([data[place] ^ mask]) + data[place + 1 :]
             send(mcu, at_ns, data)
