@@ -31,7 +31,7 @@ from tests.simulate.product import START_NS, WALL_OFFSET_NS, Product, Seen
 from tests.simulate.promises import DIALECTS, INPUTS, BrokenError, Witness
 from tests.simulate.reasons import Reasons
 from tests.simulate.reports import Echo, HalfDuplex, Reports, judge_pose, judge_state
-from tests.simulate.roads import NS, Message, messages, parameters, read_reply, sample
+from tests.simulate.roads import FOREIGN, NS, Message, messages, parameters, read_reply, sample
 from tests.simulate.spread import Spread
 
 RELEASING = {"clear", "activate", "deactivate", "set"}
@@ -208,6 +208,9 @@ class Run:
             queue.reverse()
             if queue:
                 self._next(sender, queue)
+            if sender["name"] in self.liveness.lawful and sender["way"] in FOREIGN:
+                for _, at, *_ in sender["clock"]:
+                    self.at(int(at * NS), lambda: self.liveness.event(TROUBLE_NS))
         several = (name for name, count in seen.items() if count > 1)
         self.witness.shared_clocks = frozenset(several)
         for event in plan["events"]:

@@ -135,17 +135,13 @@ def _meeting(dice: random.Random, at: float, source: str, away: bool) -> list[Ev
             events.append({"at": round(at + 0.001, 4), "do": "reset", "deaf": deaf})
         case 1:
             open_s = dice.choice((0.0, 0.002))
-            events.append(
-                {"at": round(at + 0.001, 4), "do": "unplug", "for": open_s, "new": False}
-            )
+            events.append({"at": round(at + 0.001, 4), "do": "unplug", "for": open_s, "new": False})
         case _:
             after = round(0.001 + dice.uniform(0.0, first_s + second_s), 4)
             lasts = dice.choice((0.005, 0.03, 0.5))
             fault = ["bumper_pressed", dice.randint(1, 2), after, lasts]
             whole = round(after + lasts + 0.1, 4)
-            events.append(
-                {"at": round(at - 0.001, 4), "do": "board", "for": whole, "fault": fault}
-            )
+            events.append({"at": round(at - 0.001, 4), "do": "board", "for": whole, "fault": fault})
     return events
 
 
@@ -160,7 +156,9 @@ def _alone(plan: Plan, dice: random.Random, phases: list[list[Any]]) -> dict[str
     return driver
 
 
-def _drives(plan: Plan, dice: random.Random, rests: float, shortest: float, longest: float) -> list[Any]:
+def _drives(
+    plan: Plan, dice: random.Random, rests: float, shortest: float, longest: float
+) -> list[Any]:
     """Return phases that rest for `rests` s or more, and then drive, over and over."""
     rests += plan["config"]["commands"].get("neutral_pause", 1.0)
     phases: list[list[Any]] = []
@@ -301,14 +299,83 @@ def _other_board(plan: Plan, dice: random.Random) -> None:
     ]  # fmt: skip
 
 
-MOMENTS: dict[
-    str, tuple[float, Callable[[Plan], bool], Callable[[Plan, random.Random], None]]
-] = {
+def _slow_sender(plan: Plan, dice: random.Random) -> None:
+    """Let a sender that keeps all rules send a command every few seconds, within its timeout."""
+    source = _best(plan)
+    source["timeout"] = dice.choice((2.0, 5.0, 5.0, 10.0))
+    every = source["timeout"] * dice.uniform(0.2, 0.45)
+    plan["seconds"] = max(plan["seconds"], 90.0)
+    phases = _drives(plan, dice, 5.0 * every, 5.0 * every, 12.0 * every)
+    driver = _alone(plan, dice, phases)
+    way = dice.choice(("client", "client", "page", "plain", "signed", "rmw"))
+    driver |= {"way": way, "hz": round(1.0 / every, 4), "seldom": True, "heals": True}
+
+
+def _set_back(plan: Plan, dice: random.Random) -> None:
+    """Set a foreign clock back while a message is lost, or while all messages come twice."""
+    _best(plan)["timeout"] = dice.choice((0.25, 0.5))
+    driver = _alone(plan, dice, [])
+    phases, clock, holes, at = [[0.0, 0.0, 0.0], [2.5, *_speed(dice)]], [], [], 8.0
+    period = 1.0 / driver["hz"]
+    while at < plan["seconds"] - 4.0:
+        at = round(at, 3)
+        clock.append(
+            ["step", at, -round(1.0 + dice.choice((3.0, 30.0, 3600.0)) * dice.random(), 3)]
+        )
+        match dice.randrange(4):
+            case 0 | 1:
+                holes.append([at, round(at + period * 1.01, 4)])
+            case 2:
+                holes.append([round(at + period, 4), round(at + period * 2.01, 4)])
+        zero = at + 3.0
+        for _ in range(3):
+            phases += [[round(zero, 3), 0.0, 0.0], [round(zero + 1.5, 3), *_speed(dice)]]
+            zero += 6.0
+        at += dice.uniform(20.0, 30.0)
+    driver |= {
+        "way": dice.choice(("signed", "rmw")),
+        "phases": phases,
+        "clock": clock,
+        "holes": holes,
+    }
+    driver["heals"] = True
+    if dice.random() < 0.4:
+        driver |= {"doubled": 0.003, "holes": []}
+
+
+def _routed(plan: Plan, dice: random.Random) -> None:
+    """Let two programs without an id send through a router that is not linked to the robot."""
+    plan["config"]["commands"]["neutral_first"] = True
+    _best(plan)["timeout"] = dice.choice((0.25, 0.5, 1.0))
+    first = _alone(plan, dice, [])
+    ahead = round(dice.uniform(-0.4, 0.3), 3)
+    first |= {"way": "routed", "ahead": ahead, "drift": 0.0}
+    first["routers"] = [[0.0, "session of a far router"]]
+    second = first | {"name": "s1", "id": f"s1/{dice.getrandbits(64):016x}"}
+    first["phases"] = [[0.0, 0.0, 0.0]]
+    if dice.random() < 0.5:
+        first["phases"] = _drives(plan, dice, 0.5, 1.0, 4.0)
+    first["hz"] = dice.choice((10.0, 20.0))
+    speeds, at = [], 0.0
+    while at < plan["seconds"]:
+        # The other program never sends a zero.
+        speeds.append([round(at, 3), *_speed(dice)])
+        at += dice.uniform(2.0, 10.0)
+        if dice.random() < 0.3:
+            speeds.append([round(at, 3), None, None])
+            at += dice.choice((0.5, 3.0))
+    plan["senders"] = [first, second | {"phases": speeds}]
+
+
+MOMENTS: dict[str, tuple[float, Callable[[Plan], bool], Callable[[Plan, random.Random], None]]] = {
     "late step": (0.05, _any, _late_step),
     "half duplex": (0.03, _is_plain, _half_duplex),
     "flip": (0.03, _is_plain, _flip),
     "ideal board": (0.03, _may_be_ideal, _ideal),
     "named stop": (0.02, _without_check, _named_stop),
     "other board": (0.02, _without_check, _other_board),
+    "slow sender": (0.03, _any, _slow_sender),
+    "clock set back": (0.02, _any, _set_back),
+    "routed": (0.02, _any, _routed),
 }
 """The share of the plans that have each moment, whether a plan can have it, and what makes it."""

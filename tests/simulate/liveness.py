@@ -42,7 +42,12 @@ CHARGED_NS = 15 * NS
 """The mean of a battery that was empty rises above all thresholds within this time."""
 
 PAUSE_NS = 3 * NS // 20
-"""Longest time between two commands of a sender that does not pause."""
+"""Longest time between two commands of a sender that does not pause, unless it sends more seldom
+than ten times a second."""
+
+PROOF_COUNT = 4
+"""Number of commands that a new sender needs for its proof, if it sends so seldom that they take
+longer than `PROOF_NS`."""
 
 UNSHARED = (*STEADY, "plain", "bridge")
 """Ways without a foreign clock, whose adjustment would ask its sender for a zero."""
@@ -80,6 +85,14 @@ class Liveness:
         self._began: dict[str, int] = {}
         """Time of the first command behind each lawful sender's last silence."""
         self._latest: dict[str, tuple[int, str]] = {}
+        self._pauses = {
+            one["name"]: max(PAUSE_NS, int(1.2 * NS / one["hz"])) for one in run.plan["senders"]
+        }
+        """Longest time between two commands of each sender that does not pause."""
+        self._proofs = {
+            one["name"]: max(PROOF_NS, int(PROOF_COUNT * NS / one["hz"]))
+            for one in run.plan["senders"]
+        }
         self._followed_ns: dict[str, int] = {}
         """When the robot last followed each of these senders."""
 
@@ -126,14 +139,15 @@ class Liveness:
             return
         wish = self.run.witness.wishes[-1][1]
         before_ns, _ = self._latest.get(name, (0, ""))
-        if wish.arrived_ns - before_ns > PAUSE_NS:
+        if wish.arrived_ns - before_ns > self._pauses[name]:
             self._since.pop(name, None)
             self._began[name] = wish.arrived_ns
         self._take_zero(name, wish)
         if not self._is_armed(name) or not (wish.v or wish.w):
             self._since.pop(name, None)
         else:
-            self._since.setdefault(name, max(wish.arrived_ns, self._began.get(name, 0) + PROOF_NS))
+            proved_ns = self._began.get(name, 0) + self._proofs[name]
+            self._since.setdefault(name, max(wish.arrived_ns, proved_ns))
         self._latest[name] = wish.arrived_ns, sample.identity
 
     def _is_armed(self, name: str) -> bool:
@@ -154,12 +168,12 @@ class Liveness:
         priority = run.witness.priority
         rivals = [s for s in run.plan["senders"] if s["name"] != sender["name"]]
         return (
-            sender["way"] in ("client", "page", "plain", "bridge")
+            (sender["way"] in ("client", "page", "plain", "bridge") or sender.get("heals", False))
             and not any(sender[bad] for bad in ("junk", "churn", "loss", "twice", "swap"))
             and not sender["congestion"]
             and not sender.get("bad_stamps")
             and sender["jitter"] < 0.01
-            and sender["hz"] >= 10.0
+            and (sender["hz"] >= 10.0 or "seldom" in sender)
             and sender["hz"] * run.witness.timeout[sender["source"]] / NS > 2.0
             and not any(rival["junk"] or rival["churn"] for rival in rivals)
             and all(priority[r["source"]] < priority[sender["source"]] for r in rivals)
@@ -177,7 +191,7 @@ class Liveness:
         for name, since_ns in self._since.items():
             heard_ns, identity = self._latest[name]
             quiet = now_ns - self._event_ns > SETTLES_NS
-            if quiet and now_ns - since_ns > NS and now_ns - heard_ns < PAUSE_NS:
+            if quiet and now_ns - since_ns > NS and now_ns - heard_ns < self._pauses[name]:
                 run.counts["lawful looks"] += 1
                 if now_ns - run.moved_ns > NS // 2:
                     text = f"{identity} since {since_ns / NS:.3f} s; {run.witness.reason}"

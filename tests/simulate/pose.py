@@ -278,7 +278,7 @@ class PoseWitness:
                 now_ns,
                 f"{text}, sigma grew {sigma:.3f} m",
             )
-        if not stood:
+        if not stood or self._drifts:
             return
         turned = abs(math.remainder(eyaw - pose[2], math.tau))
         sigma = math.sqrt(max(0.0, yawyaw - yaw_variance))

@@ -96,6 +96,9 @@ class _Heard:
         self.armed_ns = -1
         self.clock: _Clock | None = None
         self.foreign = self.shared = False
+        self.own = True
+        """The identity is certainly the sender's own, or certainly not. A router that the robot
+        does not know stamps like a session, so the robot may let such a zero wait for its pause."""
         self.stamped = False
         """A program of this identity has stamped its commands: its zeros may have been late."""
 
@@ -144,7 +147,7 @@ class Reasons:
         heard.arrived_ns, heard.armed_ns = at_ns, wish.armed_ns
         heard.shared = one.shared
         heard.stamped |= bool(one.clock)
-        heard.foreign = sender["way"] in FOREIGN
+        heard.foreign, heard.own = sender["way"] in FOREIGN, sender["way"] != "zenoh"
         if wish.v or wish.w:
             heard.speed_ns = at_ns
         if not one.clock:
@@ -247,7 +250,7 @@ class Reasons:
                     found.add("proof")
             since_ns = max(self._calm_ns, self._dropped_ns.get(source, -1) if heard.shared else -1)
             armed = heard.armed_ns > since_ns and certain
-            if witness.neutral_first and not armed:
+            if witness.neutral_first and not (armed and heard.own):
                 found.add("neutral")
         mine = witness.priority[source]
         for other, priority in witness.priority.items():

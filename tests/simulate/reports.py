@@ -187,9 +187,7 @@ class HalfDuplex(_Changes):
         """Take a line that went to the board."""
         self._known |= self.take(wheels)
 
-    def see(
-        self, at_ns: int, mode: str, pose: tuple[float, ...], true: tuple[float, ...]
-    ) -> None:
+    def see(self, at_ns: int, mode: str, pose: tuple[float, ...], true: tuple[float, ...]) -> None:
         """Judge a step: compare the ways since the echo began. Both tuples begin with x and y."""
         before, self._before = self._before, (*pose[:2], *true[:2])
         if before is None:

@@ -74,7 +74,7 @@ def messages(sender: dict[str, Any], seed: int, seconds: float, wall_ns: int) ->
             number += 1
             late = sender["delay"] + _jitter(sender["jitter"], chance[0]) + _held(sender, t)
             arrives_ns = int((t + late) * NS)
-            lost = chance[1] < sender["loss"]
+            lost = chance[1] < sender["loss"] or _is_in_hole(sender, t)
             junk = kinds[int(chance[2] * 1e6) % len(kinds)] if chance[3] < sender["junk"] else ""
             if not lost:
                 arrives_ns = last_ns = max(last_ns + 1000, arrives_ns)
@@ -89,6 +89,9 @@ def messages(sender: dict[str, Any], seed: int, seconds: float, wall_ns: int) ->
                 if chance[5] < sender["twice"]:
                     again_ns = arrives_ns + int(chance[0] * 0.4 * NS)
                     found.append(message._replace(arrives_ns=again_ns))
+                if "doubled" in sender:
+                    again_ns = arrives_ns + int(sender["doubled"] * NS)
+                    found.append(message._replace(arrives_ns=again_ns))
         hz = _hz(sender, t)
         t += (0.9 + 0.2 * chance[0]) / hz if sender["jitter"] else 1 / hz
     end_ns = int((seconds + 0.2) * NS)
@@ -101,6 +104,11 @@ def _hz(sender: dict[str, Any], t: float) -> float:
         if begin <= t < end:
             return float(hz)
     return float(sender["hz"])
+
+
+def _is_in_hole(sender: dict[str, Any], t: float) -> bool:
+    """Return whether the network loses a message that is sent at `t`."""
+    return any(begin <= t < end for begin, end in sender.get("holes", ()))
 
 
 def _jitter(scale: float, chance: float) -> float:
