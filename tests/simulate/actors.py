@@ -316,6 +316,8 @@ class Run:
         if verb == "stop":
             witness.stops.append(true_ns)
             if event.get("put"):
+                put_by = event["by"] if via == "native" else ""
+                self.inputs.asked(true_ns, named(put_by, "native"))
                 product.deliver(at_ns, "stop", b"", via="native", attachment=attachment)
                 return
         self._ticket += 1
@@ -732,9 +734,12 @@ class Run:
 def named(by: str, via: str) -> str:
     """Return the words by which `state` names a client that stopped the robot.
 
-    A client on a native key is named by the SHA-256 of its id, others are unnamed.
+    A client on a native key is named by the SHA-256 of its id. Others, and one without an id, are
+    unnamed.
     """
-    return hashlib.sha256(by.encode()).hexdigest()[:16] if via == "native" else f"unnamed ({via}"
+    if via == "native" and by:
+        return hashlib.sha256(by.encode()).hexdigest()[:16]
+    return f"unnamed ({via}"
 
 
 def disarms(event: dict[str, Any]) -> bool:

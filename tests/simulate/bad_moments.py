@@ -372,10 +372,10 @@ MOMENTS: dict[str, tuple[float, Callable[[Plan], bool], Callable[[Plan, random.R
     "half duplex": (0.03, _is_plain, _half_duplex),
     "flip": (0.03, _is_plain, _flip),
     "ideal board": (0.03, _may_be_ideal, _ideal),
-    "named stop": (0.02, _without_check, _named_stop),
+    "stop beside a press": (0.02, _without_check, _named_stop),
     "other board": (0.02, _without_check, _other_board),
     "slow sender": (0.03, _any, _slow_sender),
     "clock set back": (0.02, _any, _set_back),
-    "routed": (0.02, _any, _routed),
+    "behind a router": (0.02, _any, _routed),
 }
 """The share of the plans that have each moment, whether a plan can have it, and what makes it."""

@@ -40,9 +40,9 @@ FAULT_MINUTES, CASE_MINUTES = 10.0, 30.0
 FIRST_SEED = 1
 
 MEASURED_WITH = (
-    "plan", "roads", "actors", "ages", "bad_moments", "board_inputs", "course", "damage", "followed", "jerk",
-    "liveness", "log_lines", "plugging", "pose", "product", "promises", "reasons", "reports",
-    "spread",
+    "plan", "roads", "actors", "ages", "bad_moments", "board_inputs", "course", "damage",
+    "followed", "jerk", "liveness", "log_lines", "plugging", "pose", "product", "promises",
+    "reasons", "reports", "spread",
 )  # fmt: skip
 """Modules of the simulator that make the plans, play them and judge them."""
 
@@ -199,8 +199,9 @@ breaks a promise of the sound product does not count. Core-minutes are the proce
 process that plays, on a machine that other work kept busy.
 
 For a fault of the emergency stop, of bumpers that let the robot drive away, of a motor driver, or
-of the battery, only plans with this input are played, about one in fifteen. For a fault that only a
-late step with several events shows, only plans with such steps are played. A fault must be found within {fault:g}
+of the battery, only plans with this input are played, about one in fifteen. For a fault that only
+a late step with several events shows, only plans with such steps are played. A fault must be
+found within {fault:g}
 core-minutes, a case within {case:g}. A row keeps its last measurement. Its last column is the
 version of the simulator that measured it: a digest of the modules that make, play and judge plans.
 With the present plans, another seed may find an older row's fault. `--again` prints the present

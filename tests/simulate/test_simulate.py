@@ -26,6 +26,7 @@ from tests.simulate import __main__ as main
 from tests.simulate import pairs, shrink
 from tests.simulate.actors import Result, Run, played
 from tests.simulate.ages import Ages
+from tests.simulate.bad_moments import MOMENTS, NEW
 from tests.simulate.board_inputs import Inputs, kinds
 from tests.simulate.course import Course
 from tests.simulate.damage import Damage
@@ -40,7 +41,7 @@ from tests.simulate.pose import PoseWitness
 from tests.simulate.product import Disk, Product, Seen, problems
 from tests.simulate.promises import ZERO, BrokenError, Witness
 from tests.simulate.reasons import Reasons, kind_of
-from tests.simulate.reports import Echo, Reports, judge_pose
+from tests.simulate.reports import Echo, HalfDuplex, Reports, judge_pose
 from tests.simulate.roads import BAD_STAMPS, NS, Message, Sample, messages, parameters, sample
 from tests.simulate.spread import Spread
 from tests.simulate.unjudged import Unjudged
@@ -1640,3 +1641,65 @@ def test_a_listed_difference_is_taken_out_on_both_sides() -> None:
         for words in ("waiting for a command: now", "no command: now")
     ]
     assert steps[0] == steps[1] == {"at": 1, "reason": "X: now"}
+
+
+def with_moment(name: str) -> Plan:
+    """The first plan with this moment."""
+    return next(p for p in map(made, range(2000)) if p.get("moment") == name)
+
+
+@pytest.mark.parametrize("name", MOMENTS)
+def test_a_plan_with_a_moment_is_legal_and_an_older_product_knows_its_faults(name: str) -> None:
+    plan = with_moment(name)
+    assert problems(plan["config"]) == []
+    assert plan == json.loads(json.dumps(plan))
+    less = pairs.comparable(plan)
+    names = {event.get("fault", [event["do"]])[0] for event in less["events"]}
+    assert not (names | {fault[0] for fault in less["board"]}) & NEW
+
+
+def test_an_echo_beside_a_board_is_a_finding_only_if_the_pose_is_wrong_for_long() -> None:
+    one = HalfDuplex()
+    one.begin()
+    one.see(0, "driving", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    for n in range(50):
+        one.line((n / 5, n / 5, n / 5, n / 5))
+    one.see(NS, "driving", (1.0, 0.0, 0.0), (0.6, 0.0, 0.0))
+    one.see(2 * NS, "waiting", (2.0, 0.0, 0.0), (1.2, 0.0, 0.0))
+    with pytest.raises(BrokenError, match="an echo beside a board is seen"):
+        one.see(3 * NS, "driving", (2.1, 0.0, 0.0), (1.2, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(("yaw", "finding"), [(0.0, False), (0.5, True)])
+def test_a_heading_that_jumps_while_the_robot_stands_is_a_finding(
+    yaw: float, finding: bool
+) -> None:
+    pose = PoseWitness(PLAIN["config"])
+    small = (1e-6, 0.0, 0.0, 1e-6, 0.0, 1e-6)
+    for n, at_ns in enumerate((0, 10_000_000, 20_000_000, 500_000_000)):
+        estimate = (at_ns, 0.0, 0.0, yaw * (n == 3), small, ())
+        judged = pytest.raises(BrokenError, match="stands keeps its heading")
+        with judged if finding and n == 3 else nullcontext():
+            pose.see(at_ns, [estimate], (at_ns, 0.0, 0.0, 0.0, 0.0), 0, set())
+
+
+def test_a_reason_without_the_client_that_stopped_the_robot_is_a_finding() -> None:
+    witness = Witness(PLAIN["config"])
+    inputs = Inputs(witness, reports=True)
+    step = Seen(0, 0, "stopped", "stopped by op1 (native)", None, "up", [], ())
+    witness.stops = [0]
+    inputs.asked(0, "op1")
+    inputs.step(1, step, 0, True, dict)
+    pressed = Seen(2, 2, "stopped", "front bumper pressed", None, "up", [], ())
+    with pytest.raises(BrokenError, match="a stop keeps the name of its client"):
+        inputs.step(2, pressed, 0, True, dict)
+
+
+def test_a_message_in_a_hole_is_lost_and_every_message_of_a_doubling_network_comes_twice() -> None:
+    sender = driven()["senders"][0]
+    numbers = [one.number for one in messages(sender, 0, 2.0, 0)]
+    holes = [one.number for one in messages(sender | {"holes": [[0.5, 0.7]]}, 0, 2.0, 0)]
+    twice = [one.number for one in messages(sender | {"doubled": 0.003}, 0, 2.0, 0)]
+    assert 0 < len(holes) < len(numbers)
+    assert set(holes) < set(numbers)
+    assert sorted(twice) == sorted(numbers * 2)
