@@ -4,6 +4,10 @@
 daemon does not use such a line, and several in a row are a fault. If more than one line in a
 hundred is impossible, the daemon logs a warning: either the wire damages lines, or a bound is too
 low and true lines are rejected. `wheel_faults.py` checks whether the wheels obey their commands.
+
+A plain line has no checksum, so the last possible line may itself be damaged, and then the true
+lines after it look impossible. It is trusted only if it agreed with the line before it. Until then,
+two later lines that agree with each other outvote it.
 """
 
 from __future__ import annotations
@@ -12,6 +16,7 @@ import math
 from operator import sub
 
 from acsard.core.config.settings import FeedbackConfig
+from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
 from acsard.core.values import WHEELS, Event, WheelSpeeds
 
@@ -40,11 +45,21 @@ speed."""
 
 
 class Sanity:
-    """Compares each feedback line with the last line that was physically possible."""
+    """Compares each feedback line with the last line that was physically possible.
+
+    A line that contradicts that line is still possible if that line is not trusted and the new line
+    agrees with one of the last impossible lines.
+    """
 
     def __init__(self, feedback: FeedbackConfig) -> None:
         self._settings = feedback
         self._last: WheelSpeeds | None = None
+        self._trusted = False
+        """Whether `_last` differs so little from the line before it that a line with the earlier
+        speeds would be possible after it."""
+        self._rejected: list[tuple[WheelSpeeds, float]] = []
+        """The last impossible lines since `_last`, each with its time since `_last`, s. Lines over
+        `feedback.wheel_speed` are left out."""
         self._since = 0.0
         self._longest = 0.0
         """Longest time over which a recent line reports the mean speed, s. A line that covers a
@@ -56,8 +71,11 @@ class Sanity:
         """The warning of too many impossible lines. None unless the last line caused it."""
 
     def forget(self) -> None:
-        """Start over, because the link was lost or a fault has been cleared."""
-        self._last, self._since, self._longest, self._impossible = None, 0.0, 0.0, 0
+        """Start over, because the link was lost or a fault has been cleared.
+
+        The next line is still compared with the last one, but that line is not trusted.
+        """
+        self._trusted, self._impossible = False, 0
 
     @property
     def doubtful(self) -> bool:
@@ -77,13 +95,46 @@ class Sanity:
         self._longest = max(longest, since)
         if feedback.gap:
             self._last = None
-        why = self._objection(feedback, longest)
+            self._rejected.clear()
+        speeds, last = feedback.speeds, self._last
+        wheels = speeds.as_tuple()
+        change = 0.0 if last is None else max(map(abs, map(sub, wheels, last.as_tuple())))
+        most = self._most(self._since, longest)
+        why = ""
+        if max(map(abs, wheels)) > self._settings.wheel_speed or change > most:
+            # Nearly no line comes here. Only these lines need a look at the quantization steps.
+            why = self._too_fast(feedback)
+            if not why and last is not None:
+                why = self._jump(feedback, last, most)
+                if why:
+                    agrees = not self._trusted and self._agrees(feedback, longest)
+                    self._rejected = [*self._rejected[1 - REPEATED :], (speeds, self._since)]
+                    why = "" if agrees else why
         self._count(why)
         if why:
             self._impossible += 1
             return why
-        self._last, self._since, self._impossible = feedback.speeds, 0.0, 0
+        # If this line is damaged, the next line changes by `change` again. It is allowed a change
+        # over half of `_longest` at least.
+        self._trusted = last is not None and change <= self._most(0.0, self._longest)
+        self._last, self._since, self._impossible = speeds, 0.0, 0
+        if self._rejected:
+            self._rejected.clear()
         return ""
+
+    def _most(self, since: float, longest: float) -> float:
+        """Return the largest change of a speed within `since` s, rad/s.
+
+        `longest` is the longest time over which one of the lines before reports the mean speed, s.
+        """
+        return self._settings.wheel_acceleration * max(since, (since + longest) / 2) + SLACK
+
+    def _agrees(self, line: Feedback, longest: float) -> bool:
+        """Return whether a line agrees with one of the last impossible lines."""
+        return any(
+            not self._jump(line, speeds, self._most(self._since - since, longest))
+            for speeds, since in self._rejected
+        )
 
     def _count(self, why: str) -> None:
         """Count a line in the window, and set the warning if it is due."""
@@ -104,31 +155,36 @@ class Sanity:
             'mcu.link_check = "auto" protects each line with a checksum'
         )
 
-    def _objection(self, line: Feedback, longest: float) -> str:
-        speeds, fastest = line.speeds, self._settings.wheel_speed
-        before = speeds if self._last is None else self._last
-        seconds = max(self._since, (self._since + longest) / 2)
-        most = self._settings.wheel_acceleration * seconds + SLACK
-        wheels, then_wheels = speeds.as_tuple(), before.as_tuple()
-        changes = map(abs, map(sub, wheels, then_wheels))
-        if max(map(abs, wheels)) <= fastest and max(changes) <= most:
-            return ""  # Nearly every line ends here, without regard to quantization steps.
-        turned = line.counted if line.turned is None else line.turned
-        rows = zip(WHEELS, wheels, then_wheels, line.steps, turned or wheels, strict=True)
-        for name, now, then, step, angle in rows:
-            size, change = abs(now), abs(now - then)
+    def _too_fast(self, line: Feedback) -> str:
+        """Return why a speed in this line is too high, "" if none is."""
+        wheels, fastest = line.speeds.as_tuple(), self._settings.wheel_speed
+        turned = _proven(line)
+        for name, now, step, angle in zip(
+            WHEELS, wheels, line.steps, turned or wheels, strict=True
+        ):
             # A quantization step allows excess speed only if encoder counts prove the step. A
             # faulty encoder may show any step.
-            room = 0.0
+            size, room = abs(now), 0.0
             if line.count and turned is not None:
                 # If the line reports n counts, n - 1 of them certainly occurred in its time.
                 room = size * min(1.0, line.count / abs(angle)) if angle else size
-                step = max(step, line.count / SHORTEST_S)
             elif turned is not None and step < math.inf:
                 room = step
             if size > fastest + room:
                 return f"{name} at {now:.2f} rad/s is over feedback.wheel_speed"
-            if change > most + STEPS * step:
+        return ""
+
+    def _jump(self, line: Feedback, before: WheelSpeeds, most: float) -> str:
+        """Return why a speed in this line differs too much from `before`, "" if none does."""
+        least = line.count / SHORTEST_S if _proven(line) is not None else 0.0
+        rows = zip(WHEELS, line.speeds.as_tuple(), before.as_tuple(), line.steps, strict=True)
+        for name, now, then, step in rows:
+            if abs(now - then) > most + STEPS * max(step, least):
                 leap = f"{name} jumps from {then:.2f} to {now:.2f} rad/s"
                 return f"{leap}, which is over feedback.wheel_acceleration"
         return ""
+
+
+def _proven(line: Feedback) -> Motors | None:
+    """Return the angles that encoder counts prove for this line, rad, None without counts."""
+    return line.counted if line.turned is None else line.turned

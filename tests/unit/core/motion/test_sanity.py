@@ -114,6 +114,87 @@ def test_new_or_after_forgetting_it_takes_three_impossible_lines(forget: bool) -
     assert found == [False, False, True]
 
 
+# trust
+
+SPIKE = only(2, 79.0)
+
+
+def verdicts(sanity: Sanity, *lines: Feedback) -> list[bool]:
+    """Return for each line whether it is possible, and check that none makes a fault."""
+    possible = []
+    for each in lines:
+        possible.append(sanity.impossible(each) == "")
+        assert not sanity.doubtful
+    return possible
+
+
+def test_the_line_before_a_lost_link_is_still_compared_after_it() -> None:
+    sanity = Sanity(FeedbackConfig())
+    sanity.impossible(line(STILL))
+    sanity.forget()
+    assert verdicts(sanity, line(SPIKE), line(STILL)) == [False, True]
+
+
+def test_a_damaged_first_line_is_outvoted_by_the_next_two() -> None:
+    sanity = Sanity(FeedbackConfig())
+    lines = [line(each) for each in (SPIKE, STILL, STILL, STILL)]
+    assert verdicts(sanity, *lines) == [True, False, True, True]
+
+
+@pytest.mark.parametrize("speed", [-79.0, -42.0, -10.0, 10.0, 42.0, 79.0])
+@pytest.mark.parametrize("seconds", [0.03, 0.04, 0.06, 0.1, 0.6])
+def test_a_damaged_line_that_covers_a_pause_is_no_fault_of_the_true_lines(
+    seconds: float, speed: float
+) -> None:
+    sanity = Sanity(FeedbackConfig())
+    lines = [line(STILL), line(STILL), line(only(1, speed), dt=seconds)]
+    possible = verdicts(sanity, *lines, *[line(STILL)] * 5)
+    assert possible[4:] == [True] * 4
+
+
+def test_a_damaged_line_before_the_encoders_are_known_is_no_fault_of_the_true_lines() -> None:
+    sanity, unknown = Sanity(FeedbackConfig()), stepping(SPIKE, math.inf)
+    assert verdicts(sanity, line(STILL), unknown, *[line(STILL)] * 4)[3:] == [True] * 3
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_of_a_wire_that_damages_every_second_line_the_true_lines_are_found(first: int) -> None:
+    sanity, wild = Sanity(FeedbackConfig()), (79.0, -60.0, 35.0, -79.0, 60.0, -35.0)
+    lines = []
+    for speed in wild:
+        lines += [line(only(2, speed)), line(STILL)]
+    assert verdicts(sanity, *lines[first:])[3 - first :: 2] == [True] * 5
+
+
+def test_a_speed_that_no_wheel_reaches_agrees_with_nothing() -> None:
+    sanity, fast = Sanity(FeedbackConfig()), line(only(0, 80.1))
+    sanity.impossible(line(SPIKE))
+    assert [bool(sanity.impossible(fast)) for _ in range(3)] == [True] * 3
+    assert sanity.doubtful
+
+
+def test_a_jump_from_a_speed_that_two_lines_agreed_on_is_a_fault_even_if_it_lasts() -> None:
+    sanity = Sanity(FeedbackConfig())
+    sanity.impossible(line(STILL))
+    sanity.impossible(line(STILL))
+    assert [bool(sanity.impossible(line(SPIKE))) for _ in range(3)] == [True] * 3
+    assert sanity.doubtful
+
+
+def test_lines_that_agree_with_no_other_are_a_fault_from_the_first_on() -> None:
+    sanity, found = Sanity(FeedbackConfig()), []
+    for speed in (20.0, 79.0, -79.0, -30.0):
+        sanity.impossible(line(only(3, speed)))
+        found.append(sanity.doubtful)
+    assert found == [False, False, False, True]
+
+
+def test_after_a_gap_nothing_from_before_it_is_compared() -> None:
+    sanity = Sanity(FeedbackConfig())
+    verdicts(sanity, line(STILL), line(STILL), line(SPIKE))
+    assert verdicts(sanity, line(STILL, dt=0.0, gap=2.0), line(SPIKE)) == [True, False]
+
+
 # coarse encoders
 
 
