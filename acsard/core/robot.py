@@ -295,9 +295,11 @@ class Robot:
             self._odometry.checks.hear(inputs.gyro)
         if not feedback:
             return ()
-        return tuple(
-            [estimate for line in feedback if (estimate := self._believe(line, now, events))]
-        )
+        return tuple([
+            self._believe(believed, now, events)
+            for line in feedback
+            for believed in self._plausible(line, now, events)
+        ])  # fmt: skip
 
     def _forget(self) -> None:
         self._sanity.forget()
@@ -371,18 +373,33 @@ class Robot:
         age_s = (now_ns - status_ns) / NS_PER_S
         return shown(self.session.status) | {"age_s": f"{age_s:.1f}"}
 
-    def _believe(self, line: Feedback, now: Instant, events: list[Event]) -> Estimate | None:
-        """Update the odometry and return the estimate, or None if the line is impossible."""
+    def _plausible(self, line: Feedback, now: Instant, events: list[Event]) -> list[Feedback]:
+        """Return the lines that may change the odometry now: `line`, with lines held back, or none.
+
+        An impossible line is rejected. A line that fills a gap waits until others confirm it.
+        """
         why = self._sanity.impossible(line)
         if self._sanity.warning is not None:
             events.append(self._sanity.warning)
         if why:
-            self.counters["line_implausible"] += 1
-            events.append(Event("lines_rejected", why, "warning", kind="implausible", news=False))
+            self._reject(why, 1, events)
             self._odometry.skip(line)
             if self._sanity.doubtful:
                 self._fault(f"the board reports impossible speeds: {why}", now, events)
-            return None
+            return []
+        lines, dropped = self._odometry.confirmed(line)
+        if dropped:
+            self._reject("the lines after it contradict its speeds", dropped, events)
+        return lines
+
+    def _reject(self, why: str, count: int, events: list[Event]) -> None:
+        self.counters["line_implausible"] += count
+        events.append(
+            Event("lines_rejected", why, "warning", kind="implausible", count=count, news=False)
+        )
+
+    def _believe(self, line: Feedback, now: Instant, events: list[Event]) -> Estimate:
+        """Update the odometry with a plausible line, and return the estimate."""
         checks = self._odometry.checks
         wheels = checks.wheels
         # A pressed emergency stop cuts the motors' power, so wheels that ignore the speeds are no

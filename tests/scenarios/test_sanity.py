@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 import random
 from collections import Counter
 from contextlib import nullcontext
@@ -12,7 +14,7 @@ import pytest
 from acsard.core.config.contradictions import contradictions
 from acsard.core.config.settings import Config, LimitsConfig, McuConfig, SimConfig, WheelMap
 from acsard.core.simulator.faults import Fault
-from acsard.core.values import NS_PER_S, WHEELS
+from acsard.core.values import NS_PER_S, WHEELS, Received
 from tests.scenarios.world import World
 
 
@@ -89,6 +91,97 @@ def test_minutes_of_driving_about_raise_no_false_alarm(world: World) -> None:
         world.send(0.0)
         world.run(0.2 + i % 3)
     assert "fault" not in {event.name for event in world.events}
+
+
+# damage
+
+
+def damage(world: World, silence: float, number: int, place: int, bits: int) -> None:
+    """Lose all replies for `silence` s, and flip bits in one reply after that.
+
+    It is the reply with this `number`, the first being 1, and `bits` is a mask of the bits to flip
+    in its byte at `place`.
+    """
+    feed, begun_ns, replies = world.port.feed, world.now_ns, itertools.count(1)
+
+    def through_the_wire(received: Received) -> None:
+        if received.at.mono_ns < begun_ns + silence * NS_PER_S:
+            return
+        data = bytearray(received.data)
+        if next(replies) == number:
+            data[place] ^= bits
+        feed(Received(received.at, bytes(data)))
+
+    world.port.feed = through_the_wire  # type: ignore[method-assign]
+
+
+def off_by(world: World) -> tuple[float, float]:
+    """Return the error of the pose in m and in rad."""
+    pose, true = world.state, world.mcu.vehicle.pose
+    turned = math.remainder(pose.yaw - true.yaw, math.tau)
+    return math.dist((pose.x, pose.y), (true.x, true.y)), abs(turned)
+
+
+TENS, ONES = (2, 10, 18, 26), (3, 11, 19, 27)
+"""Places of the tens and of the ones digits of the four speeds in a reply."""
+
+FLIPS = [(TENS[0], 8), (TENS[1], 1), (ONES[2], 8), (ONES[3], 2)]
+ALL_FLIPS = [(place, 1 << bit) for place in range(33) for bit in range(8)]
+
+
+@pytest.mark.variations(6)
+@pytest.mark.parametrize("drives", [False, True])
+@pytest.mark.parametrize("silence", [0.06, 0.2, 0.3, 0.6, 0.9])
+@pytest.mark.parametrize(
+    "flips", [FLIPS, pytest.param(ALL_FLIPS, marks=pytest.mark.soak)], ids=["some", "all"]
+)
+def test_a_bit_flipped_in_the_first_line_after_a_silence_costs_no_more_than_the_silence(
+    drives: bool, silence: float, flips: list[tuple[int, int]]
+) -> None:
+    ends = []
+    for place, bits in [(0, 0), *flips]:
+        world = World()
+        world.run(1.0)
+        if drives:
+            world.drive(0.5, 0.8, seconds=1.0)
+        damage(world, silence, 1, place, bits)
+        for _ in range(20):
+            if drives:
+                world.send(0.5, 0.8)
+            world.run(0.1)
+        assert told(world, "fault") == []
+        ends.append(off_by(world))
+    metres, turned = zip(*ends, strict=True)
+    assert max(metres) < metres[0] + 0.02
+    assert max(turned) < turned[0] + 0.06
+
+
+@pytest.mark.parametrize("number", [1, 2, 3, 4])
+def test_a_bit_flipped_while_the_link_returns_is_no_fault(number: int) -> None:
+    world = World()
+    world.run(1.0)
+    for _ in range(3):  # the quantization steps are learned
+        world.drive(0.5, 0.5, seconds=1.0)
+        world.run(1.5)
+    damage(world, 0.3, number, TENS[0], 8)
+    world.run(2.0)
+    assert (world.state.mode, told(world, "fault")) == ("ready", [])
+
+
+def test_a_bit_flipped_in_the_first_line_after_clear_is_no_fault_and_does_not_turn_the_pose(
+    world: World,
+) -> None:
+    for _ in range(3):
+        world.drive(0.5, 0.5, seconds=1.0)
+        world.run(1.5)
+    world.put("stop", b"")
+    world.run(2.5)
+    yaw = world.state.yaw
+    damage(world, 0.0, 1, TENS[0], 8)
+    assert world.call("clear").success
+    world.run(1.0)
+    assert (world.state.mode, told(world, "fault")) == ("ready", [])
+    assert world.state.yaw == pytest.approx(yaw, abs=0.01)
 
 
 # hands

@@ -6,17 +6,25 @@ recovered from the speeds in the line, or these speeds times the time. It uses e
 count exactly once. In a gap that no line covers, it assumes the speed before the gap for the first
 half of the gap, and the speed after the gap for the second half. If the daemon commanded rest
 during the gap, it assumes the speed before the gap only until that command. The motion during
-implausible lines is computed with the next plausible line.
+implausible lines, and in the gaps before them, is computed with the next plausible line.
+
+A damaged line after a gap would falsify the motion of the whole gap. `Confirmation` therefore holds
+a line with a doubtful speed until other lines confirm this speed or refute it.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from operator import sub
 
 from msgspec import Struct
 
+from acsard.core.config.settings import FeedbackConfig
 from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
+from acsard.core.motion.error_model import SMOOTHED
+from acsard.core.motion.sanity import SLACK, STEPS
 from acsard.core.values import REST, Twist, WheelSpeeds
 
 MAX_LOST_S, MAX_LOST = 0.05, 1
@@ -68,17 +76,27 @@ class Rolling:
     def __init__(self, quiet: float = math.inf) -> None:
         """Start. The daemon commands rest after `quiet` s without feedback."""
         self._quiet = quiet
-        self._lost = self._gap = self._counted = 0.0
+        self._lost = self._gap = self._bridged = self._counted = 0.0
         """Times, s, covered by implausible lines without counts (`_lost`), by the gaps before these
-        lines (`_gap`), and by implausible lines with counts (`_counted`)."""
+        lines (`_bridged` if they can be filled, else `_gap`), and by implausible lines with counts
+        (`_counted`)."""
         self._turned, self._skipped = NOWHERE, 0
+
+    @property
+    def skipped(self) -> float:
+        """Time that the last implausible lines without counts cover, s, with the gaps before them.
+
+        It is 0 after a plausible line.
+        """
+        return self._lost + self._gap + self._bridged
 
     def skip(self, line: Feedback) -> None:
         """Remember an implausible line: its counts, or its duration if it has no counts."""
         self._skipped += 1
         if line.turned is None:
-            self._lost += line.dt
+            self._lost += line.dt - line.bridged
             self._gap += line.gap
+            self._bridged += line.bridged
         else:
             self._counted += line.dt
             self._turned = plus(self._turned, line.turned)
@@ -88,7 +106,7 @@ class Rolling:
 
         `before` contains the wheel speeds of the last plausible line, rad/s.
         """
-        speeds, dt, bridged = line.speeds.as_tuple(), line.dt, line.bridged
+        speeds, dt, bridged = line.speeds.as_tuple(), line.dt, line.bridged + self._bridged
         if not (self._skipped or bridged or line.gap or line.turned is not None):
             # Nearly every line takes this shortcut. The code below gives the same result for it.
             seen = times(speeds, dt)
@@ -98,15 +116,18 @@ class Rolling:
         # long.
         guessed = self._lost <= MAX_LOST_S or self._skipped <= MAX_LOST
         lost, unknown = (self._lost, 0.0) if guessed else (0.0, self._lost)
-        turned, unknown, known = self._turned, unknown + self._gap, lost + self._counted + dt
+        filled = self._bridged
+        turned, unknown, known = (
+            self._turned, unknown + self._gap, lost + filled + self._counted + dt,
+        )  # fmt: skip
         if self._skipped:
-            self._lost = self._gap = self._counted = 0.0
+            self._lost = self._gap = self._bridged = self._counted = 0.0
             self._turned, self._skipped = NOWHERE, 0
         if line.turned is not None:
-            pieces, seen, seconds = _some(times(speeds, lost)), line.turned, dt
+            pieces, seen, seconds = _some(times(speeds, lost + filled)), line.turned, dt
             turned, bridged = plus(turned, line.turned), 0.0
         else:
-            unknown, seconds = unknown + line.gap, lost + dt
+            unknown, seconds = unknown + line.gap, lost + filled + dt
             seen = said = times(speeds, seconds - bridged)
             pieces = _some(said)
             if line.counted is not None:
@@ -130,6 +151,83 @@ def plus(a: Motors, b: Motors) -> Motors:
 def times(a: Motors, factor: float) -> Motors:
     """Return the angles or speeds of all wheels times a factor."""
     return a[0] * factor, a[1] * factor, a[2] * factor, a[3] * factor
+
+
+class Confirmation:
+    """Holds back a line with a doubtful speed that counts for longer than usual.
+
+    After a gap, one damaged line would falsify the motion of the whole gap. Such damage shows,
+    because it changes one wheel alone, and both wheels of a side change their speeds alike. Let A
+    be the largest angle by which a damaged line of the usual duration can falsify the motion of a
+    wheel. A line is used at once if no wheel has changed alone by a speed that could falsify the
+    motion by more than A. Otherwise it is held, and the next line decides:
+
+    - If it agrees with the held line to that degree, both are used. A wheel did change alone.
+    - If it agrees with the last line that was used, the held line is dropped.
+
+    If it agrees with neither, the third line decides: a line that differs much more from the other
+    two than they do from each other is dropped. The time of a dropped line counts as a gap.
+    """
+
+    def __init__(self, feedback: FeedbackConfig) -> None:
+        self._acceleration = feedback.wheel_acceleration
+        self._period = 0.0
+        """Usual time between two lines, s, 0 before the first one."""
+        self._held: list[Feedback] = []
+        self._seconds = 0.0
+        """Time that the held lines cover, s, with the gaps before them."""
+
+    def look(
+        self,
+        line: Feedback,
+        skipped: float,
+        before: WheelSpeeds,
+        believed: Callable[[Motors], Motors],
+    ) -> tuple[list[Feedback], list[Feedback]]:
+        """Return the lines to use now, the oldest first, and the lines to drop.
+
+        Args:
+            line: The next plausible line.
+            skipped: The time that the implausible lines directly before it cover, s, with the gaps
+                before them.
+            before: The wheel speeds of the last line that was used, rad/s.
+            believed: The function that replaces the speeds of wheels that are known to be faulty.
+        """
+        period, held, seconds = self._period, self._held, line.dt + line.gap + skipped
+        if not held and (seconds <= 2 * period or not period or line.turned is not None):
+            self._period = period + SMOOTHED * (seconds - period) if period else seconds
+            return [line], []
+        self._seconds = seconds = seconds + (self._seconds if held else 0.0)
+        most = (self._acceleration * period + SLACK) * period / seconds
+        used, now = believed(before.as_tuple()), believed(line.speeds.as_tuple())
+        lines, three = [*held, line], [*[believed(one.speeds.as_tuple()) for one in held], now]
+        kept = lines
+        if len(lines) == 3:
+            nearest = [min(_alone(a, b, line.steps) for b in three if b is not a) for a in three]
+            least = 2 * min(nearest) + most
+            kept = [one for one, off in zip(lines, nearest, strict=True) if off <= least]
+        elif _alone(now, three[0] if held else used, line.steps) > most:
+            if not held or _alone(now, used, line.steps) > most:
+                held.append(line)
+                return [], []
+            kept = [line]
+        held.clear()
+        return kept, [one for one in lines if one not in kept]
+
+
+def _alone(a: Motors, b: Motors, steps: Motors) -> float:
+    """Return the largest change of one wheel that the other wheel of its side does not share.
+
+    `a` and `b` are wheel speeds, rad/s. A change that `steps` explain, the known quantization steps
+    of the speeds, does not count.
+    """
+    changes = tuple(map(sub, a, b))
+    # The wheels i and 3 - i in `WHEELS` order are those of one side.
+    rows = zip(changes, reversed(changes), steps, strict=True)
+    return max(
+        max(0.0, min(abs(own), abs(own - other)) - (STEPS * step if step < math.inf else 0.0))
+        for own, other, step in rows
+    )
 
 
 class Gaps:

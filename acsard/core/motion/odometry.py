@@ -19,13 +19,21 @@ from collections import deque
 from itertools import takewhile
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from acsard.core.config.settings import FeedbackConfig, OdometryConfig
 from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
 from acsard.core.motion.consistency import ConsistencyChecks
 from acsard.core.motion.error_model import ErrorModel, TwistUncertainty
-from acsard.core.motion.gap_filling import NOWHERE, Gaps, Rolled, Rolling, plus
+from acsard.core.motion.gap_filling import (
+    NOWHERE,
+    Confirmation,
+    Gaps,
+    Rolled,
+    Rolling,
+    plus,
+)
 from acsard.core.motion.gyro import REST_S, Turn
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.learned_track import CONFIGURED, Track
@@ -82,6 +90,7 @@ class Odometry:
         self._kinematics, self._track = kinematics, CONFIGURED
         self._positions = NOWHERE
         self._rolling = Rolling(quiet)
+        self._confirmation = Confirmation(feedback)
         self._held = NOWHERE
         """Angles that the wheels have rolled at rest, rad. They are not added to the pose until
         they exceed two encoder counts or the robot drives (see `_unsettled`)."""
@@ -155,6 +164,18 @@ class Odometry:
         encoder counts, these counts are used.
         """
         self._rolling.skip(feedback)
+
+    def confirmed(self, feedback: Feedback) -> tuple[list[Feedback], int]:
+        """Return the lines for `fold`, the oldest first, and the number of lines that were dropped.
+
+        `feedback` is the next possible line. It is held if it covers a long time with a speed that
+        no other wheel and no other line confirms yet.
+        """
+        rolling, believed = self._rolling, self.checks.wheels.believed
+        lines, dropped = self._confirmation.look(feedback, rolling.skipped, self.speeds, believed)
+        for line in dropped:
+            rolling.skip(replace(line, bridged=line.dt))
+        return lines, len(dropped)
 
     def fold(self, feedback: Feedback) -> Estimate:
         """Advance the pose by one feedback line, and return the new estimate.

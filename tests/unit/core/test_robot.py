@@ -1387,6 +1387,36 @@ def test_lines_that_cannot_be_true_are_told_as_rejected() -> None:
     assert names(bench.step())[0] == "lines_rejected"
 
 
+def silence(bench: Bench, speed: float) -> Bench:
+    """Let the board be silent for 0.3 s, and then report this speed of one wheel of four."""
+    reply, bench.reply = bench.reply, None
+    for _ in range(30):
+        bench.step()
+    bench.reply = bench.codec.encode(WheelSpeeds(0.0, speed, 0.0, 0.0))
+    bench.step()
+    bench.reply = reply
+    return bench
+
+
+def test_after_a_silence_a_line_that_the_next_one_refutes_is_rejected() -> None:
+    bench = silence(Bench().linked(), 40.0)
+    assert bench.out.estimates == ()
+    (event,) = [event for event in bench.step().events if event.name == "lines_rejected"]
+    assert event.text == "implausible: the lines after it contradict its speeds"
+    assert [(each.pose, each.speeds) for each in bench.out.estimates] == [(Pose(), STILL)]
+    assert bench.counters()["line_implausible"] == 1
+    assert bench.step().link == "up"
+
+
+def test_after_a_silence_a_line_that_the_next_one_confirms_is_used_with_it() -> None:
+    bench = silence(Bench().linked(), 40.0)
+    bench.reply = bench.codec.encode(WheelSpeeds(0.0, 40.0, 0.0, 0.0))
+    first, second = bench.step().estimates
+    assert first.at.mono_ns < second.at.mono_ns
+    assert first.speeds == second.speeds == WheelSpeeds(0.0, 40.0, 0.0, 0.0)
+    assert "line_implausible" not in bench.counters()
+
+
 # fault
 
 

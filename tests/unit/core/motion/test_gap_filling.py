@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
 
+from acsard.core.config.settings import FeedbackConfig
+from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
-from acsard.core.motion.gap_filling import GUESS, MAX_LOST_S, NOWHERE, SPAN, Gaps, Rolled, Rolling
-from acsard.core.values import REST, Instant, Twist, WheelSpeeds
+from acsard.core.motion.gap_filling import (
+    GUESS,
+    MAX_LOST_S,
+    NOWHERE,
+    SPAN,
+    Confirmation,
+    Gaps,
+    Rolled,
+    Rolling,
+)
+from acsard.core.values import REST, STILL, Instant, Twist, WheelSpeeds
 
 AT = Instant(0, 0)
 FOUR = WheelSpeeds(4.0, 4.0, 4.0, 4.0)
@@ -125,6 +137,141 @@ def test_counts_passed_over_behind_a_silence_are_added_once() -> None:
     first, second = (rolling.take(Feedback(AT, FOUR, 0.01, turned=turned), TWO) for _ in range(2))
     assert first.turned == all_four(0.12)
     assert second.turned == turned
+
+
+def test_a_gap_before_a_line_passed_over_lies_between_the_speeds_around_it() -> None:
+    rolling = Rolling()
+    rolling.skip(Feedback(AT, TWO, 0.51, bridged=0.5))
+    rolled = rolling.take(Feedback(AT, FOUR, 0.01), TWO)
+    assert total(rolled) == pytest.approx(0.5 * 3.0 + 0.02 * 4.0)
+    assert (rolled.seconds, rolled.bridged) == near(0.52, 0.5)
+    assert (rolled.known, rolled.unknown) == near(0.52, 0.0)
+    assert total(rolling.take(Feedback(AT, FOUR, 0.01), FOUR)) == pytest.approx(0.04)
+
+
+def test_a_gap_before_a_line_passed_over_goes_on_at_the_next_lines_speed_if_that_has_counts() -> (
+    None
+):
+    rolling, turned = Rolling(), (0.06, 0.06, 0.06, 0.06)
+    rolling.skip(Feedback(AT, TWO, 0.51, bridged=0.5))
+    rolled = rolling.take(Feedback(AT, FOUR, 0.01, turned=turned), TWO)
+    assert total(rolled) == pytest.approx(0.06 + 0.51 * 4.0)
+    assert (rolled.known, rolled.bridged) == near(0.52, 0.0)
+
+
+# doubtful lines
+
+
+def one(index: int, speed: float, others: float = 4.0) -> WheelSpeeds:
+    return WheelSpeeds(*[speed if i == index else others for i in range(4)])
+
+
+class Doubtful:
+    """A `Confirmation` after one line at 100 Hz, with the numbers of the lines that it returns."""
+
+    def __init__(self, before: WheelSpeeds = FOUR) -> None:
+        self.confirmation, self.before, self.lines = Confirmation(FeedbackConfig()), before, 0
+        self.hear(before, 0.01)
+
+    def hear(self, speeds: WheelSpeeds, dt: float, **more: Any) -> tuple[list[int], list[int]]:
+        """Return the numbers of the lines to use and to drop after a further line."""
+        self.lines += 1
+        line = Feedback(Instant(self.lines, 0), speeds, dt, **more)
+        used, dropped = self.confirmation.look(line, self.skipped, self.before, self.believed)
+        if used:
+            self.before = used[-1].speeds
+        return [each.at.mono_ns for each in used], [each.at.mono_ns for each in dropped]
+
+    skipped = 0.0
+
+    @staticmethod
+    def believed(wheels: Motors) -> Motors:
+        return wheels
+
+
+@pytest.mark.parametrize("wheel", range(4))
+@pytest.mark.parametrize("gap", [{"dt": 0.51, "bridged": 0.5}, {"dt": 0.0, "gap": 1.5}])
+def test_a_wheel_that_changes_alone_in_a_gap_is_refuted_by_the_next_line(
+    wheel: int, gap: dict[str, float]
+) -> None:
+    doubtful = Doubtful()
+    assert doubtful.hear(one(wheel, 14.0), **gap) == ([], [])
+    assert doubtful.hear(FOUR, 0.01) == ([3], [2])
+    assert doubtful.hear(one(wheel, 14.0), 0.01) == ([4], []), "a usual line is used at once"
+
+
+def test_a_wheel_that_changes_alone_in_a_gap_is_confirmed_by_the_next_line() -> None:
+    doubtful = Doubtful()
+    assert doubtful.hear(one(1, 14.0), 0.51, bridged=0.5) == ([], [])
+    assert doubtful.hear(one(1, 14.1), 0.01) == ([2, 3], [])
+
+
+def test_wheels_of_a_side_that_change_alike_in_a_gap_need_no_other_line() -> None:
+    doubtful = Doubtful()
+    assert doubtful.hear(WheelSpeeds(40.0, -9.0, -9.2, 40.1), 0.51, bridged=0.5) == ([2], [])
+
+
+def test_a_doubtful_angle_no_larger_than_that_of_a_usual_line_is_used_at_once() -> None:
+    # (1500 rad/s2 x 10 ms + 2 rad/s) x 10 ms / 0.51 s is 0.333 rad/s.
+    assert Doubtful().hear(one(2, 4.33), 0.51, bridged=0.5) == ([2], [])
+    assert Doubtful().hear(one(2, 4.34), 0.51, bridged=0.5) == ([], [])
+
+
+def test_known_quantization_steps_make_no_line_doubtful() -> None:
+    for steps, used in (((5.0,) * 4, [2]), ((math.inf,) * 4, [])):
+        assert Doubtful().hear(one(2, 14.0), 0.51, bridged=0.5, steps=steps) == (used, [])
+
+
+def test_a_pause_without_lost_lines_is_judged_like_a_gap() -> None:
+    doubtful = Doubtful()
+    assert doubtful.hear(one(0, 14.0), 0.3) == ([], [])
+    assert doubtful.hear(FOUR, 0.01) == ([3], [2])
+
+
+def test_lines_passed_over_belong_to_the_time_of_the_next_one() -> None:
+    doubtful = Doubtful()
+    doubtful.skipped = 0.5
+    assert doubtful.hear(one(0, 14.0), 0.01) == ([], [])
+
+
+def test_a_line_with_counts_is_used_at_once() -> None:
+    assert Doubtful().hear(one(0, 14.0), 0.51, turned=(0.0,) * 4) == ([2], [])
+
+
+@pytest.mark.parametrize(
+    ("speeds", "used", "dropped"),
+    [
+        ((9.0, 8.0, 7.0), [2, 3, 4], []),
+        ((40.0, 8.0, 7.8), [3, 4], [2]),
+        ((9.0, 40.0, 8.8), [2, 4], [3]),
+        ((9.0, 8.5, 40.0), [2, 3], [4]),
+    ],
+    ids=["none", "first", "second", "third"],
+)
+def test_of_three_lines_the_one_that_differs_much_is_dropped(
+    speeds: tuple[float, ...], used: list[int], dropped: list[int]
+) -> None:
+    """A wheel changes alone, because the encoder of the other one is dead."""
+    doubtful = Doubtful(STILL)
+    said = [doubtful.hear(one(3, speed, 0.0), 0.01 + gap, bridged=gap)
+            for speed, gap in zip(speeds, (0.5, 0.0, 0.0), strict=True)]  # fmt: skip
+    assert said == [([], []), ([], []), (used, dropped)]
+
+
+def test_a_wheel_that_is_known_to_be_faulty_makes_no_line_doubtful() -> None:
+    doubtful = Doubtful()
+    doubtful.believed = lambda wheels: (wheels[3], *wheels[1:])  # type: ignore[method-assign]
+    assert doubtful.hear(one(0, 0.0, 14.0), 0.51, bridged=0.5) == ([2], [])
+
+
+def test_on_a_slow_link_the_usual_time_is_longer() -> None:
+    slow = Doubtful()
+    slow.confirmation = Confirmation(FeedbackConfig())
+    for _ in range(3):
+        assert slow.hear(FOUR, 0.1) == ([slow.lines], [])
+    assert slow.hear(one(1, 70.0), 0.1) == ([5], [])
+    assert slow.hear(one(1, 4.0), 0.1) == ([6], [])
+    assert slow.hear(one(1, 70.0), 0.6, bridged=0.5) == ([], [])
 
 
 CRUISE = Twist(0.5, 0.5)

@@ -50,6 +50,9 @@ def feedback(left: float, right: float, dt: float, gap: float = 0.0) -> Feedback
     return Feedback(AT, WheelSpeeds(right, left, left, right), dt, gap)
 
 
+LATER = feedback(20.0, 20.0, 0.01)
+
+
 def same_pose(got: Pose, expected: Three, tolerance: float = 1e-9) -> bool:
     """Return whether poses are equal within `tolerance`, ignoring whole turns of yaw."""
     turn = math.remainder(got.yaw - expected[2], math.tau)
@@ -508,6 +511,23 @@ def test_a_skipped_line_leaves_its_time_to_the_next() -> None:
     estimate = robot.fold(feedback(10.0, 10.0, 0.01))
     assert estimate.pose.x == pytest.approx(0.01)
     assert robot.fold(feedback(10.0, 10.0, 0.01)).pose.x == pytest.approx(0.015)
+
+
+@pytest.mark.parametrize("bridged", [0.0, 0.5])
+def test_a_damaged_line_that_covers_a_long_time_leaves_this_time_to_the_next(
+    bridged: float,
+) -> None:
+    """That time lies between the speeds before it and after it, as in a gap."""
+    robot = odometry()
+    robot.fold(feedback(10.0, 10.0, 0.01))
+    assert robot.confirmed(feedback(20.0, 20.0, 0.01)) == ([feedback(20.0, 20.0, 0.01)], 0)
+    damaged = Feedback(AT, WheelSpeeds(60.0, 20.0, 20.0, 20.0), 0.51, bridged=bridged)
+    assert robot.confirmed(damaged) == ([], 0)
+    lines, dropped = robot.confirmed(msgspec.structs.replace(LATER, at=Instant(1, 1)))
+    estimates, before = [robot.fold(each) for each in lines], 0.005
+    assert (len(estimates), dropped) == (1, 1)
+    assert estimates[0].pose.yaw == 0.0
+    assert robot.pose.x - before == pytest.approx((15.0 * 0.51 + 20.0 * 0.01) * 0.05)
 
 
 def test_more_than_50_ms_of_skipped_lines_are_a_gap() -> None:
