@@ -24,7 +24,7 @@ from acsard.core.config.settings import FeedbackConfig
 from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
 from acsard.core.motion.error_model import SMOOTHED
-from acsard.core.motion.sanity import SLACK, STEPS
+from acsard.core.motion.sanity import SLACK
 from acsard.core.values import REST, Twist, WheelSpeeds
 
 MAX_LOST_S, MAX_LOST = 0.05, 1
@@ -218,16 +218,15 @@ class Confirmation:
 def _alone(a: Motors, b: Motors, steps: Motors) -> float:
     """Return the largest change of one wheel that the other wheel of its side does not share.
 
-    `a` and `b` are wheel speeds, rad/s. A change that `steps` explain, the known quantization steps
-    of the speeds, does not count.
+    `a` and `b` are wheel speeds, rad/s. A change by one of the known quantization `steps` of the
+    speeds does not count.
     """
-    changes = tuple(map(sub, a, b))
+    changes, largest = tuple(map(sub, a, b)), 0.0
     # The wheels i and 3 - i in `WHEELS` order are those of one side.
-    rows = zip(changes, reversed(changes), steps, strict=True)
-    return max(
-        max(0.0, min(abs(own), abs(own - other)) - (STEPS * step if step < math.inf else 0.0))
-        for own, other, step in rows
-    )
+    for own, other, step in zip(changes, reversed(changes), steps, strict=True):
+        explained = step if step < math.inf else 0.0
+        largest = max(largest, min(abs(own), abs(own - other)) - explained)
+    return largest
 
 
 class Gaps:

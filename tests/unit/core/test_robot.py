@@ -1403,7 +1403,8 @@ def test_after_a_silence_a_line_that_the_next_one_refutes_is_rejected() -> None:
     assert bench.out.estimates == ()
     (event,) = [event for event in bench.step().events if event.name == "lines_rejected"]
     assert event.text == "implausible: the lines after it contradict its speeds"
-    assert [(each.pose, each.speeds) for each in bench.out.estimates] == [(Pose(), STILL)]
+    (estimate,) = bench.out.estimates
+    assert (estimate.pose, estimate.speeds) == (Pose(), STILL)
     assert bench.counters()["line_implausible"] == 1
     assert bench.step().link == "up"
 

@@ -218,7 +218,7 @@ def test_a_doubtful_angle_no_larger_than_that_of_a_usual_line_is_used_at_once() 
 
 
 def test_known_quantization_steps_make_no_line_doubtful() -> None:
-    for steps, used in (((5.0,) * 4, [2]), ((math.inf,) * 4, [])):
+    for steps, used in (((9.8,) * 4, [2]), ((9.6,) * 4, []), ((math.inf,) * 4, [])):
         assert Doubtful().hear(one(2, 14.0), 0.51, bridged=0.5, steps=steps) == (used, [])
 
 
