@@ -1400,7 +1400,7 @@ def silence(bench: Bench, speed: float) -> Bench:
 
 def test_after_a_silence_a_line_that_the_next_one_refutes_is_rejected() -> None:
     bench = silence(Bench().linked(), 40.0)
-    assert bench.out.estimates == ()
+    assert list(bench.out.estimates) == []
     (event,) = [event for event in bench.step().events if event.name == "lines_rejected"]
     assert event.text == "implausible: the lines after it contradict its speeds"
     (estimate,) = bench.out.estimates
