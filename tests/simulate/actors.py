@@ -708,7 +708,7 @@ class Run:
             lies, truth = self._names, self.product.truth()
             self.pose.see(true_ns, seen.estimates, truth, offset, lies)
             if self.half_duplex.on:
-                self.half_duplex.see(true_ns, seen.mode, seen.estimates[-1][1:], truth[1:])
+                self.half_duplex.see(true_ns, seen.mode, seen.estimates[-1][1:3], truth[1:3])
             if self._stalled_ns > true_ns - NS:
                 self.spread.forget()
             for estimate in seen.estimates:

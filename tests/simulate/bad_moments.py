@@ -356,7 +356,8 @@ def _routed(plan: Plan, dice: random.Random) -> None:
     if dice.random() < 0.5:
         first["phases"] = _drives(plan, dice, 0.5, 1.0, 4.0)
     first["hz"] = dice.choice((10.0, 20.0))
-    speeds, at = [], 0.0
+    speeds: list[list[Any]] = []
+    at = 0.0
     while at < plan["seconds"]:
         # The other program never sends a zero.
         speeds.append([round(at, 3), *_speed(dice)])
