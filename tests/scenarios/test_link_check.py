@@ -11,6 +11,7 @@ import random
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import nullcontext
+from itertools import repeat
 
 import pytest
 from msgspec.structs import replace
@@ -620,6 +621,61 @@ def test_a_plain_link_that_echoes_is_found_out_when_the_speed_changes(
     world.port.plug(FakeMcu(world.config, world.now_ns))
     world.drive(0.5, seconds=1.0)
     assert world.state.mode == "driving"
+
+
+class HalfDuplex(FakeMcu):
+    """A board behind an adapter that also returns each line of the daemon."""
+
+    def receive(self, now_ns: int, data: bytes) -> None:
+        super().receive(now_ns, data)
+        self._schedule(self._in_free_ns, "sent", data)
+
+
+@pytest.mark.parametrize("acceleration", [1.0, 100.0])
+@pytest.mark.parametrize(
+    ("period", "latency_ms"),
+    [pytest.param(0.0, 0, id="answers"), pytest.param(0.0, 16, id="answers by an adapter"),
+     pytest.param(0.1, 0, id="reports at 10 Hz"), pytest.param(0.01, 0, id="reports at 100 Hz"),
+     pytest.param(0.1, 16, id="reports at 10 Hz by an adapter")],
+)  # fmt: skip
+def test_an_echo_beside_the_replies_of_a_board_is_found_out_when_the_speed_changes(
+    acceleration: float, period: float, latency_ms: int
+) -> None:
+    limits = replace(LimitsConfig(), linear_acceleration=acceleration)
+    world = World(Config(mcu=McuConfig(reply_period=period), limits=limits), plugged=False)
+    board = HalfDuplex(world.config, world.now_ns)
+    board.latency_ns = latency_ms * MS
+    world.port.plug(board)
+    with board.free_running(period) if period else nullcontext():
+        world.run(0.5)
+        assert world.state.link == "up"  # at rest it makes no difference
+        world.drive(0.5, seconds=0.3)
+        assert (world.state.mode, world.state.link) == ("waiting", "stale")
+        assert "the daemon's own lines come back" in world.state.reason
+        world.run(1.0)
+        sent = len(world.port.sent)
+        world.drive(0.5, seconds=2.0)
+        assert moving([line for _, line in list(world.port.sent)[sent:]]) == []
+
+
+@each("lag", [0.01, 0.02, 0.03, 0.05])
+@each("deceleration", [0.6, 1.0, 3.0])
+def test_an_ideal_board_whose_motors_lag_by_whole_periods_is_not_taken_for_an_echo(
+    lag: float, deceleration: float
+) -> None:
+    limits = replace(
+        LimitsConfig(), linear_deceleration=deceleration, linear_stop_deceleration=deceleration
+    )
+    sim = SimConfig(motor_time_constant=lag, encoder_counts=1_000_000)
+    world = World(Config(limits=limits, sim=sim))
+    world.mcu._processing = repeat(1.3)  # type: ignore[assignment]
+    world.run(0.3)
+    for speed in (0.8, -0.4):
+        # A command moves the times of the lines, so only the ramp down without one is steady.
+        world.drive(speed, seconds=1.0)
+        world.run(2.0)
+    assert world.state.link == "up"
+    assert "line_echo" not in world.state.counters
 
 
 @pytest.mark.parametrize("check", ["auto", "require"])

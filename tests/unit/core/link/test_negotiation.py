@@ -5,6 +5,7 @@ They also cover a board that only echoes the lines it gets.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from itertools import pairwise
 
@@ -490,7 +491,7 @@ def test_twenty_equal_reports_through_a_change_of_speed_are_an_echo() -> None:
 
 def test_a_change_alone_does_not_make_an_echo_before_there_are_twenty() -> None:
     bench = Echoes()
-    found = [bench.exchange(speed) for speed in range(REPORTS)]
+    found = [bench.exchange(speed) for speed in (0, *range(REPORTS - 1))]
     assert found == [False] * (REPORTS - 1) + [True]
 
 
@@ -514,7 +515,7 @@ def test_one_report_that_differs_begins_the_run_anew() -> None:
     for speed in range(REPORTS - 1):
         assert not bench.exchange(speed)
     assert not bench.exchange(30.0, 29.99)
-    found = [bench.exchange(speed) for speed in range(REPORTS)]
+    found = [bench.exchange(speed) for speed in (0, *range(REPORTS - 1))]
     assert found == [False] * (REPORTS - 1) + [True]
 
 
@@ -531,9 +532,74 @@ def test_an_echo_that_comes_in_batches_is_found() -> None:
     found = []
     for step in range(0, 60, 2):
         bench.send(step)
-        bench.send(step + 1)
-        found += [bench.report(step), bench.report(step + 1)]
+        bench.send(step)
+        found += [bench.report(step), bench.report(step)]
     assert found.index(True) == REPORTS - 1
+
+
+DRIVE = [*[0.0] * 30, *[0.2 * n for n in range(50)]]
+"""Speeds at 100 Hz: rest, and a ramp of 1 m/s2 with wheels of 0.05 m."""
+
+
+@each("others", [1, 2])
+@each("late", [0, 3])
+def test_an_echo_is_found_as_soon_if_the_replies_of_a_board_come_between(
+    others: int, late: int
+) -> None:
+    bench = Echoes()
+    for number, speed in enumerate(DRIVE):
+        measured = 0.9 * DRIVE[max(0, number - 4)]
+        found = bench.exchange(speed, lag=late)
+        if found:
+            break
+        assert not any(bench.report(measured) for _ in range(others))
+    assert number - late - 30 == 10  # lines after the start of the ramp: 10 changes of 0.2 rad/s
+
+
+def test_an_echo_is_found_as_soon_if_a_board_reports_now_and_then() -> None:
+    bench = Echoes()
+    for number, speed in enumerate(DRIVE):
+        if number % 10 == 7:
+            assert not bench.report(DRIVE[max(0, number - 5)] + 0.03)
+        if bench.exchange(speed):
+            break
+    assert number - 30 == 10
+
+
+def test_a_steady_ramp_shows_no_echo() -> None:
+    bench = Echoes()
+    assert not any(bench.exchange(0.013 * n) for n in range(3000))  # rounded to 0.01 rad/s
+    bench = Echoes()
+    assert not any(bench.exchange(0.03 * n) for n in range(400))
+    assert bench.exchange(0.03 * 399)  # the end of the ramp shows the echo
+
+
+@each("acceleration", [3.0, 5.0, 20.0, 400.0])
+@each("lag", [1, 2, 3, 7])
+@each("reports", [1, 2, 3])
+def test_a_motor_that_lags_by_a_whole_number_of_lines_is_no_echo(
+    acceleration: float, lag: int, reports: int
+) -> None:
+    """The board measures exactly, over the time since its last report."""
+    bench, speed, kept = Echoes(), 0.0, math.exp(-1.0 / (lag * reports))
+    sent = 0.0
+    for goal in (0.0, 4.0, 9.0, -3.0, 0.0):
+        for _ in range(round(1200.0 / acceleration) + 60):
+            sent += max(-acceleration / 100, min(acceleration / 100, goal - sent))
+            bench.send(sent)
+            line = round(sent, 2)
+            for _ in range(reports):
+                behind, speed = speed - line, line + (speed - line) * kept
+                assert not bench.report(line + behind * (1.0 - kept) * lag * reports)
+
+
+@each("others", [1, 2, 3])
+def test_a_motor_that_reaches_a_new_speed_within_some_reports_is_no_echo(others: int) -> None:
+    bench = Echoes()
+    for number in range(400):
+        speed, before = number // 40 % 2 * 6.0, (number // 40 + 1) % 2 * 6.0
+        share = (number % 40 + 1) / (others + 1)
+        assert not bench.exchange(speed, before + (speed - before) * min(1.0, share))
 
 
 def test_a_report_older_than_the_lines_that_are_kept_is_no_echo() -> None:
