@@ -197,7 +197,8 @@ CORRECTED: tuple[tuple[str, tuple[str, ...]], ...] = (
         ("acsard/runtime/kept_latches.py",),
     ),
     (
-        "an echo is found up to seven lines later, and also of checked lines without samples",
+        "an echo is found up to seven lines later, beside the replies of a board, and also of "
+        "checked lines without samples; a board that repeats only a steady ramp is none",
         (LINK + "echo.py", LINK + "negotiation.py", LINK + "session.py"),
     ),
     (

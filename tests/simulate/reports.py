@@ -28,6 +28,9 @@ ECHO_LINES, ECHO_CHANGE = 40, 6.0
 """Lines with another speed, and rad/s of change in all, by which an echo is known as one: twice as
 many as the pages say, and three times the change."""
 
+ECHO_CORNER = 0.025
+"""rad/s by which two changes of speed must differ, because a straight ramp shows no echo."""
+
 ECHO_WAY = 0.5
 """Way, m, by which the pose may be wrong until an echo beside a board is known."""
 
@@ -142,18 +145,21 @@ class _Changes:
 
     def restart(self) -> None:
         """Note that the daemon, or the opening of its port, begins anew."""
-        self._lines, self._change = 0, 0.0
+        self._lines, self._change, self._corner = 0, 0.0, False
         self._last: tuple[float, ...] = ()
+        self._slope: list[float] = []
 
     def take(self, wheels: tuple[float, ...]) -> bool:
         """Take a line, and return whether the echo is surely known now."""
-        if not self.on or wheels == self._last:
+        if not self.on:
             return False
-        pairs = zip(wheels, self._last or wheels, strict=True)
-        self._change += max(abs(new - old) for new, old in pairs)
-        self._last = wheels
-        self._lines += any(wheels)
-        return self._lines > ECHO_LINES and self._change > ECHO_CHANGE
+        slope = [new - old for new, old in zip(wheels, self._last or wheels, strict=True)]
+        bends = [abs(new - old) for new, old in zip(slope, self._slope or slope, strict=True)]
+        self._last, self._slope = wheels, slope
+        self._corner |= max(bends) > ECHO_CORNER
+        self._change += max(map(abs, slope))
+        self._lines += any(wheels) and any(slope)
+        return self._lines > ECHO_LINES and self._change > ECHO_CHANGE and self._corner
 
     @property
     def text(self) -> str:

@@ -988,7 +988,14 @@ def test_a_new_daemon_learns_anew_that_it_hears_itself(restarts: bool) -> None:
         for n in range(1, 60):
             if restarts and n == 30:
                 echo.restart()
-            echo.line(n * NS, (0.2 * n,) * 4)
+            echo.line(n * NS, (0.2 * max(0, n - 5),) * 4)
+
+
+def test_a_steady_ramp_need_not_show_an_echo() -> None:
+    echo = Echo()
+    echo.begin()
+    for n in range(1, 60):
+        echo.line(n * NS, (0.2 * n,) * 4)
 
 
 def test_a_new_daemon_has_its_own_time_to_find_its_output_blocked() -> None:
