@@ -200,8 +200,9 @@ class EchoDetector:
     echoes and also answers is detected as soon as one that only echoes. An example is an adapter
     for RS-485 with a board behind it.
 
-    A board that reports its set points, or a simulator whose wheels have no lag, looks exactly like
-    an echo. The daemon then does not drive until the port is opened again, and reports the reason.
+    A board that reports its set points looks exactly like an echo, and so may a simulator whose
+    wheels have no lag. The daemon then does not drive until the port is opened again, and reports
+    the reason.
     """
 
     def __init__(self) -> None:
