@@ -151,11 +151,13 @@ class _Changes:
 
     def take(self, wheels: tuple[float, ...]) -> bool:
         """Take a line, and return whether the echo is surely known now."""
-        if not self.on:
+        last, before = self._last, self._slope
+        if self.on:
+            self._last = wheels
+        if not (self.on and last):
             return False
-        slope = [new - old for new, old in zip(wheels, self._last or wheels, strict=True)]
-        bends = [abs(new - old) for new, old in zip(slope, self._slope or slope, strict=True)]
-        self._last, self._slope = wheels, slope
+        slope = self._slope = [new - old for new, old in zip(wheels, last, strict=True)]
+        bends = [abs(new - old) for new, old in zip(slope, before or slope, strict=True)]
         self._corner |= max(bends) > ECHO_CORNER
         self._change += max(map(abs, slope))
         self._lines += any(wheels) and any(slope)
