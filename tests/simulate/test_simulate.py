@@ -1669,8 +1669,9 @@ def test_an_echo_beside_a_board_is_a_finding_only_if_the_pose_is_wrong_for_long(
     one = HalfDuplex()
     one.begin()
     one.see(0, "driving", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    for n in range(50):
-        one.line((n / 5, n / 5, n / 5, n / 5))
+    for n in range(55):
+        speed = max(0, n - 5) / 5
+        one.line((speed, speed, speed, speed))
     one.see(NS, "driving", (1.0, 0.0, 0.0), (0.6, 0.0, 0.0))
     one.see(2 * NS, "waiting", (2.0, 0.0, 0.0), (1.2, 0.0, 0.0))
     with pytest.raises(BrokenError, match="an echo beside a board is seen"):
