@@ -58,6 +58,7 @@ EQUIVALENT: dict[str, str] = {
     "acsard/core/motion/freshness.py _Clock.__init__: 'self._early = 0' -> 'self._early = -1'": "`max(0, ...)` takes it for 0",
     "acsard/core/motion/freshness.py _Clock.__init__: 'self._paused = False' -> 'pass'": "set when the first proof ends, before it is read",
     "acsard/core/motion/freshness.py _Clock.__init__: 'self._paused = False' -> 'self._paused = True'": "set when the first proof ends, before it is read",
-    "acsard/core/motion/freshness.py _Clock.judge: 'mark = (stamp_ns, -1 if command.sequence is None else command.sequence)' -> 'mark = (stamp_ns, -2 if command.sequence is None else command.sequence)'": "no sender has a number below 0",
+    "acsard/core/motion/freshness.py _Clock.judge: 'number = -1 if command.sequence is None else command.sequence' -> 'number = -2 if command.sequence is None else command.sequence'": "no sender has a number below 0",
+    "acsard/core/motion/freshness.py _Clock.__init__: 'self._number = -1' -> 'self._number = -2'": "no sender has a number below 0",
     "acsard/core/motion/freshness.py _Proof._constant: 'pairs = [min(pair) for pair in zip(minima[::2], minima[1::2], strict=True)]' -> 'pairs = [min(pair) for pair in zip(minima[1::2], minima[::2], strict=True)]'": "the minimum of a pair is the same in either order",
 }

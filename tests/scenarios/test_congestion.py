@@ -221,3 +221,64 @@ def test_commands_that_were_lost_are_not_taken_for_a_pause(way: Way) -> None:
     )
     assert oldest <= TIMEOUT_S + MARGIN_S
     assert obeyed == 0
+
+
+@each("period", [1.9, 2.1, 4.9])
+@each("way", STAMPED)
+def test_a_slow_sender_drives_a_source_with_a_long_timeout(way: Way, period: float) -> None:
+    """Commands that were further apart than 2 s never proved their delays."""
+    world = World(Config(commands=CommandsConfig(sources=(Source("app", 50, 5.0),))))
+    world.run(0.3)
+    speaker = Speaker(world, way)
+    for number in range(8):
+        speaker.send(0.0 if number < 5 else 0.3)
+        world.run(period)
+    assert world.state.mode == "driving", (way, period, world.state.reason)
+
+
+@each("way", STAMPED)
+def test_the_old_commands_of_a_slow_sender_are_not_followed(way: Way) -> None:
+    """It sends every 3 s with a timeout of 5 s, and the network begins to take 20 s."""
+    world = World(Config(commands=CommandsConfig(sources=(Source("app", 50, 5.0),))))
+    world.run(0.3)
+    speaker = Speaker(world, way)
+    speaker.hold(0.0, 15.0, 1 / 3)
+    oldest, obeyed = over(
+        world,
+        speaker,
+        lambda t: 20.0 if t > 30.0 else BASE_S,
+        lambda t: 0.0 if t % 12.0 < 4.0 else 0.4,
+        90.0,
+        1 / 3,
+    )
+    assert obeyed > 3
+    assert oldest <= 5.0 + MARGIN_S
+
+
+@each("trouble", ["lost", "second lost", "twice"])
+@each("way", ["signed", "rmw"])
+def test_a_clock_that_is_set_back_while_a_command_is_lost_or_repeated_heals(
+    way: Way, trouble: str
+) -> None:
+    """The sender was refused for as many minutes as its clock was set back by seconds."""
+    world = quiet()
+    speaker = Speaker(world, way)
+    speaker.open(0.3)
+    speaker.ahead -= 30.0
+    if trouble == "second lost":
+        speaker.hold(0.3, 0.05)
+    if trouble != "twice":
+        speaker.message(0.0)
+        world.run(0.05)
+    since_ns = world.now_ns
+    for number in range(60):
+        message = speaker.message(0.0 if 40 <= number < 44 else 0.3)
+        speaker.deliver(message)
+        world.run(0.003)
+        if trouble == "twice":
+            speaker.deliver(message)
+        world.run(0.047)
+        if number == 39:
+            assert world.state.reason.startswith("send a zero first"), world.state.reason
+            assert not moved(world, since_ns + NS_PER_S)
+    assert world.state.mode == "driving", world.state.reason

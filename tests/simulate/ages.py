@@ -23,6 +23,9 @@ EARLY_NS = 60_000_000
 BURST_NS = 1_000_000
 """Messages within this time count as one, with the lowest of their delays."""
 
+PAUSE_NS = 2_000_000_000
+"""A longer silence is a pause of the sender, if it is also longer than the timeout."""
+
 STAYS_NS = 4_000_000_000
 """Time after which the daemon surely knows lower delays of a foreign clock."""
 
@@ -120,19 +123,20 @@ class Ages:
             clock.least_ns, clock.recent, clock.constant = None, deque(), False
         clock.names = len(self.clocks)
         foreign = sender["way"] in FOREIGN
-        if foreign and clock.stamp_ns and message.stamp_ns - clock.stamp_ns > 19 * NS // 10:
+        pause_ns = max(PAUSE_NS, timeout_ns) - NS // 10
+        if foreign and clock.stamp_ns and message.stamp_ns - clock.stamp_ns > pause_ns:
             clock.loose = True
         if (foreign and sender["clock"]) or sender.get("bad_stamps"):
             clock.loose = True
         clock.stamp_ns = message.stamp_ns
         recent = clock.recent
-        silent = bool(recent) and arrived_ns - recent[-1][0] > 19 * NS // 10
+        silent = bool(recent) and arrived_ns - recent[-1][0] > pause_ns
         if silent and foreign and not clock.followed:
             # The proof begins again, and the pages promise no more.
             clock.least_ns, clock.constant = None, False
         least = clock.least_ns
         clock.learn(age, arrived_ns, foreign)
-        while recent and recent[0][0] < arrived_ns - 3 * NS:
+        while recent and recent[0][0] < arrived_ns - max(3 * NS, pause_ns):
             recent.popleft()
         prompt: int = int(sender["delay"] * NS)
         allowed = timeout_ns + EARLY_NS + MARGIN_NS

@@ -20,7 +20,10 @@ the same, so the sum of the delays that are trusted in this way is bounded by a 
 `FORGIVE_NS`, refilled by 1 s a minute. An adjustment is visible, and costs no budget, if stamps go
 back or stand still for more than one command, because no network can cause that. After a pause of
 the sender, a rise of the delay is trusted even beyond the budget, because the clock may have been
-set by any amount.
+set by any amount. A pause is longer than 2 s, and longer than the timeout of the source.
+
+Sequence numbers show which commands the network lost, repeated or delivered in another order. The
+daemon does not take lost commands for a pause, and a repeated command changes nothing.
 
 Arrivals are measured by the monotonic clock, because our own wall clock may be set.
 """
@@ -70,8 +73,10 @@ JUMP_PROOF_NS = 3 * NS_PER_S // 2
 likely a backlog that arrives in bursts than a clock that was set."""
 
 GAP_NS = 2 * NS_PER_S
-"""Silence of a sender, ns, that ends a test of its delay. If stamps and arrivals show the pause, a
-foreign clock (one that may be adjusted) may have been set by any amount meanwhile."""
+"""A longer silence of a sender, ns, is a pause, unless its source has a longer timeout. Then the
+silence must exceed the timeout, because the sender need not send more often. A pause ends a test of
+the delay. If stamps and arrivals show the pause, a foreign clock (one that may be adjusted) may
+have been set by any amount meanwhile."""
 
 STANDS_NS = 10_000
 """A clock was set back if two commands arrive more than `APART_NS` apart, but the second stamp is
@@ -88,7 +93,8 @@ waits for the last command of the queue, which has the smallest delay. No sender
 
 FORGIVE_NS, FORGIVE_RATE = NS_PER_S, 60
 """Budget, ns, for delay rises of a foreign clock (one that may be adjusted) that are trusted
-without a visible adjustment. It is refilled by one second in `FORGIVE_RATE` seconds."""
+without a visible adjustment. It is refilled by one second in `FORGIVE_RATE` seconds. While commands
+are late, the budget may rise above `FORGIVE_NS`, so that no sender is refused for ever."""
 
 MAX_CLOCKS = 1024
 """Largest number of clocks. If there are more, usually the longest silent one is forgotten. To make
@@ -172,13 +178,16 @@ class _Clock:
     def __init__(self, at_ns: int) -> None:
         self.state: State = "new"
         self.at_ns = at_ns
-        """Arrival of the last command, monotonic ns."""
+        """Arrival of the last command, monotonic ns. Repeated commands do not count."""
+        self.gap_ns = GAP_NS
+        """Longest silence that is not a pause, ns: `GAP_NS`, or the longest timeout of the sources
+        that the sender has commanded."""
         self.forgiven_ns = 0
         """Part of the last trusted rise of the delay that no adjustment of stamps explains, ns."""
         self._stamp_ns = 0
         self._delay = 0
-        self._number: int | None = None
-        """Sequence number of the last command."""
+        self._number = -1
+        """Sequence number of the last command, -1 without one."""
         self._least = 0
         """Minimum of the trusted delays, ns. It rises with time by the largest possible drift."""
         self._early = 0
@@ -210,6 +219,10 @@ class _Clock:
         """Return the verdict on the next command of this clock, and update the minimum delay."""
         at_ns, delay = command.arrived_ns, command.arrived_ns - stamp_ns
         silence, departed = at_ns - self.at_ns, stamp_ns - self._stamp_ns
+        number = -1 if command.sequence is None else command.sequence
+        self.gap_ns = max(self.gap_ns, timeout_ns)
+        if self._repeats(stamp_ns, number, silence):
+            return "stale"
         if silence > FORGET_NS and departed > FORGET_NS:
             self.state, self._proof, self._accepted, self._floor = "new", None, None, None
         if command.steady and self._later_than_lowest(delay, silence) > timeout_ns:
@@ -219,11 +232,10 @@ class _Clock:
         else:
             self._least += silence // DRIFT
             if not command.steady:
-                self._look_for_adjustment(stamp_ns, silence, command.sequence)
+                self._look_for_adjustment(stamp_ns, silence, number)
             verdict = self._compare(delay, at_ns, silence, timeout_ns, command.steady)
-        self.at_ns, self._stamp_ns, self._delay = at_ns, stamp_ns, delay
-        self._number = command.sequence
-        mark = stamp_ns, -1 if command.sequence is None else command.sequence
+        self.at_ns, self._stamp_ns, self._delay, self._number = at_ns, stamp_ns, delay, number
+        mark = stamp_ns, number
         if verdict == "fresh" and self._superseded(mark):
             return "stale"
         if verdict in ("fresh", "set"):
@@ -235,34 +247,54 @@ class _Clock:
         last = self._accepted
         return last is not None and (mark < last or (mark == last and mark[1] >= 0))
 
+    def _repeats(self, stamp_ns: int, number: int, silence: int) -> bool:
+        """Return whether the network repeated this command, or delivered a later one before it.
+
+        Such a command changes nothing. If its stamp is later than those before, its program has
+        restarted and counts from the beginning. After a pause, any number may be a restart.
+        """
+        if not 0 <= number <= self._number or silence > self.gap_ns:
+            return False
+        accepted = self._accepted
+        return stamp_ns <= self._stamp_ns or (accepted is not None and stamp_ns <= accepted[0])
+
     def _later_than_lowest(self, delay: int, silence: int) -> int:
         """Return by how much this delay of a steady clock exceeds the lowest one, ns."""
         floor = delay if self._floor is None else self._floor + silence // DRIFT
         self._floor = min(floor, delay)
         return delay - self._floor
 
-    def _look_for_adjustment(self, stamp_ns: int, silence: int, number: int | None) -> None:
+    def _look_for_adjustment(self, stamp_ns: int, silence: int, number: int) -> None:
         """Record a pause of the sender, or an adjustment of its clock.
 
         A stamp that goes back or stands still shows an adjustment. The next command must confirm
         it: its stamp must also go back or stand still, or must not be later than the stamp before
-        the adjustment. Nothing is recorded if the sequence numbers show that commands were lost.
+        the adjustment.
+
+        If the sequence numbers show that commands were lost, the network may have caused the
+        silence. The adjustment then counts by as much as the stamp is earlier than that of the last
+        accepted command, and a pause is not recorded.
         """
-        doubted, self._doubted = self._doubted, None
-        if number is not None and self._number is not None and number != self._number + 1:
+        lost = number - self._number - 1 if number >= 0 and self._number >= 0 else 0
+        if lost < 0:  # the numbers began again
             return
-        departed = stamp_ns - self._stamp_ns
+        departed, accepted = stamp_ns - self._stamp_ns, self._accepted
+        doubted, self._doubted = self._doubted, None
         if doubted is not None and (departed <= STANDS_NS or stamp_ns <= doubted[2]):
             self._before = doubted[0] if self._before is None else self._before
             self._shown += doubted[1]
-        if departed > GAP_NS and silence > GAP_NS:
+        if lost and accepted is not None:
+            back = accepted[0] - stamp_ns - self._shown
+            if back > 0 and 0 <= accepted[1] < number:
+                self._doubted = self._delay, back, accepted[0]
+        elif departed > self.gap_ns and silence > self.gap_ns:
             self._paused = True
         elif departed <= STANDS_NS and silence > APART_NS:
             self._doubted = self._delay, silence - departed, self._stamp_ns
 
     def _prove(self, delay: int, at_ns: int, silence: int, timeout_ns: int) -> Verdict:
         proof = self._proof
-        if proof is not None and silence <= GAP_NS:
+        if proof is not None and silence <= self.gap_ns:
             sign = proof.add(delay, at_ns, timeout_ns)
             if sign == "proven":
                 return self._believe(proof, "fresh")
@@ -288,7 +320,7 @@ class _Clock:
         proof, needed_ns, share = self._proof, min(timeout_ns, LONGEST_PROOF_NS), CREPT
         if proof is None:
             self._accrue(at_ns, FORGIVE_NS)
-        elif silence <= GAP_NS:
+        elif silence <= self.gap_ns:
             sign = proof.add(delay, at_ns, timeout_ns)
             if sign == "open":
                 return "stale"
@@ -336,7 +368,7 @@ class Freshness:
     def __init__(self) -> None:
         self._clocks: dict[str, _Clock] = {}
         self._newcomers: dict[str, _Clock] = {}
-        """Clocks that may be adjusted and have no accepted command, forgotten after `GAP_NS`."""
+        """Clocks that may be adjusted and have no accepted command, forgotten after a pause."""
         self._unproved: dict[str, _Clock] = {}
         """Clocks that are never adjusted and have no accepted command. They are kept for `KEEP_NS`
         of silence, because their lowest delay is valid from the first command on."""
@@ -351,7 +383,7 @@ class Freshness:
         A command without a stamp is stale only if its sequence number is out of order.
         """
         if command.stamp_ns is None:
-            return self._in_order(command)
+            return self._in_order(command, max(GAP_NS, timeout_ns))
         name, at_ns = command.clock or command.source, command.arrived_ns
         clock = None
         for held in (self._clocks, self._newcomers, self._unproved):
@@ -367,13 +399,13 @@ class Freshness:
         self._forget(at_ns)
         return verdict
 
-    def _in_order(self, command: Command) -> Verdict:
-        """Judge a command without a stamp by its number. After `GAP_NS`, numbers may restart."""
+    def _in_order(self, command: Command, gap_ns: int) -> Verdict:
+        """Judge a command without a stamp by its number. After a pause, numbers may restart."""
         number, at_ns = command.sequence, command.arrived_ns
         if number is None:
             return "fresh"
         last = self._numbers.pop(command.sender, None)
-        if last is not None and number <= last[0] and at_ns - last[1] <= GAP_NS:
+        if last is not None and number <= last[0] and at_ns - last[1] <= gap_ns:
             self._numbers[command.sender] = last
             return "stale"
         self._numbers[command.sender] = number, at_ns
@@ -389,13 +421,13 @@ class Freshness:
         """
         limits = (self._newcomers, GAP_NS), (self._unproved, KEEP_NS), (self._clocks, KEEP_NS)
         for held, silent_ns in limits:
-            while held and now_ns - _oldest(held).at_ns > silent_ns:
+            while held and now_ns - _oldest(held).at_ns > max(silent_ns, _oldest(held).gap_ns):
                 del held[next(iter(held))]
         some = [held for held, _ in limits if held]
         if sum(map(len, some)) > MAX_CLOCKS:
-            held = min(some, key=lambda clocks: _oldest(clocks).at_ns)
-            if self._unproved and now_ns - _oldest(self._unproved).at_ns > GAP_NS:
-                held = self._unproved
+            doubtful = [held for held in some if held is not self._clocks]
+            silent = [held for held in doubtful if now_ns - _oldest(held).at_ns > GAP_NS]
+            held = min(silent or some, key=lambda clocks: _oldest(clocks).at_ns)
             del held[next(iter(held))]
 
 

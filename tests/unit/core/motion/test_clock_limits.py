@@ -1,6 +1,6 @@
 """The limits of `Freshness`, to the nanosecond: what it accepts at a limit, and refuses beyond it.
 
-A sender sends at 20 Hz unless a test says something else, and its source has a timeout of 250 ms.
+A sender sends at 20 Hz to a source with a timeout of 250 ms, unless a test says something else.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from tests.unit.core.motion.commanders import GO, MS
 
 PERIOD = 50 * MS
 TIMEOUT = 250 * MS
+PATIENT = 5 * NS_PER_S
+"""The timeout of a source with slow senders, ns."""
 DRIFT = 10_000
 """The drift that is allowed for in one period, ns."""
 
@@ -26,11 +28,11 @@ Step = tuple[int, int]
 class Sender:
     """A sender at a `Freshness` of its own. Times are in ns, and its delay is 0 at first."""
 
-    def __init__(self, known: bool = True, steady: bool = False) -> None:
-        self.freshness, self.steady = Freshness(), steady
+    def __init__(self, known: bool = True, steady: bool = False, timeout: int = TIMEOUT) -> None:
+        self.freshness, self.steady, self.timeout = Freshness(), steady, timeout
         self.at_ns = NS_PER_S
         if known:
-            assert self.steadily(0, 20)[-1] == "fresh"
+            assert self.steadily(0, 50 if timeout > TIMEOUT else 20)[-1] == "fresh"
 
     def sends(self, after: int, delay: int, number: int | None = None, clock: str = "a") -> Verdict:
         self.at_ns += after
@@ -38,7 +40,7 @@ class Sender:
         command = Command(
             "high", GO, self.at_ns, stamp_ns, clock, sequence=number, steady=self.steady
         )
-        return self.freshness.judge(command, TIMEOUT)
+        return self.freshness.judge(command, self.timeout)
 
     def each(self, steps: list[Step]) -> list[Verdict]:
         return [self.sends(*step) for step in steps]
@@ -142,6 +144,35 @@ def test_the_proof_of_a_clock_that_was_set_begins_again_after_a_silence_of_over_
     late = 600 * MS
     steps = [(NS_PER_S, late), (2 * NS_PER_S + beyond, late), (750 * MS, late)]
     assert Sender().each(steps) == ["stale", "stale", verdict]
+
+
+@pytest.mark.parametrize("steady", [True, False])
+@pytest.mark.parametrize(("beyond", "verdict"), [(0, "unproven"), (1, "first")])
+def test_a_proof_lasts_over_a_silence_of_a_timeout_that_is_longer(
+    beyond: int, verdict: Verdict, steady: bool
+) -> None:
+    sender = Sender(known=False, steady=steady, timeout=PATIENT)
+    assert sender.sends(0, 0) == "first"
+    assert sender.sends(PATIENT + beyond, 0) == verdict
+    assert sender.sends(PATIENT, 0) == ("unproven" if beyond else "fresh")
+
+
+@pytest.mark.parametrize(("beyond", "verdict"), [(0, "set"), (1, "stale")])
+def test_the_proof_of_a_clock_that_was_set_lasts_over_a_silence_of_a_long_timeout(
+    beyond: int, verdict: Verdict
+) -> None:
+    sender, late = Sender(timeout=PATIENT), 10 * NS_PER_S
+    steps = [(PERIOD, late), (PERIOD, late), (PATIENT + beyond, late), (NS_PER_S, late)]
+    assert sender.each(steps) == ["stale", "stale", "stale", verdict]
+
+
+def test_a_proof_lasts_over_the_longest_timeout_of_the_sources_of_a_sender() -> None:
+    """The sender commands two sources every 3 s, and one of them has a short timeout."""
+    sender, verdicts = Sender(known=False), list[Verdict]()
+    for _ in range(4):
+        for sender.timeout in (PATIENT, TIMEOUT):
+            verdicts.append(sender.sends(3 * NS_PER_S // 2, 0))
+    assert verdicts == ["first", "unproven", *["fresh"] * 6]
 
 
 @pytest.mark.parametrize(("beyond", "verdict"), [(0, "fresh"), (1, "unproven")])
@@ -304,6 +335,23 @@ def test_a_sender_that_pauses_for_over_2_s_may_have_set_its_clock(
     assert sender.steadily(late, 30)[-1] == verdict
 
 
+@pytest.mark.parametrize(("pause", "verdict"), [(PATIENT, "stale"), (PATIENT + 1, "set")])
+def test_a_sender_that_lets_its_source_time_out_may_have_set_its_clock(
+    pause: int, verdict: Verdict
+) -> None:
+    sender, late = Sender(timeout=PATIENT), 60 * NS_PER_S
+    assert sender.sends(late + pause, late) == "stale"
+    assert sender.steadily(late, 40)[-1] == verdict
+
+
+def test_a_slow_sender_does_not_pause_between_its_commands() -> None:
+    """The network delays all commands by 60 s, and the sender sends every 3 s."""
+    sender, late = Sender(timeout=PATIENT), 60 * NS_PER_S
+    assert sender.sends(3 * NS_PER_S, 0) == "fresh"
+    assert sender.sends(3 * NS_PER_S + late, late) == "stale"
+    assert {sender.sends(3 * NS_PER_S, late) for _ in range(100)} == {"stale"}
+
+
 def test_stamps_that_leap_in_commands_that_came_together_show_no_pause() -> None:
     """The daemon drops commands when too many come at once, as after a suspend of its computer."""
     sender, late = Sender(), 8 * NS_PER_S
@@ -328,6 +376,145 @@ def test_numbers_tell_a_pause_from_a_loss(
         for after in (late + 3 * NS_PER_S, *[PERIOD] * 30)
     ]
     assert verdicts == [*["stale"] * 30, verdict]
+
+
+# adjustments while commands are lost, repeated or swapped
+
+BACK = 30 * NS_PER_S
+"""The time by which a clock is set back in these tests, ns."""
+
+Road = list[tuple[int, int, int]]
+"""Messages in the order of their arrival: number, true time of sending and of arrival in periods.
+The clock is set back by `BACK` before number 101 is sent at period 1."""
+
+
+class Numbered(Sender):
+    """A sender with numbers. Number 100 is the last one before its clock is set back."""
+
+    def __init__(self) -> None:
+        super().__init__(known=False)
+        self.begun_ns = self.at_ns
+        verdicts = [self.numbered(100 + n, n, n) for n in range(-40, 1)]
+        assert verdicts[-1] == "fresh"
+
+    def numbered(self, number: int, sent: float, arrived: float, back: int = 0) -> Verdict:
+        """Send by the true time in periods, with a clock that was set back by `back`."""
+        at_ns = self.begun_ns + round((100 + arrived) * PERIOD)
+        stamp_ns = self.begun_ns + round((100 + sent) * PERIOD) - back
+        command = Command("high", GO, at_ns, stamp_ns, "a", sequence=number)
+        return self.freshness.judge(command, TIMEOUT)
+
+    def after(self, first: int, periods: int = 60, late: float = 0.0) -> list[Verdict]:
+        """Send numbers from `first` on with a clock that was set back."""
+        numbers = range(first, first + periods)
+        return [self.numbered(n, n - 100, n - 100 + late, BACK) for n in numbers]
+
+
+@pytest.mark.parametrize("lost", [1, 2, 5, 15])
+def test_a_clock_is_set_back_while_commands_are_lost(lost: int) -> None:
+    sender = Numbered()
+    verdicts = sender.after(101 + lost)
+    assert verdicts[:33] == [*["stale"] * 30, "set", *["fresh"] * 2]
+    assert sender.freshness.forgiven_ns <= (lost + 1) * PERIOD
+
+
+@pytest.mark.parametrize("every", [2, 3])
+def test_a_clock_is_set_back_while_most_commands_are_lost(every: int) -> None:
+    sender = Numbered()
+    verdicts = [sender.numbered(100 + n, n, n, BACK) for n in range(every - 1, 60 * every, every)]
+    assert "set" in verdicts
+    assert sender.freshness.forgiven_ns <= every * PERIOD
+
+
+@pytest.mark.parametrize("later", [0.05, 0.95, 1.5, 20.0])
+def test_a_clock_is_set_back_while_every_command_comes_twice(later: float) -> None:
+    """The second copy arrives `later`, in periods."""
+    sender, verdicts, again = Numbered(), list[Verdict](), set[Verdict]()
+    for arrived, n in sorted((n + late, n) for n in range(-20, 41) for late in (0.0, later)):
+        if arrived > 0.0:
+            verdict = sender.numbered(100 + n, n, arrived, BACK if n > 0 else 0)
+            if arrived == n:
+                verdicts.append(verdict)
+            else:
+                again.add(verdict)
+    assert verdicts == [*["stale"] * 30, "set", *["fresh"] * 9]
+    assert again == {"stale"}
+    assert sender.freshness.forgiven_ns <= PERIOD
+
+
+SWAPS: dict[str, Road] = {
+    "the last one before the adjustment comes late": [(102, 2, 2), (101, 0, 2.1), (103, 3, 3)],
+    "the first one after it comes late": [(102, 2, 2), (101, 1, 2.1), (103, 3, 3)],
+    "the last one before it comes later than its timeout": [
+        (102, 2, 2), (103, 3, 3), (101, 0, 6), (103, 3, 6.2), (104, 4, 6.4),
+    ],
+}  # fmt: skip
+
+
+@each("swap", SWAPS)
+def test_a_clock_is_set_back_while_commands_are_swapped(swap: str) -> None:
+    sender = Numbered()
+    for number, sent, arrived in SWAPS[swap]:
+        sender.numbered(number, sent, arrived, BACK if sent > 0 else 0)
+    assert "set" in sender.after(107)
+    assert sender.freshness.forgiven_ns <= 3 * PERIOD
+
+
+def test_lost_commands_excuse_no_delay_beside_an_adjustment() -> None:
+    """The clock is set back, commands are lost, and all later ones are 5 s old."""
+    sender = Numbered()
+    assert set(sender.after(110, 100, late=100.0)) == {"stale"}
+
+
+def test_an_adjustment_counts_once_however_many_commands_are_lost_after_it() -> None:
+    """After the adjustment every second command is lost, and then all are 5 s old."""
+    sender = Numbered()
+    for n in range(2, 20, 2):
+        assert sender.numbered(100 + n, n, n, BACK) == "stale"
+    assert set(sender.after(120, 100, late=100.0)) == {"stale"}
+
+
+def test_commands_that_are_lost_show_no_adjustment_of_a_clock_that_goes_on() -> None:
+    sender = Numbered()
+    for n in range(2, 200, 2):
+        assert sender.numbered(100 + n, n, n + 100) == "stale"
+
+
+def test_one_wrong_stamp_behind_lost_commands_shows_no_adjustment() -> None:
+    sender = Numbered()
+    assert sender.numbered(103, 3, 3, 1000 * BACK) == "stale"
+    assert {sender.numbered(104 + n, 4 + n, 43 + n) for n in range(100)} == {"stale"}
+
+
+def test_commands_that_are_replayed_show_no_adjustment_and_never_count() -> None:
+    """All later commands are 5 s old, and between them come old ones once more."""
+    sender = Numbered()
+    for n in range(1, 100):
+        assert sender.numbered(100 + n, n, n + 100) == "stale"
+        assert sender.numbered(61 + n % 40, n % 40 - 39, n + 100.3) == "stale"
+        assert sender.numbered(62 + n % 40, n % 40 - 38, n + 100.6) == "stale"
+
+
+def test_commands_from_before_an_adjustment_show_no_second_one_when_they_are_replayed() -> None:
+    """The old stamps are later than those of the clock that was set back."""
+    sender = Numbered()
+    assert sender.after(101)[-1] == "fresh"
+    for number in (98, 99):
+        sender.numbered(number, number - 100, 61)
+    assert set(sender.after(161, 100, late=100.0)) == {"stale"}
+
+
+def test_numbers_that_begin_again_stop_nobody() -> None:
+    sender = Numbered()
+    assert [sender.numbered(n, n, n) for n in range(1, 40)] == ["fresh"] * 39
+    assert "set" in [sender.numbered(n, n, n, BACK) for n in range(40, 80)]
+
+
+def test_numbers_that_begin_again_with_a_clock_that_was_set_back_count_after_the_proof() -> None:
+    """The clock was set back by 0.8 s while the program restarted."""
+    sender = Numbered()
+    verdicts = [sender.numbered(n, n, n, 800 * MS) for n in range(1, 100)]
+    assert verdicts.index("set") <= 40 + 30 + 1
 
 
 # the budget
@@ -393,9 +580,30 @@ def test_a_clock_that_others_saw_silent_for_over_an_hour_is_forgotten(
     assert sender.sends(0, hour) == verdict
 
 
-def numbered(freshness: Freshness, at_ns: int, number: int, sender: str = "a") -> Verdict:
+def test_the_proof_of_a_slow_sender_among_others_lasts_over_a_silence_of_its_timeout() -> None:
+    sender = Sender(known=False, timeout=PATIENT)
+    assert sender.sends(0, 0) == "first"
+    sender.timeout = TIMEOUT
+    sender.sends(PATIENT, 0, clock="b")
+    sender.timeout = PATIENT
+    assert sender.sends(0, 0) == "unproven"
+
+
+def test_new_clocks_that_are_silent_for_over_2_s_are_forgotten_before_known_ones() -> None:
+    """A known sender is silent for 9 s, while a hundred new ones a second send to a slow source."""
+    sender = Sender()
+    sender.timeout = 2 * PATIENT
+    for number in range(1800):
+        sender.sends(5 * MS, 0, clock=f"stranger {number}")
+    sender.timeout = TIMEOUT
+    assert sender.sends(PERIOD, 0) == "fresh"
+
+
+def numbered(
+    freshness: Freshness, at_ns: int, number: int, sender: str = "a", timeout: int = TIMEOUT
+) -> Verdict:
     command = Command("high", GO, at_ns, sender=sender, sequence=number)
-    return freshness.judge(command, TIMEOUT)
+    return freshness.judge(command, timeout)
 
 
 @pytest.mark.parametrize(("beyond", "verdict"), [(0, "stale"), (1, "fresh")])
@@ -403,6 +611,16 @@ def test_numbers_without_stamps_begin_again_after_over_2_s(beyond: int, verdict:
     freshness = Freshness()
     assert numbered(freshness, NS_PER_S, 6) == "fresh"
     assert numbered(freshness, 3 * NS_PER_S + beyond, 5) == verdict
+
+
+@pytest.mark.parametrize(("beyond", "verdict"), [(0, "stale"), (1, "fresh")])
+def test_numbers_without_stamps_begin_again_after_a_timeout_that_is_longer(
+    beyond: int, verdict: Verdict
+) -> None:
+    """Until then the robot may still follow the command with the higher number."""
+    freshness = Freshness()
+    assert numbered(freshness, NS_PER_S, 6, timeout=PATIENT) == "fresh"
+    assert numbered(freshness, NS_PER_S + PATIENT + beyond, 5, timeout=PATIENT) == verdict
 
 
 @pytest.mark.parametrize(("others", "verdict"), [(1023, "stale"), (1024, "fresh")])
