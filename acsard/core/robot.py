@@ -512,7 +512,7 @@ class Robot:
             if isinstance(one, Refusal):
                 self._refuse(one, now_ns, events)
                 if one.source:
-                    self._arbiter.notice(one.source, one.sender, one.arrived_ns)
+                    self._arbiter.notice(one.source, one.sender, one.arrived_ns, one.shared)
                 continue
             if one.stamp_replaced:
                 self.counters["stamps_replaced"] += 1

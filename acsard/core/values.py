@@ -179,6 +179,8 @@ class Refusal(Struct, frozen=True):
     sender: str = ""
     arrived_ns: int = 0
     """Monotonic time at which the command arrived, ns; 0 if it is unknown."""
+    shared: bool = False
+    """Whether several programs may have the same `sender` (see `Command.shared`)."""
 
 
 EventName = Literal[

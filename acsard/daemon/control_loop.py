@@ -23,7 +23,7 @@ from acsard.core.incoming.bus_interface import (
     GatewayFollower,
     RouterFollower,
 )
-from acsard.core.incoming.commands import Receiver, caller_name, parts, sender
+from acsard.core.incoming.commands import Receiver, caller_name, claimed_identity, parts
 from acsard.core.incoming.imu import GyroFollower
 from acsard.core.incoming.queries import Queries, Query, refused
 from acsard.core.incoming.speed_limit import SpeedLimiter
@@ -349,13 +349,15 @@ class ControlLoop:
             try:
                 commands.append(self._receiver.command(arrival))
             except DecodeError as error:
+                who = claimed_identity(arrival)
                 refusals.append(
                     Refusal(
                         error.reason,
                         f"{arrival.key}: {error}",
                         parts(arrival.key)[1],
-                        sender(arrival),
+                        who.sender,
                         arrival.arrived_ns,
+                        who.shared,
                     )
                 )
         if superseded := count_superseded(commands):

@@ -339,13 +339,16 @@ def _by_key(arrival: Arrival) -> str:
     return f"{arrival.via}/{arrival.key.partition('/')[2]}"
 
 
-def sender(arrival: Arrival) -> str:
-    """Return the public name of a sample's sender, "" for an rmw_zenoh sample without a GID."""
+def claimed_identity(arrival: Arrival) -> Identity:
+    """Return the identity of a sample's sender, as `identify`, but never raise an error.
+
+    The `sender` of an rmw_zenoh sample without a GID is "".
+    """
     if arrival.via == "rmw":
         gid = arrival.attachment[-GID_BYTES:]
         # A shorter GID could look like the public name of a native sender.
-        return _by_gid(gid) if len(gid) == GID_BYTES else ""
-    return identify(arrival).sender
+        return Identity(_by_gid(gid) if len(gid) == GID_BYTES else "")
+    return identify(arrival)
 
 
 def _twist_payload(arrival: Arrival) -> _TwistPayload:

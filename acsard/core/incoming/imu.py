@@ -15,7 +15,7 @@ from collections.abc import MutableMapping
 from msgspec import Struct
 from msgspec.structs import replace
 
-from acsard.core.incoming.commands import MAX_COMMAND_BYTES, Arrival, sender
+from acsard.core.incoming.commands import MAX_COMMAND_BYTES, Arrival, claimed_identity
 from acsard.core.messages.encodings import DecodeError, Decoder, decode_cdr, detect
 from acsard.core.messages.schema import Covariance3, Header, Imu, Quaternion, Vector3
 from acsard.core.messages.signature import public_name
@@ -65,7 +65,7 @@ class GyroFollower:
         """Return the turn rate in a sample, or None after counting and reporting its refusal."""
         try:
             sample = reading(arrival)
-            anew = self._follow(sender(arrival), arrival.arrived_ns)
+            anew = self._follow(claimed_identity(arrival).sender, arrival.arrived_ns)
         except DecodeError as error:
             counters[f"imu_{error.reason}"] = counters.get(f"imu_{error.reason}", 0) + 1
             events.append(Event("imu_refused", str(error), "warning", kind=error.reason))

@@ -184,7 +184,7 @@ class Arbiter:
         if command.shared and not is_zero(command):
             source.cancel_zeros(command.arrived_ns)
         if not (math.isfinite(twist.linear) and math.isfinite(twist.angular)):
-            self.notice(command.source, command.sender, command.arrived_ns)
+            self.notice(command.source, command.sender, command.arrived_ns, command.shared)
             return "not_finite"
         verdict = self._freshness.judge(command, source.timeout_ns)
         if verdict == "stale":
@@ -202,12 +202,12 @@ class Arbiter:
         sender.take(command, self._since_ns, verdict)
         return "" if verdict in ("fresh", "set") else "unproven"
 
-    def notice(self, source: str, sender: str, arrived_ns: int) -> None:
+    def notice(self, source: str, sender: str, arrived_ns: int, shared: bool = False) -> None:
         """Record a lost or unusable message, which may have commanded motion.
 
-        If its sender is unknown or has a shared identity, the message cancels the zeros of all
-        shared identities of `source` for which `commands.neutral_pause` is not over yet. `sender`
-        is "" and `arrived_ns` is 0 for messages that were lost.
+        If its sender is unknown ("") or has a `shared` identity, the message cancels the zeros of
+        all shared identities of `source` for which `commands.neutral_pause` is not over yet. For
+        messages that were lost, `sender` is "" and `arrived_ns` is 0.
         """
         known = self._sources.get(source)
         if known is None:
@@ -215,7 +215,7 @@ class Arbiter:
         one = known.senders.get(sender)
         if one is not None:
             one.noticed_ns = arrived_ns
-        if one is None or one.shared:
+        if shared or not sender:
             known.cancel_zeros(arrived_ns)
 
     def choose(self, now_ns: int) -> Choice:

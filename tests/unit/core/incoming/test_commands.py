@@ -26,7 +26,7 @@ from acsard.core.incoming.commands import (
     Bindings,
     Receiver,
     caller_name,
-    sender,
+    claimed_identity,
 )
 from acsard.core.messages.encodings import FORMATS, DecodeError, Format, encode
 from acsard.core.messages.schema import JointState, TwistStamped
@@ -787,14 +787,17 @@ def test_the_sender_over_rmw_is_the_publisher() -> None:
 
 def test_one_who_sends_what_cannot_be_read_is_the_same_sender_as_before() -> None:
     good = arrival(written(twist(), "json"), sender="z1", stamp_ns=5)
-    assert sender(replace(good, payload=b"hello")) == RECEIVER.command(good).sender
+    bad = claimed_identity(replace(good, payload=b"hello"))
+    assert (bad.sender, bad.shared) == (RECEIVER.command(good).sender, True)
     ros = by_ros("rmw", twist())
-    assert sender(replace(ros, payload=b"")) == RECEIVER.command(ros).sender
+    bad = claimed_identity(replace(ros, payload=b""))
+    assert (bad.sender, bad.shared) == (RECEIVER.command(ros).sender, False)
 
 
 def test_half_a_gid_passes_for_no_other_sender() -> None:
     nameless = public_name("z1")
-    assert sender(by_ros("rmw", twist(), attachment=bytes.fromhex(nameless))) == ""
+    half = by_ros("rmw", twist(), attachment=bytes.fromhex(nameless))
+    assert claimed_identity(half).sender == ""
 
 
 # the project's own attachment
@@ -898,7 +901,7 @@ def test_the_certificate_in_the_key_is_part_of_the_sender_s_name() -> None:
     came = arrival(written(twist(), "json"), key="cmd/app/anna", attachment=signed(stamp=9))
     told = receiver.command(came)
     assert (told.source, told.sender, told.clock) == ("app", *[f"{JOYSTICK} [anna]"] * 2)
-    assert sender(came) == told.sender
+    assert claimed_identity(came).sender == told.sender
     by_zenoh = receiver.command(replace(came, attachment=b"", sender="z1", stamp_ns=5))
     assert by_zenoh.sender == f"{Z1} [anna]"
     by_key = receiver.command(replace(came, attachment=b""))
@@ -913,7 +916,7 @@ def test_a_sender_id_under_a_second_certificate_is_refused(first: str, second: s
     with pytest.raises(DecodeError, match="already in use") as raised:
         receiver.command(replace(came, key=f"cmd/app{second}"))
     assert raised.value.reason == "other_certificate"
-    assert receiver.command(came).sender == sender(came)
+    assert receiver.command(came).sender == claimed_identity(came).sender
 
 
 def test_what_many_share_and_what_comes_by_ros_is_bound_to_no_certificate() -> None:

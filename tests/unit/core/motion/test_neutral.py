@@ -97,7 +97,7 @@ def test_what_may_be_a_speed_of_a_shared_identity_ends_the_wait_of_each_shared_z
         bench.wait(20).send(HIGH, REST, "a", shared=True)
         bench.wait(wait_ms)
         if other == "unreadable":
-            bench.unreadable(HIGH, name)
+            bench.unreadable(HIGH, name, shared=True)
         elif other == "stale":
             assert bench.stamped(HIGH, 5000.0, "b", GO, "b", shared=True) == "stale"
         else:
@@ -125,13 +125,18 @@ def test_a_speed_on_another_source_leaves_the_zero_of_a_shared_identity() -> Non
     assert bench.driver() == "high"
 
 
-@pytest.mark.parametrize("name", ["", "never seen"])
-def test_a_message_of_an_unknown_sender_ends_the_wait_of_a_shared_zero(name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "shared", "ends"),
+    [("", False, True), ("never seen", True, True), ("never seen", False, False)],
+)
+def test_what_cannot_be_read_ends_the_wait_of_a_shared_zero_unless_its_sender_is_another_one(
+    name: str, shared: bool, ends: bool
+) -> None:
     bench = Bench(HIGH, armed=False)
     bench.send(HIGH, REST, "a", shared=True)
-    bench.unreadable(HIGH, name)
+    bench.unreadable(HIGH, name, shared)
     bench.wait(1001).send(HIGH, GO, "a", shared=True)
-    assert bench.driver() == ""
+    assert (bench.driver() == "") is ends
 
 
 def test_messages_that_were_lost_unread_end_the_wait_of_a_shared_zero() -> None:
@@ -464,7 +469,7 @@ def test_no_twist_is_followed_of_a_sender_that_no_zero_has_armed(
             assert bench.driver() == ""
             continue
         if kind == "unreadable":
-            bench.unreadable(HIGH, name)
+            bench.unreadable(HIGH, name, shared)
             refused = kind
         elif kind == "stamped":
             refused = bench.stamped(HIGH, late_ms, name, TWISTS[name], name, shared)
