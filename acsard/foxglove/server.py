@@ -148,16 +148,16 @@ class Settings:
             return news | (asked(self._known, wishes.keys()) if wishes else {})
 
     def refresh(self, here: bool) -> dict[str, Any]:
-        """Make the waiting changes, or query the settings again if a viewer needs them.
+        """Make one waiting change, or query the settings again if a viewer needs them.
 
-        `here` is false if the daemon is gone. Return the settings that changed. This call may wait
-        for the daemon.
+        `here` is false if the daemon is gone. Return the settings that changed. This call waits for
+        at most two replies of the daemon.
         """
-        if self._wishes.waiting:
-            news = dict[str, Any]()
-            for wishes in self._wishes.take():
-                news |= self._change(wishes)
-            return news
+        wishes = self._wishes.pop()
+        if wishes is not None:
+            if self._wishes.waiting:
+                self._wishes.wake()  # the next round makes the next change
+            return self._change(wishes)
         with self._lock:
             age_ns = clock.mono_ns() - self._read_ns
             due = (self._asked and age_ns > NS_PER_S) or (self._followed and age_ns > POLL_NS)

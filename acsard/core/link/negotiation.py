@@ -135,8 +135,8 @@ sum may be a coincidence."""
 CORNER = 0.025
 """A run counts as an echo only if a speed change in it differs by more than this from the change
 before it, rad/s. Speeds in lines are rounded to 0.01 rad/s, so on a straight ramp two changes
-differ by up to 0.02 rad/s. Therefore an echo is not detected while all ramps are gentler than about
-0.025 rad/s per line, which is 0.25 m/s2 with wheels of 0.1 m at 100 Hz."""
+differ by up to 0.02 rad/s. Therefore an echo may stay undetected while all ramps are gentler than
+0.025 rad/s per line, which is 0.125 m/s2 with wheels of 0.05 m at 100 Hz."""
 
 LINES = 8
 """Number of the newest sent lines with which `EchoDetector` compares a report. At 100 Hz, this
@@ -197,8 +197,8 @@ class EchoDetector:
       steady ramp exactly, but it rounds off the start and the end of the ramp.
 
     At rest every board looks like an echo, so a run without changes proves nothing. A far end that
-    echoes and also answers is detected as soon as one that only echoes. An example is an adapter
-    for RS-485 with a board behind it.
+    echoes and also answers is detected as soon as one that only echoes, unless all ramps are gentle
+    (see `CORNER`). An example is an adapter for RS-485 with a board behind it.
 
     A board that reports its set points looks exactly like an echo, and so may a simulator whose
     wheels have no lag. The daemon then does not drive until the port is opened again, and reports

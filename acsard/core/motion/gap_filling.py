@@ -194,8 +194,10 @@ class Confirmation:
             believed: The function that replaces the speeds of wheels that are known to be faulty.
         """
         period, held, seconds = self._period, self._held, line.dt + line.gap + skipped
+        # A long time counts as two periods, so that a gap changes the mean little, but a slower
+        # board changes it in the end.
+        self._period += SMOOTHED * (min(seconds, 2 * period) - period) if period else seconds
         if not held and (seconds <= 2 * period or not period or line.turned is not None):
-            self._period = period + SMOOTHED * (seconds - period) if period else seconds
             return [line], []
         self._seconds = seconds = seconds + (self._seconds if held else 0.0)
         most = (self._acceleration * period + SLACK) * period / seconds

@@ -106,8 +106,10 @@ def test_changes_beyond_the_limit_are_refused_in_words() -> None:
     for _ in range(WISHES + 1):
         made.set({KEY: 7.0})
     assert words() == [f"not set: {WISHES} earlier changes wait for the daemon; try again"]
-    made.refresh(here=True)
-    assert len(robot.asked) == WISHES
+    for number in range(1, WISHES + 1):
+        made.refresh(here=True)
+        # Each round of the bridge makes one change, because each may wait for the daemon.
+        assert len(robot.asked) == number
 
 
 def test_the_end_of_one_subscription_does_not_end_the_others(

@@ -264,6 +264,14 @@ def test_a_wheel_that_is_known_to_be_faulty_makes_no_line_doubtful() -> None:
     assert doubtful.hear(one(0, 0.0, 14.0), 0.51, bridged=0.5) == ([2], [])
 
 
+def test_a_slower_board_makes_the_usual_time_longer() -> None:
+    doubtful = Doubtful()
+    for _ in range(300):
+        doubtful.hear(STILL, 0.05)
+    wild = one(0, 0.0, 14.0)
+    assert doubtful.hear(wild, 0.05) == ([302], [])
+
+
 def test_on_a_slow_link_the_usual_time_is_longer() -> None:
     slow = Doubtful()
     slow.confirmation = Confirmation(FeedbackConfig())
