@@ -9,8 +9,8 @@ import sys
 
 from msgspec.structs import replace
 
-from acsard.core.messages.one_line import short
 from acsard.core.messages.schema import BatterySummary
+from acsard.core.messages.short_texts import short
 from acsard.core.motion.arbiter import Choice
 from acsard.core.motion.arbiter_text import chosen
 from acsard.top.drive_screen import lines

@@ -33,7 +33,7 @@ from acsard.core.config.settings import (
     SimConfig,
     Source,
 )
-from acsard.core.config.writing import document
+from acsard.core.config.toml_text import document
 from acsard.core.messages.schema import RobotState
 from acsard.host import real_time
 from acsard.host.errors import MendableError

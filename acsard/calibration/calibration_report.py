@@ -14,7 +14,7 @@ from acsard.calibration.odometry_noise import METRES
 from acsard.calibration.plausibility import RATIO, TRACK
 from acsard.calibration.solve import Calibration
 from acsard.core.config.settings import DriveConfig
-from acsard.core.config.writing import excerpt
+from acsard.core.config.toml_text import excerpt
 from acsard.core.formatting import many
 from acsard.terminal.output import table
 

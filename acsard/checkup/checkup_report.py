@@ -14,7 +14,7 @@ from acsard.checkup.findings import REST, Finding, Verdict
 from acsard.core.config.contradictions import contradictions
 from acsard.core.config.parsing import effective, from_builtins
 from acsard.core.config.settings import Config
-from acsard.core.config.writing import excerpt
+from acsard.core.config.toml_text import excerpt
 
 Changes = dict[str, object]
 """New configuration values by dotted key, such as `mcu.port`."""

@@ -12,7 +12,7 @@ import msgspec
 from acsard.cli.common import add_config, load
 from acsard.core.config.contradictions import warnings
 from acsard.core.config.parsing import effective
-from acsard.core.config.writing import document
+from acsard.core.config.toml_text import document
 from acsard.daemon.robot_description import robot_description
 
 

@@ -31,8 +31,8 @@ from acsard.client.synchronous import decoder
 from acsard.core import formatting
 from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.keys_and_roles import TOPICS, by_key
-from acsard.core.messages.one_line import SHORT, short
 from acsard.core.messages.schema import MESSAGES
+from acsard.core.messages.short_texts import SHORT, short
 from acsard.daemon.bus.robot_discovery import ALL, follow, named, present, robot_of
 from acsard.daemon.bus.subscription import encoded
 from acsard.host import clock

@@ -16,8 +16,8 @@ from contextlib import suppress
 import msgspec
 from msgspec import Struct
 
-from acsard.core.config.editing import edited
 from acsard.core.config.parsing import ConfigError
+from acsard.core.config.toml_editing import edited
 from acsard.host.child import environment
 from acsard.host.extras import install
 

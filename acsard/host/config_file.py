@@ -10,9 +10,9 @@ from pathlib import Path
 
 from msgspec import Struct
 
-from acsard.core.config.editing import edited
 from acsard.core.config.parsing import ConfigError, parse
 from acsard.core.config.settings import Config
+from acsard.core.config.toml_editing import edited
 from acsard.host.atomic_file import replace, sync
 from acsard.host.config_edit_process import edited_apart
 from acsard.host.errors import Exit, ExitError, MendableError

@@ -13,7 +13,7 @@ from msgspec import Struct
 from acsard.core.config.live import changed, flat
 from acsard.core.config.parsing import ConfigError, effective, parse
 from acsard.core.config.settings import Config
-from acsard.core.config.writing import document
+from acsard.core.config.toml_text import document
 from acsard.core.formatting import printable
 from acsard.core.guard import Memory
 from acsard.core.robot import Robot

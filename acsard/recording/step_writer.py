@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple
 
 from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
-from acsard.core.config.writing import document
+from acsard.core.config.toml_text import document
 from acsard.core.formatting import many
 from acsard.core.values import NS_PER_S, Event, Instant
 from acsard.host.version import version

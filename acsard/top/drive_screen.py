@@ -9,8 +9,8 @@ from msgspec import Struct
 from rich.text import Text
 
 from acsard.core.formatting import printable
-from acsard.core.messages.one_line import place, speeds
 from acsard.core.messages.schema import RobotState
+from acsard.core.messages.short_texts import place, speeds
 from acsard.top.text import MODES, flow
 
 HELP = (

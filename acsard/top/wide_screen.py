@@ -11,8 +11,8 @@ from collections.abc import Callable, Sequence
 from rich.text import Text
 
 from acsard.core.formatting import rough, signed
-from acsard.core.messages.one_line import power
 from acsard.core.messages.schema import Info, RobotState, SourceState, Spread
+from acsard.core.messages.short_texts import power
 from acsard.core.motion.gyro import WORDS
 from acsard.core.values import NS_PER_S
 from acsard.daemon.latencies import NAMES

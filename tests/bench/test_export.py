@@ -17,7 +17,7 @@ from msgspec.structs import replace
 
 from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
-from acsard.core.config.writing import document
+from acsard.core.config.toml_text import document
 from acsard.core.guard import Guard
 from acsard.core.robot import Robot
 from acsard.core.values import Inputs, Instant, Outputs, Recording

@@ -11,7 +11,7 @@ from typing import Any
 from acsard.core.config.named_faults import FAULTS
 from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
-from acsard.core.config.writing import document
+from acsard.core.config.toml_text import document
 from acsard.core.guard import Guard
 from acsard.core.robot import Robot
 from acsard.core.simulator.fake_mcu import FakeMcu

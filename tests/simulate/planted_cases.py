@@ -102,7 +102,7 @@ CASES = (
     fault(
         "case 11",
         "TX joined to RX looks like a board, and the daemon drives it",
-        "core/link/negotiation.py",
+        "core/link/echo_detector.py",
         "REPORTS = 20",
         "REPORTS = 1_000_000_000",
     ),

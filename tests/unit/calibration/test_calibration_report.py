@@ -8,7 +8,7 @@ from msgspec import structs
 from acsard.calibration.calibration_report import NAMES, keys, parts, report
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import DriveConfig
-from acsard.core.config.writing import excerpt
+from acsard.core.config.toml_text import excerpt
 from acsard.terminal.output import SENTENCES, plain
 from tests.unit.calibration.cut import calibrated, table, usual
 

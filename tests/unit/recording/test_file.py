@@ -15,7 +15,7 @@ from msgspec.structs import replace
 
 from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
-from acsard.core.config.writing import document
+from acsard.core.config.toml_text import document
 from acsard.core.values import NS_PER_S, Instant
 from acsard.host.errors import RecordingError
 from acsard.recording.end_record import EndRecord, read_end

@@ -28,7 +28,7 @@ from acsard.calibration.log_table import RefusedError
 from acsard.calibration.runs import Run
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import DriveConfig, OdometryConfig
-from acsard.core.config.writing import excerpt
+from acsard.core.config.toml_text import excerpt
 from acsard.terminal.output import plain
 from tests.unit.calibration.cut import BASE, IDEAL, log_of, table
 from tests.unit.calibration.guided.played import Player, usual_setup

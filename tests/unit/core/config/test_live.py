@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from acsard.core.config.live import LIVE, changed, flat, live
 from acsard.core.config.parsing import ConfigError, effective, parse
 from acsard.core.config.settings import Config, LimitsConfig, RobotConfig
-from acsard.core.config.writing import document
+from acsard.core.config.toml_text import document
 from tests.each import each
 
 CONFIG = Config(robot=RobotConfig("r7"))

@@ -8,7 +8,6 @@ import re
 import pytest
 from msgspec.structs import replace
 
-from acsard.core.messages.one_line import SHORT, place, short, speeds
 from acsard.core.messages.schema import (
     Battery,
     BatterySummary,
@@ -25,6 +24,7 @@ from acsard.core.messages.schema import (
     TwistWithCovariance,
     Vector3,
 )
+from acsard.core.messages.short_texts import SHORT, place, short, speeds
 from tests.each import each
 
 HEADER = Header(Time(), "odom")

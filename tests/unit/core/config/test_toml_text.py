@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from acsard.core.config.parsing import effective, from_builtins, parse
 from acsard.core.config.settings import Config, McuConfig
-from acsard.core.config.writing import document, excerpt
+from acsard.core.config.toml_text import document, excerpt
 from tests.each import each
 from tests.unit.keys import KEYS
 

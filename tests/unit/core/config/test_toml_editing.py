@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from tomlkit.exceptions import NonExistentKey
 
-from acsard.core.config.editing import edited
 from acsard.core.config.parsing import ConfigError, parse
+from acsard.core.config.toml_editing import edited
 from tests.each import each
 
 KEYS: dict[str, object] = {
