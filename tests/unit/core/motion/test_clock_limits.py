@@ -383,7 +383,7 @@ def test_numbers_tell_a_pause_from_a_loss(
 BACK = 30 * NS_PER_S
 """The time by which a clock is set back in these tests, ns."""
 
-Road = list[tuple[int, int, int]]
+Road = list[tuple[int, float, float]]
 """Messages in the order of their arrival: number, true time of sending and of arrival in periods.
 The clock is set back by `BACK` before number 101 is sent at period 1."""
 
