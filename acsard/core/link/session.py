@@ -46,9 +46,9 @@ has stopped the motors by itself."""
 
 FORGET_NS = 3 * NS_PER_S
 """The fields of the status lines from before the last opening of the port are forgotten when the
-link has been up, and this computer on time, for this time, ns. A board reports each field at least
-once a second. Until then a field keeps its value, so a pressed emergency stop holds the latch of
-its stop while the cable is pulled and put back."""
+link has been up for this time, ns, without the steps in which this computer was late. A board
+reports each field at least once a second. Until then a field keeps its value, so a pressed
+emergency stop holds the latch of its stop while the cable is pulled and put back."""
 
 IDENTITY = b"!acsard-mcu "
 """First bytes of the line with which an MCU with acsard's firmware identifies itself after
@@ -81,9 +81,9 @@ class McuSession:
         """Monotonic time of arrival of the last status line that is not forgotten, ns."""
         self._reported: tuple[BoardStatus, int | None] = (BoardStatus(), None)
         """`status` and `status_ns` as the lines since the last opening of the port make them."""
-        self._awaiting, self._unsettled_ns = True, 0
-        """Whether fields may have to be forgotten, and the monotonic time of the last update in
-        which the link was not up or this computer was late, ns."""
+        self._awaiting, self._settled_ns, self._judged_ns = True, 0, 0
+        """Whether fields may have to be forgotten, for how long the link has been up without late
+        steps, and the monotonic time of the last update, ns."""
         self.reopened = self.forgot = False
         """Whether the last `update` found the port opened again, and whether it forgot the fields
         that the board has not reported since the opening."""
@@ -270,11 +270,15 @@ class McuSession:
         # see a lost link first.
         link.judge(now_ns, may_rise=not self._starting_over)
         up = link.state == "up"
-        if not up or self.lateness.step_s:
-            self._unsettled_ns = now_ns
-        elif self._awaiting and now_ns - self._unsettled_ns >= FORGET_NS:
-            self._awaiting, self.forgot = False, True
-            self.status, self.status_ns = self._reported
+        if self._awaiting:
+            if not up:
+                self._settled_ns = 0
+            elif not self.lateness.step_s:
+                self._settled_ns += now_ns - self._judged_ns
+            if self._settled_ns >= FORGET_NS:
+                self._awaiting, self.forgot = False, True
+                self.status, self.status_ns = self._reported
+        self._judged_ns = now_ns
         quiet = not up and link.silent(now_ns) and now_ns - check.settled_ns > self.quiet_ns
         if quiet and (check.state == "plain" or check.checked):
             check.begin()

@@ -206,8 +206,9 @@ class Arbiter:
         """Record a lost or unusable message, which may have commanded motion.
 
         If its sender is unknown ("") or has a `shared` identity, the message cancels the zeros of
-        all shared identities of `source` for which `commands.neutral_pause` is not over yet. For
-        messages that were lost, `sender` is "" and `arrived_ns` is 0.
+        all shared identities of `source` for which `commands.neutral_pause` was not over when it
+        arrived. Of messages that were lost, the time is unknown: `sender` is "" and `arrived_ns` is
+        0, and each zero is cancelled that has not armed its sender yet.
         """
         known = self._sources.get(source)
         if known is None:

@@ -76,6 +76,10 @@ class Rolling:
     def __init__(self, quiet: float = math.inf) -> None:
         """Start. The daemon commands rest after `quiet` s without feedback."""
         self._quiet = quiet
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget the implausible lines since the last plausible one."""
         self._lost = self._gap = self._bridged = self._counted = 0.0
         """Times, s, covered by implausible lines without counts (`_lost`), by the gaps before these
         lines (`_bridged` if they can be filled, else `_gap`), and by implausible lines with counts
@@ -121,8 +125,7 @@ class Rolling:
             self._turned, unknown + self._gap, lost + filled + self._counted + dt,
         )  # fmt: skip
         if self._skipped:
-            self._lost = self._gap = self._bridged = self._counted = 0.0
-            self._turned, self._skipped = NOWHERE, 0
+            self.forget()
         if line.turned is not None:
             pieces, seen, seconds = _some(times(speeds, lost + filled)), line.turned, dt
             turned, bridged = plus(turned, line.turned), 0.0
@@ -173,6 +176,10 @@ class Confirmation:
         self._acceleration = feedback.wheel_acceleration
         self._period = 0.0
         """Usual time between two lines, s, 0 before the first one."""
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget the lines that are held."""
         self._held: list[Feedback] = []
         self._seconds = 0.0
         """Time that the held lines cover, s, with the gaps before them."""

@@ -136,8 +136,11 @@ class Odometry:
     def set_pose(self, pose: Pose) -> None:
         """Set the pose of base_link in odom, with the uncertainty of an initial pose.
 
-        The angles of the wheels do not change.
+        The angles of the wheels do not change. Motion that is not in the pose yet, of lines that
+        are held or were impossible, is forgotten, because it came before.
         """
+        self._confirmation.forget()
+        self._rolling.forget()
         self._path.set(pose)
         self._steps.clear()
         self._uncertainty.set(pose.yaw)

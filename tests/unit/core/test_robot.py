@@ -744,6 +744,18 @@ def test_a_late_step_leaves_a_new_board_the_whole_time_for_its_reports() -> None
     assert bench.answer("clear").success
 
 
+def test_a_computer_that_is_late_now_and_then_forgets_the_board_before_too() -> None:
+    bench = Button(DRIVER_FAULT)
+    bench.linked()
+    replugged(bench, b"")
+    for _ in range(3):
+        assert not bench.answer("clear").success
+        for _ in range(120):
+            bench.step()
+        bench.step(ms=90)
+    assert bench.answer("clear").success
+
+
 # the battery
 
 

@@ -234,6 +234,19 @@ def test_setting_the_pose_makes_it_as_certain_as_at_the_start() -> None:
     assert robot.fold(feedback(0.0, 0.0, 0.01)).covariance == START
 
 
+def test_motion_that_is_not_in_the_pose_yet_does_not_change_a_pose_that_is_set_meanwhile() -> None:
+    robot = odometry()
+    for line in robot.confirmed(feedback(20.0, 20.0, 0.01))[0]:
+        robot.fold(line)
+    doubtful = Feedback(AT, WheelSpeeds(20.0, 20.0, 60.0, 20.0), 0.3)
+    assert robot.confirmed(doubtful) == ([], 0)
+    robot.skip(feedback(20.0, 20.0, 0.01))
+    robot.set_pose(Pose())
+    lines, dropped = robot.confirmed(feedback(20.0, 20.0, 0.01))
+    assert (len(lines), dropped) == (1, 0)
+    assert robot.fold(lines[0]).pose.x == pytest.approx(20.0 * 0.05 * 0.01)
+
+
 # the covariance
 
 
