@@ -223,7 +223,8 @@ def test_commands_that_were_lost_are_not_taken_for_a_pause(way: Way) -> None:
     assert obeyed == 0
 
 
-@each("period", [1.9, 2.1, 4.9])
+@pytest.mark.slow
+@each("period", [2.1, 4.9])
 @each("way", STAMPED)
 def test_a_slow_sender_drives_a_source_with_a_long_timeout(way: Way, period: float) -> None:
     """Commands that were further apart than 2 s never proved their delays."""
@@ -236,6 +237,7 @@ def test_a_slow_sender_drives_a_source_with_a_long_timeout(way: Way, period: flo
     assert world.state.mode == "driving", (way, period, world.state.reason)
 
 
+@pytest.mark.slow
 @each("way", STAMPED)
 def test_the_old_commands_of_a_slow_sender_are_not_followed(way: Way) -> None:
     """It sends every 3 s with a timeout of 5 s, and the network begins to take 20 s."""
