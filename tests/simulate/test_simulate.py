@@ -484,7 +484,7 @@ def test_some_plans_have_inputs_and_are_legal_and_an_older_product_gets_none() -
         assert 4 <= sum(kind in kinds(one) for one in plans) <= 30
     for one in with_inputs:
         assert problems(one["config"]) == []
-        if kinds(one) == {"stop"}:
+        if kinds(one) == {"stop"} and "moment" not in one:
             faults = {event["fault"][0] for event in one["events"] if event["do"] == "board"}
             assert faults == {"bumper_pressed"}
             assert not {"reset", "restart", "unplug"} & {event["do"] for event in one["events"]}
@@ -522,8 +522,9 @@ def driven(**changes: Any) -> Plan:
 
 @pytest.mark.slow
 def test_in_a_quarter_of_the_plans_nobody_outranks_a_sender_that_keeps_all_rules() -> None:
-    plans = [Run(plan).liveness for plan in map(made, range(80))]
-    assert 12 <= sum(bool(one.lawful) for one in plans) <= 32
+    plans = [plan for plan in map(made, range(100)) if "moment" not in plan]
+    lawful = sum(bool(Run(plan).liveness.lawful) for plan in plans)
+    assert 0.15 <= lawful / len(plans) <= 0.4
 
 
 @pytest.mark.parametrize("noted", [True, False])
