@@ -285,7 +285,7 @@ class _Clock:
             self._shown += doubted[1]
         if lost and accepted is not None:
             back = accepted[0] - stamp_ns - self._shown
-            if back > 0 and 0 <= accepted[1] < number:
+            if back > 0 and accepted[1] >= 0:
                 self._doubted = self._delay, back, accepted[0]
         elif departed > self.gap_ns and silence > self.gap_ns:
             self._paused = True

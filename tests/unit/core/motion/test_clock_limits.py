@@ -5,6 +5,7 @@ A sender sends at 20 Hz to a source with a timeout of 250 ms, unless a test says
 
 from __future__ import annotations
 
+import pickle
 from itertools import count
 
 import pytest
@@ -171,7 +172,7 @@ def test_a_proof_lasts_over_the_longest_timeout_of_the_sources_of_a_sender() -> 
     sender, verdicts = Sender(known=False), list[Verdict]()
     for _ in range(4):
         for sender.timeout in (PATIENT, TIMEOUT):
-            verdicts.append(sender.sends(3 * NS_PER_S // 2, 0))
+            verdicts.append(sender.sends(3 * NS_PER_S, 0))
     assert verdicts == ["first", "unproven", *["fresh"] * 6]
 
 
@@ -352,6 +353,13 @@ def test_a_slow_sender_does_not_pause_between_its_commands() -> None:
     assert {sender.sends(3 * NS_PER_S, late) for _ in range(100)} == {"stale"}
 
 
+def test_stamps_that_leap_within_a_long_timeout_show_no_pause() -> None:
+    sender, late = Sender(timeout=PATIENT), 60 * NS_PER_S
+    sender.sends(PERIOD + late + 3 * NS_PER_S, late + 3 * NS_PER_S)
+    assert sender.sends(3 * NS_PER_S, late) == "stale"
+    assert set(sender.steadily(late, 100)) == {"stale"}
+
+
 def test_stamps_that_leap_in_commands_that_came_together_show_no_pause() -> None:
     """The daemon drops commands when too many come at once, as after a suspend of its computer."""
     sender, late = Sender(), 8 * NS_PER_S
@@ -363,7 +371,17 @@ def test_stamps_that_leap_in_commands_that_came_together_show_no_pause() -> None
 
 @each(
     ("before", "then", "verdict"),
-    [(7, 8, "set"), (7, 51, "stale"), (7, 9, "stale"), (7, None, "set"), (None, 8, "set")],
+    [
+        (7, 8, "set"),
+        (7, 51, "stale"),
+        (7, 9, "stale"),
+        (7, None, "set"),
+        (None, 8, "set"),
+        (0, 1, "set"),
+        (0, 2, "stale"),
+        (7, 0, "stale"),
+        (7, 7, "stale"),
+    ],
 )
 def test_numbers_tell_a_pause_from_a_loss(
     before: int | None, then: int | None, verdict: Verdict
@@ -442,6 +460,42 @@ def test_a_clock_is_set_back_while_every_command_comes_twice(later: float) -> No
     assert sender.freshness.forgiven_ns <= PERIOD
 
 
+@each("known", [False, True])
+@each(
+    ("number", "older", "after", "changes"),
+    [
+        (9, 0, 1, False),
+        (9, 1, 1, False),
+        (9, 0, 2 * NS_PER_S, False),
+        (0, 1, 1, False),
+        (9, 0, 2 * NS_PER_S + 1, True),
+        (9, -1, 1, True),
+        (10, 1, 1, True),
+        (None, 1, 1, True),
+    ],
+)
+def test_a_repeated_command_changes_nothing_until_the_sender_pauses(
+    known: bool, number: int | None, older: int, after: int, changes: bool
+) -> None:
+    """The stamp is `older` than that of number 9, ns, and the command comes `after` it, ns."""
+    sender = Sender(known=False)
+    verdicts = [sender.sends(PERIOD, 0, max(0, n)) for n in range(-20 if known else 6, 10)]
+    assert verdicts[-1] == ("fresh" if known else "unproven")
+    before = pickle.dumps(sender.freshness)
+    assert sender.sends(after, after + older, number) == "stale" or changes
+    assert (pickle.dumps(sender.freshness) != before) == changes
+
+
+@each("older", [0, 1, -1])
+def test_a_repeated_command_of_a_clock_that_was_set_back_changes_nothing(older: int) -> None:
+    """Its stamp is near that of the last accepted command, and later than that of the last one."""
+    sender = Numbered()
+    sender.numbered(101, 1, 1, BACK)
+    before = pickle.dumps(sender.freshness)
+    sender.numbered(100, -older / PERIOD, 1.1)
+    assert (pickle.dumps(sender.freshness) != before) == (older < 0)
+
+
 SWAPS: dict[str, Road] = {
     "the last one before the adjustment comes late": [(102, 2, 2), (101, 0, 2.1), (103, 3, 3)],
     "the first one after it comes late": [(102, 2, 2), (101, 1, 2.1), (103, 3, 3)],
@@ -502,6 +556,43 @@ def test_commands_from_before_an_adjustment_show_no_second_one_when_they_are_rep
     for number in (98, 99):
         sender.numbered(number, number - 100, 61)
     assert set(sender.after(161, 100, late=100.0)) == {"stale"}
+
+
+def test_a_late_command_from_before_an_adjustment_hides_no_part_of_it() -> None:
+    """The clock is set back by 450 ms. Only the next two commands are earlier than the last one."""
+    sender, back = Numbered(), 9 * PERIOD
+    sender.numbered(102, 2, 2, back)
+    assert sender.numbered(101, 0.5, 8) == "stale"
+    assert "set" in [sender.numbered(100 + n, n, n, back) for n in range(9, 60)]
+    assert sender.freshness.forgiven_ns <= 3 * PERIOD
+
+
+def test_a_delay_from_before_an_adjustment_is_counted_although_commands_were_lost() -> None:
+    """The network took 500 ms until the clock was set back."""
+    sender = Numbered()
+    assert sender.numbered(101, 1, 11) == "stale"
+    sender.numbered(103, 3, 13, BACK)
+    assert "set" in sender.after(114)
+    assert 490 * MS <= sender.freshness.forgiven_ns <= 500 * MS
+
+
+def test_a_stream_that_is_replayed_with_losses_shows_no_adjustment() -> None:
+    sender = Numbered()
+    for n in range(-41, 0, 2):
+        assert sender.numbered(100 + n, n, n + 100) == "stale"
+    assert {sender.numbered(101 + n, n, n + 100) for n in range(1, 100, 2)} == {"stale"}
+
+
+@pytest.mark.parametrize(("accepted", "verdict"), [(0, "set"), (None, "stale")])
+def test_lost_commands_show_an_adjustment_only_since_a_command_with_a_number(
+    accepted: int | None, verdict: Verdict
+) -> None:
+    sender = Sender()
+    assert sender.sends(PERIOD, 0, accepted) == "fresh"
+    if accepted is None:
+        sender.sends(PERIOD, 29 * NS_PER_S // 30, 0)
+    verdicts = [sender.sends(PERIOD, BACK, number) for number in range(2, 80, 2)]
+    assert ("set" in verdicts) == (verdict == "set")
 
 
 def test_numbers_that_begin_again_stop_nobody() -> None:
