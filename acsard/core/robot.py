@@ -295,11 +295,12 @@ class Robot:
             self._odometry.checks.hear(inputs.gyro)
         if not feedback:
             return ()
-        return tuple([
-            self._believe(believed, now, events)
-            for line in feedback
-            for believed in self._plausible(line, now, events)
-        ])  # fmt: skip
+        estimates: list[Estimate] = []
+        for line in feedback:
+            estimates += [
+                self._believe(one, now, events) for one in self._plausible(line, now, events)
+            ]
+        return tuple(estimates)
 
     def _forget(self) -> None:
         self._sanity.forget()

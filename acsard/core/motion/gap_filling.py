@@ -120,10 +120,8 @@ class Rolling:
         # long.
         guessed = self._lost <= MAX_LOST_S or self._skipped <= MAX_LOST
         lost, unknown = (self._lost, 0.0) if guessed else (0.0, self._lost)
-        filled = self._bridged
-        turned, unknown, known = (
-            self._turned, unknown + self._gap, lost + filled + self._counted + dt,
-        )  # fmt: skip
+        turned, filled, unknown = self._turned, self._bridged, unknown + self._gap
+        known = lost + filled + self._counted + dt
         if self._skipped:
             self.forget()
         if line.turned is not None:
