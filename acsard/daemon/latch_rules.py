@@ -80,9 +80,14 @@ def decode(robot: str, data: bytes) -> Latches:
         raise LatchFileError(f"it is damaged ({error})") from None
     if content.robot != robot:
         raise LatchFileError(f"it belongs to the robot {_safe(content.robot)!r:.60}")
+    found = content.latches
+    for latch in (found.stop, found.fault, found.inactive):
+        if latch is not None and any(cause.earlier for cause in latch.earlier):
+            # No daemon writes that, and the code below cannot process causes of any depth.
+            raise LatchFileError("it is damaged (an earlier cause has causes of its own)")
     if _plain(content) != raw:
         raise LatchFileError("it is damaged (a field name is missing or unknown)")
-    return content.latches.after_restart()
+    return found.after_restart()
 
 
 def at_start(why: str) -> str:

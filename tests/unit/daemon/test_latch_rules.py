@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import msgspec
 import pytest
 from hypothesis import given
@@ -61,6 +63,24 @@ def test_a_text_of_a_stranger_is_kept_up_to_500_characters() -> None:
 def test_all_latches_come_back_marked_as_kept() -> None:
     assert decode("acsar", encode("acsar", ALL)) == ALL.after_restart()
     assert decode("acsar", encode("acsar", Latches())) == Latches()
+
+
+@each("depth", [1, 2, 300])
+@each("name", ["stop", "fault", "inactive"])
+def test_an_earlier_cause_with_causes_of_its_own_is_damage(name: str, depth: int) -> None:
+    one = json.dumps(json.loads(encode("acsar", Latches(stop=STOP)))["latches"]["stop"])
+    nested = one
+    for _ in range(depth):
+        nested = f'{one[:-1]}, "earlier": [{nested}]}}'
+    latches = (
+        f'{{"stop": null, "fault": null, "inactive": null, "lowered": {{}}, "{name}": {nested}}}'
+    )
+    data = f'{{"format": 1, "robot": "acsar", "latches": {latches}}}'.encode()
+    if depth == 1:
+        assert decode("acsar", data) is not None
+        return
+    with pytest.raises(LatchFileError, match="causes of its own"):
+        decode("acsar", data)
 
 
 @given(several)
