@@ -368,6 +368,32 @@ def _routed(plan: Plan, dice: random.Random) -> None:
     plan["senders"] = [first, second | {"phases": speeds}]
 
 
+def _newcomers(plan: Plan, dice: random.Random) -> None:
+    """Let one new sender after another drive, while the network holds its first commands back.
+
+    They wait, and then arrive faster than they were sent.
+    """
+    _best(plan)["timeout"] = dice.choice((0.25, 0.5, 1.0))
+    first = _alone(plan, dice, [])
+    senders: list[dict[str, Any]] = []
+    at = 1.0
+    while at < plan["seconds"] - 6.0:
+        waits_s, faster = dice.uniform(1.5, 6.0), round(dice.uniform(1.5, 6.0), 3)
+        zeros_s = dice.choice((0.1, 0.3, 0.6, 1.3))
+        begin, end = round(at, 3), round(at + 2.0 * waits_s, 3)
+        number = len(senders)
+        newcomer = {
+            "name": f"s{number}", "id": f"s{number}/{dice.getrandbits(64):016x}",
+            "way": dice.choice(("client", "client", "page", "signed", "rmw")),
+            "hz": dice.choice((10.0, 20.0, 50.0)), "from": begin, "to": end,
+            "phases": [[begin, 0.0, 0.0], [round(begin + zeros_s, 3), *_speed(dice)]],
+            "congestion": [[begin, end, "drain", faster]],
+        }  # fmt: skip
+        senders.append(first | newcomer)
+        at = end + dice.uniform(1.0, 3.0)
+    plan["senders"] = senders
+
+
 MOMENTS: dict[str, tuple[float, Callable[[Plan], bool], Callable[[Plan, random.Random], None]]] = {
     "late step": (0.05, _any, _late_step),
     "half duplex": (0.03, _is_plain, _half_duplex),
@@ -378,5 +404,6 @@ MOMENTS: dict[str, tuple[float, Callable[[Plan], bool], Callable[[Plan, random.R
     "slow sender": (0.03, _any, _slow_sender),
     "clock set back": (0.02, _any, _set_back),
     "behind a router": (0.02, _any, _routed),
+    "backlogs of newcomers": (0.02, _any, _newcomers),
 }
 """The share of the plans that have each moment, whether a plan can have it, and what makes it."""
