@@ -54,6 +54,9 @@ if sys.dont_write_bytecode or not os.access(__file__, os.W_OK):
 LIVE = ("bench", "firmware", "system", "systemd")
 """Directories whose tests run real processes in real time. They run before the computed tests."""
 
+NIGHTLY_OF = 3
+"""Of so many slow variations, `.ci/run` runs one and the nightly job runs the others."""
+
 LOUD = (
     "test_bad_commands.py", "test_board.py", "test_bus.py", "test_daemon.py", "test_faults.py",
     "test_faults_bus.py", "test_isolation.py", "test_page_lets_go.py", "test_period.py",
@@ -107,15 +110,20 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> _ByUnit:
 
 
 def _all_but_some_are_slow(items: list[pytest.Item]) -> None:
+    """Leave most variations of a test to the marked tests, and most of these to the nightly job."""
     seen = Counter[str]()
     for item in items:
         one_in = item.get_closest_marker("variations")
         if one_in is None:
             continue
         test = item.nodeid.partition("[")[0]
-        if seen[test] % one_in.args[0]:
-            item.add_marker(pytest.mark.slow)
+        round_, place = divmod(seen[test], one_in.args[0])
         seen[test] += 1
+        if place:
+            item.add_marker(pytest.mark.slow)
+            # The rounds begin at different places, so that each place is played in some round.
+            if (place + round_) % NIGHTLY_OF != 1:
+                item.add_marker(pytest.mark.nightly)
 
 
 @pytest.hookimpl(tryfirst=True)  # runs before `-m` selects tests

@@ -23,6 +23,11 @@ def quiet() -> World:
     return world
 
 
+def more(count: int) -> object:
+    """Return a run with more random cases, for the nightly job."""
+    return pytest.param(count, marks=[pytest.mark.slow, pytest.mark.nightly])
+
+
 def long(count: int) -> object:
     return pytest.param(count, marks=[pytest.mark.soak, pytest.mark.timeout(1800)])
 
@@ -42,7 +47,7 @@ def cleared(way: Way, *names: str) -> tuple[World, list[Speaker]]:
 
 
 @pytest.mark.variations(4)
-@pytest.mark.parametrize("count", [2, pytest.param(30, marks=pytest.mark.slow), long(100)])
+@pytest.mark.parametrize("count", [2, more(30), long(100)])
 @pytest.mark.parametrize("way", get_args(Way))
 def test_the_zeros_of_one_program_never_release_another(way: Way, count: int) -> None:
     """One client sends zeros at 10 Hz, the other always 0.5 m/s: it moved 2.1 m in 5 s."""
@@ -62,7 +67,7 @@ def test_the_zeros_of_one_program_never_release_another(way: Way, count: int) ->
         assert not moved(world, start_ns), seed
 
 
-@pytest.mark.parametrize("count", [10, pytest.param(40, marks=pytest.mark.slow), long(1000)])
+@pytest.mark.parametrize("count", [10, more(40), long(1000)])
 def test_programs_whose_stamps_come_from_several_routers_never_release_each_other(
     count: int,
 ) -> None:
@@ -220,7 +225,7 @@ def test_after_clear_a_held_key_stays_without_effect_until_it_is_let_go(way: Way
     assert "it has sent speeds for over 3 s" in world.state.reason
 
 
-@pytest.mark.parametrize("count", [4, pytest.param(60, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [4, more(60)])
 def test_a_zero_that_was_proven_never_outlives_the_speeds_behind_it(count: int) -> None:
     """One program sends one plain zero, the other 0.5 m/s with a header through heavy jitter."""
     for seed in range(count):

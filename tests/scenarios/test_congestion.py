@@ -74,6 +74,7 @@ def test_a_constant_delay_that_comes_by_a_jump_is_not_taken_for_a_clock(
 
 
 @pytest.mark.slow
+@pytest.mark.variations(5)
 @pytest.mark.parametrize("way", STAMPED)
 def test_no_shape_of_congestion_has_an_old_command_obeyed(way: Way) -> None:
     """Growth of 1 to 10 % and plateaus of 0.5 to 30 s follow one another, with jitter."""

@@ -23,7 +23,7 @@ from acsard.recording.timeline import TimelineEntry
 from tests.each import each
 from tests.scenarios.taped import happenings, recorded_world
 
-FORGERIES = [2, pytest.param(10, marks=pytest.mark.slow)]
+FORGERIES = [2, pytest.param(10, marks=[pytest.mark.slow, pytest.mark.nightly])]
 """Number of random places at which each kind of forgery is tried."""
 
 Messages = list[tuple[Topic, int, bytes]]

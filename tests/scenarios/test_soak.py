@@ -1,7 +1,7 @@
 """Nothing moves that must not, in ten thousand attempts, and for a day with a fault every minute.
 
-Each test prints its figure. The short versions run by default, and those marked slow run in
-`.ci/run`. The long ones run with
+Each test prints its figure. The short versions run by default, those marked slow run in `.ci/run`,
+and those with more random cases in the nightly job. The long ones run with
 
     pytest -m soak -s tests/scenarios/test_soak.py
 """
@@ -28,9 +28,14 @@ ZERO = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
 DAY_NS = 86_400 * NS_PER_S
 
 
-def slow(count: float) -> object:
+def slow(value: float) -> object:
     """Return a run that is too slow for every day."""
-    return pytest.param(count, marks=pytest.mark.slow)
+    return pytest.param(value, marks=pytest.mark.slow)
+
+
+def more(count: int) -> object:
+    """Return a run with more random cases, for the nightly job."""
+    return pytest.param(count, marks=[pytest.mark.slow, pytest.mark.nightly])
 
 
 def long(count: int, seconds: int) -> object:
@@ -103,7 +108,7 @@ def silence(world: World, dice: random.Random, timeout: float) -> float:
     return took
 
 
-@pytest.mark.parametrize("count", [50, slow(200), long(10_000, 1200)])
+@pytest.mark.parametrize("count", [50, more(200), long(10_000, 1200)])
 def test_after_silence_the_ramp_starts_within_the_timeout_and_a_tick(count: int) -> None:
     dice, kept, latest = random.Random(1), 0, 0.0
     for trial in range(count):
@@ -175,7 +180,7 @@ def start_over(world: World, kind: str, dice: random.Random) -> World:
     return world
 
 
-@pytest.mark.parametrize("count", [8, slow(48), long(1_000, 1800)])
+@pytest.mark.parametrize("count", [8, more(48), long(1_000, 1800)])
 def test_nothing_moves_before_neutral_after_whatever_started_over(count: int) -> None:
     dice, kept, seen = random.Random(2), 0, Counter[str]()
     world = World()
@@ -254,7 +259,7 @@ def blackhole(dice: random.Random, slow: bool, seconds: float) -> tuple[int, int
     return stale, backward, accepted
 
 
-@pytest.mark.parametrize("count", [2, slow(10), long(200, 1800)])
+@pytest.mark.parametrize("count", [2, more(10), long(200, 1800)])
 def test_no_stale_command_is_obeyed_after_a_blackhole(count: int) -> None:
     dice, stale, backward, accepted = random.Random(3), 0, 0, 0
     for trial in range(count):
@@ -473,7 +478,7 @@ def poured_out(dice: random.Random, way: Way, running: bool) -> bool:
     return moved(world, since_ns)
 
 
-@pytest.mark.parametrize("count", [3, slow(24), long(500, 1800)])
+@pytest.mark.parametrize("count", [3, more(24), long(500, 1800)])
 def test_no_backlog_moves_a_robot_that_never_heard_its_sender_nor_one_that_knows_it(
     count: int,
 ) -> None:
@@ -575,7 +580,7 @@ def stepped(dice: random.Random, way: Way, ahead: float, step: float) -> str:
     return "" if driving_again(world, speaker) else f"after the cut: {world.state.reason}"
 
 
-@pytest.mark.parametrize("count", [2, slow(16), long(400, 1800)])
+@pytest.mark.parametrize("count", [2, more(16), long(400, 1800)])
 def test_a_sender_s_clock_may_be_anything_and_be_set_at_any_time(count: int) -> None:
     dice, wrong = random.Random(8), Counter[str]()
     for trial in range(count):
@@ -678,7 +683,10 @@ def stuck(dice: random.Random, way: Way, hz: float, kind: str) -> bool:
     ("kind", "count"),
     [
         ("steady", 1),
-        *(pytest.param(kind, 6 if kind == "cuts" else 2, marks=pytest.mark.slow) for kind in KINDS),
+        *(
+            pytest.param(kind, 6 if kind == "cuts" else 2, marks=pytest.mark.nightly)
+            for kind in KINDS
+        ),
         *(
             pytest.param(kind, 100, marks=[pytest.mark.soak, pytest.mark.timeout(1800)])
             for kind in KINDS
@@ -697,7 +705,7 @@ def test_who_never_lets_go_never_drives_on_by_itself(kind: str, count: int) -> N
 
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("way", SHARED)
-@pytest.mark.parametrize("count", [4, slow(12)])
+@pytest.mark.parametrize("count", [4, more(12)])
 def test_another_s_zeros_while_one_that_looks_like_it_is_stalled_do_not_set_that_off(
     count: int, way: Way
 ) -> None:

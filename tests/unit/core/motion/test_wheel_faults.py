@@ -290,6 +290,7 @@ GOAL = 0.05
 COARSE = {(20, "reversed"): 0.25}
 """Larger share for the case in which many counts must pass before a failure shows."""
 
+NIGHTLY = [pytest.mark.slow, pytest.mark.nightly]
 SOAK = [pytest.mark.soak, pytest.mark.timeout(3600)]
 
 
@@ -297,8 +298,8 @@ SOAK = [pytest.mark.soak, pytest.mark.timeout(3600)]
     ("counts", "count"),
     [
         (3200, 4),
-        *(pytest.param(counts, 30, marks=pytest.mark.slow) for counts in (20, 96, 400)),
-        pytest.param(3200, 50, marks=pytest.mark.slow),
+        pytest.param(96, 30, marks=pytest.mark.slow),
+        *(pytest.param(*one, marks=NIGHTLY) for one in ((20, 30), (400, 30), (3200, 50))),
         *(pytest.param(counts, 1000, marks=SOAK) for counts in (20, 96, 400, 3200)),
     ],
 )
