@@ -24,8 +24,9 @@ UNKNOWN_RAD = 1.0
 """Deviation of the heading from which on the position is not judged: terms of second order, which
 are larger than those of first order then, make it far too uncertain rather than too certain."""
 
-CALM_NS = NS
-"""Time after trouble in which the wheels of a side may still seem to slip."""
+CALM_NS = 3 * NS // 2
+"""Time after trouble in which the wheels of a side may still seem to slip: one wrong speed does not
+count any more after 0.7 s, and a slip ends when the wheels have agreed for 0.5 s."""
 
 SHORTEST_NS = 10_000_000
 """Shortest period in which the counts of an encoder do not look like slip."""
@@ -66,15 +67,19 @@ class Spread:
         """Note that the next estimate has another covariance for another reason than motion."""
         self._last = None
 
+    def trouble(self, now_ns: int) -> None:
+        """Note that a line with a wrong speed may have come now."""
+        self._calm_ns = now_ns + CALM_NS
+
     def see(self, now_ns: int, estimate: Estimate, faults: set[str]) -> None:
         """Judge an estimate while the board has these faults."""
         if not self._judged:
             return
         if not faults <= DIALECTS:
-            self._calm_ns = now_ns + CALM_NS
+            self.trouble(now_ns)
         last, self._last = self._last, estimate
         if self._rough and last is not None and estimate[0] - last[0] < SHORTEST_NS:
-            self._calm_ns = now_ns + CALM_NS
+            self.trouble(now_ns)
         _, x, y, yaw, (xx, _, _, yy, _, yawyaw), _ = estimate
         if last is None or now_ns < self._calm_ns or estimate[0] - last[0] > self._longest_ns:
             self._place, self._yaw = math.sqrt(xx + yy), math.sqrt(yawyaw)
