@@ -394,6 +394,27 @@ def _newcomers(plan: Plan, dice: random.Random) -> None:
     plan["senders"] = senders
 
 
+def _later_and_later(plan: Plan, dice: random.Random) -> None:
+    """Let the network delay the commands of a foreign clock more and more.
+
+    Each delay stays for some seconds, in which the sender sends zeros and speeds.
+    """
+    _best(plan)["timeout"] = dice.choice((0.25, 0.5))
+    driver = _alone(plan, dice, [])
+    phases, congestion = [[0.0, 0.0, 0.0], [2.5, *_speed(dice)]], []
+    at, late_s = 5.0, 0.0
+    while at < plan["seconds"] - 4.0:
+        late_s += dice.choice((0.4, 0.6, 0.9))
+        end = at + dice.uniform(4.0, 8.0)
+        congestion.append([round(at, 3), round(end, 3), "jump", round(late_s, 3)])
+        while at < end - 2.5:
+            phases += [[round(at + 0.5, 3), 0.0, 0.0], [round(at + 1.5, 3), *_speed(dice)]]
+            at += dice.uniform(2.0, 3.0)
+        at = end
+    way = dice.choice(("signed", "rmw"))
+    driver |= {"way": way, "phases": phases, "congestion": congestion}
+
+
 MOMENTS: dict[str, tuple[float, Callable[[Plan], bool], Callable[[Plan, random.Random], None]]] = {
     "late step": (0.05, _any, _late_step),
     "half duplex": (0.03, _is_plain, _half_duplex),
@@ -405,5 +426,6 @@ MOMENTS: dict[str, tuple[float, Callable[[Plan], bool], Callable[[Plan, random.R
     "clock set back": (0.02, _any, _set_back),
     "behind a router": (0.02, _any, _routed),
     "backlogs of newcomers": (0.02, _any, _newcomers),
+    "later and later": (0.02, _any, _later_and_later),
 }
 """The share of the plans that have each moment, whether a plan can have it, and what makes it."""
