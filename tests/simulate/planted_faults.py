@@ -18,6 +18,14 @@ class Edit(NamedTuple):
     new: str
 
 
+KINDS = {
+    "estop": "estop", "away": "away", "battery": "battery", "driver": "driver_fault",
+    "moment": "late step",
+    "freshness halves": "backlogs of newcomers", "freshness budget": "later and later",
+}  # fmt: skip
+"""Kinds of plans by the name of a fault, or by the first word of its name."""
+
+
 class Fault(NamedTuple):
     """One planted fault."""
 
@@ -30,11 +38,7 @@ class Fault(NamedTuple):
     def kind(self) -> str:
         """The kind of inputs, or the moment, of the plans that are played; "" for all plans."""
         first = self.name.split()[0]
-        if first == "driver":
-            return "driver_fault"
-        if first == "moment":
-            return "late step"
-        return first if first in ("estop", "away", "battery") else ""
+        return KINDS.get(self.name) or KINDS.get(first, "")
 
 
 def fault(name: str, breaks: str, module: str, old: str, new: str, *more: Edit) -> Fault:
