@@ -12,6 +12,7 @@ import sys
 import tempfile
 from collections import Counter
 from pathlib import Path
+from zlib import crc32
 
 import pytest
 from hypothesis import settings
@@ -54,8 +55,8 @@ if sys.dont_write_bytecode or not os.access(__file__, os.W_OK):
 LIVE = ("bench", "firmware", "system", "systemd")
 """Directories whose tests run real processes in real time. They run before the computed tests."""
 
-NIGHTLY_OF = 3
-"""Of so many slow variations, `.ci/run` runs one and the nightly job runs the others."""
+VARIATIONS_PER_CI_TEST = 3
+"""`.ci/run` runs about one of this number of slow variations. The nightly job runs the others."""
 
 LOUD = (
     "test_bad_commands.py", "test_board.py", "test_bus.py", "test_daemon.py", "test_faults.py",
@@ -111,19 +112,22 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> _ByUnit:
 
 def _all_but_some_are_slow(items: list[pytest.Item]) -> None:
     """Leave most variations of a test to the marked tests, and most of these to the nightly job."""
-    seen = Counter[str]()
+    seen, left = Counter[str](), Counter[str]()
     for item in items:
         one_in = item.get_closest_marker("variations")
         if one_in is None:
             continue
         test = item.nodeid.partition("[")[0]
-        round_, place = divmod(seen[test], one_in.args[0])
         seen[test] += 1
-        if place:
-            item.add_marker(pytest.mark.slow)
-            # The rounds begin at different places, so that each place is played in some round.
-            if (place + round_) % NIGHTLY_OF != 1:
-                item.add_marker(pytest.mark.nightly)
+        if (seen[test] - 1) % one_in.args[0] == 0:
+            continue
+        item.add_marker(pytest.mark.slow)
+        if item.get_closest_marker("soak") or item.get_closest_marker("nightly"):
+            continue
+        left[test] += 1
+        # A digest chooses, because a fixed step would fall on the same value of one parameter.
+        if left[test] > 1 and crc32(item.nodeid.encode()) % VARIATIONS_PER_CI_TEST:
+            item.add_marker(pytest.mark.nightly)
 
 
 @pytest.hookimpl(tryfirst=True)  # runs before `-m` selects tests

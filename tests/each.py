@@ -1,4 +1,4 @@
-"""Provide `@each`: like `parametrize`, but as one test for all parameter sets.
+"""Provide parameter sets: `@each`, which makes one test of all of them, and `more`.
 
 Ten thousand tests of a microsecond take longer to distribute and report than to run. A failure
 names its parameter set.
@@ -12,8 +12,15 @@ import inspect
 from collections.abc import Callable, Coroutine, Iterable
 from typing import Any
 
+import pytest
+
 STORY_S = 60.0
 """The longest time of a test that is a coroutine."""
+
+
+def more(*values: Any) -> Any:
+    """Return a parameter set that makes a test try more random cases, for the nightly job."""
+    return pytest.param(*values, marks=[pytest.mark.slow, pytest.mark.nightly])
 
 
 def run(test: Coroutine[Any, Any, None]) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from acsard.core.incoming.commands import Arrival
 from acsard.core.incoming.queries import Query
-from tests.each import each
+from tests.each import each, more
 from tests.scenarios.speakers import SHARED, STAMPED, Speaker, Way, moved
 from tests.scenarios.world import SIGNED, World
 
@@ -21,11 +21,6 @@ def quiet() -> World:
     world = World()
     world.run(0.3)
     return world
-
-
-def more(count: int) -> object:
-    """Return a run with more random cases, for the nightly job."""
-    return pytest.param(count, marks=[pytest.mark.slow, pytest.mark.nightly])
 
 
 def long(count: int) -> object:

@@ -20,10 +20,10 @@ from acsard.recording.end_record import read_end
 from acsard.recording.file import Recording, Topic, Writing
 from acsard.recording.rows import NOTHING, Batch, Rare, Row
 from acsard.recording.timeline import TimelineEntry
-from tests.each import each
+from tests.each import each, more
 from tests.scenarios.taped import happenings, recorded_world
 
-FORGERIES = [2, pytest.param(10, marks=[pytest.mark.slow, pytest.mark.nightly])]
+FORGERIES = [2, more(10)]
 """Number of random places at which each kind of forgery is tried."""
 
 Messages = list[tuple[Topic, int, bytes]]

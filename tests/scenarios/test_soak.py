@@ -21,6 +21,7 @@ import pytest
 from acsard.core.config.settings import CommandsConfig, Config, ControlConfig, McuConfig, Source
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.values import NS_PER_S, Outputs
+from tests.each import more
 from tests.scenarios.speakers import FOREIGN, SHARED, STAMPED, Speaker, Way, backlog, moved
 from tests.scenarios.world import World
 
@@ -31,11 +32,6 @@ DAY_NS = 86_400 * NS_PER_S
 def slow(value: float) -> object:
     """Return a run that is too slow for every day."""
     return pytest.param(value, marks=pytest.mark.slow)
-
-
-def more(count: int) -> object:
-    """Return a run with more random cases, for the nightly job."""
-    return pytest.param(count, marks=[pytest.mark.slow, pytest.mark.nightly])
 
 
 def long(count: int, seconds: int) -> object:
@@ -682,11 +678,8 @@ def stuck(dice: random.Random, way: Way, hz: float, kind: str) -> bool:
 @pytest.mark.parametrize(
     ("kind", "count"),
     [
-        ("steady", 1),
-        *(
-            pytest.param(kind, 6 if kind == "cuts" else 2, marks=pytest.mark.nightly)
-            for kind in KINDS
-        ),
+        *((kind, 1) for kind in KINDS),
+        *(more(kind, 6 if kind == "cuts" else 2) for kind in KINDS),
         *(
             pytest.param(kind, 100, marks=[pytest.mark.soak, pytest.mark.timeout(1800)])
             for kind in KINDS
@@ -697,7 +690,7 @@ def test_who_never_lets_go_never_drives_on_by_itself(kind: str, count: int) -> N
     dice, found = random.Random(9), Counter[str]()
     ways: tuple[Way, ...] = (*STAMPED, "plain", "bridge")
     for trial in range(count * len(RATES_HZ)):
-        way, hz = ways[trial // len(RATES_HZ) % len(ways)], RATES_HZ[trial % len(RATES_HZ)]
+        way, hz = ways[trial % len(ways)], RATES_HZ[trial % len(RATES_HZ)]
         found[f"{way} at {hz:g} Hz"] += stuck(dice, way, hz, kind)
     print(f"\n{kind}: {found.total()} of {count * len(RATES_HZ)} moved the robot {dict(+found)}")
     assert not +found

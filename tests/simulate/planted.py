@@ -200,14 +200,15 @@ process that plays, on a machine that other work kept busy.
 
 For a fault of the emergency stop, of bumpers that let the robot drive away, of a motor driver, or
 of the battery, only plans with this input are played, about one in fifteen. For a fault that only
-a late step with several events shows, and for two faults of delayed commands, only plans with such
-a moment are played, one in twenty to fifty. A fault must be found within {fault:g} core-minutes, a
-case within {case:g}. A row keeps its last measurement. Its last column is the version of the
-simulator that measured it: a digest of the modules that make, play and judge plans. With the
-present plans, another seed may find an older row's fault. `--again` prints the present version,
-plays the seed of each row again, and lists the rows that no longer hold. "not found" says
-that no seed found the fault in the core-minutes of that row. `--missing` measures those faults
-again, and all without a row.
+a late step with several events shows, only plans with such a step are played, about one in twenty.
+For `freshness halves` and `freshness budget`, only plans with new senders whose commands are held
+back, or with delays that rise in steps, are played, about one in sixty. A fault must be found
+within {fault:g} core-minutes, a case within {case:g}. A row keeps its last measurement. Its last
+column is the version of the simulator that measured it: a digest of the modules that make, play and
+judge plans. With the present plans, another seed may find an older row's fault. `--again` prints
+the present version, plays the seed of each row again, and lists the rows that no longer hold. "not
+found" says that no seed found the fault in the core-minutes of that row. `--missing` measures those
+faults again, and all without a row.
 """
 
 COLUMNS = """

@@ -18,7 +18,7 @@ class Edit(NamedTuple):
     new: str
 
 
-KINDS = {
+PLANS_OF_FAULT = {
     "estop": "estop", "away": "away", "battery": "battery", "driver": "driver_fault",
     "moment": "late step",
     "freshness halves": "backlogs of newcomers", "freshness budget": "later and later",
@@ -38,7 +38,7 @@ class Fault(NamedTuple):
     def kind(self) -> str:
         """The kind of inputs, or the moment, of the plans that are played; "" for all plans."""
         first = self.name.split()[0]
-        return KINDS.get(self.name) or KINDS.get(first, "")
+        return PLANS_OF_FAULT.get(self.name) or PLANS_OF_FAULT.get(first, "")
 
 
 def fault(name: str, breaks: str, module: str, old: str, new: str, *more: Edit) -> Fault:

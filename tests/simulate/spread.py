@@ -24,9 +24,10 @@ UNKNOWN_RAD = 1.0
 """Deviation of the heading from which on the position is not judged: terms of second order, which
 are larger than those of first order then, make it far too uncertain rather than too certain."""
 
-CALM_NS = 3 * NS // 2
-"""Time after trouble in which the wheels of a side may still seem to slip: one wrong speed does not
-count any more after 0.7 s, and a slip ends when the wheels have agreed for 0.5 s."""
+CALM_NS = 8 * NS // 5
+"""Time after trouble in which the wheels of a side may still seem to slip. One wrong speed affects
+the comparison of the wheels for 0.7 s at 100 Hz, and for 1.05 s at 20 Hz. A slip ends when the
+wheels have agreed for 0.5 s."""
 
 SHORTEST_NS = 10_000_000
 """Shortest period in which the counts of an encoder do not look like slip."""

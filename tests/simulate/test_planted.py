@@ -9,6 +9,7 @@ import pytest
 
 from acsard.core.values import REST, Command
 from tests.simulate import planted
+from tests.simulate.bad_moments import MOMENTS
 from tests.simulate.planted import (
     CASE_MINUTES,
     FAULT_MINUTES,
@@ -21,7 +22,7 @@ from tests.simulate.planted import (
     text_of,
 )
 from tests.simulate.planted_cases import CASES
-from tests.simulate.planted_faults import FAULTS, FRESHNESS, Fault
+from tests.simulate.planted_faults import FAULTS, FRESHNESS, PLANS_OF_FAULT, Fault
 
 OPEN = {"loop end", "robot end"}
 """Faults that only plans made by hand have found so far, so that they have no row."""
@@ -42,6 +43,13 @@ def test_code_that_a_fault_adds_to_freshness_runs_there(fault: Fault) -> None:
     exec(compile(edited(fault)[FRESHNESS], FRESHNESS, "exec"), names)
     verdict = names["Freshness"]().judge(Command("app", REST, 5, 3, "clock"), 10**9)
     assert verdict in ("first", "unproven", "fresh")
+
+
+def test_each_fault_with_plans_of_its_own_has_plans() -> None:
+    inputs = {"estop", "away", "battery", "driver_fault"}
+    assert set(PLANS_OF_FAULT.values()) <= inputs | MOMENTS.keys()
+    names = {fault.name for fault in ALL}
+    assert names | {name.split()[0] for name in names} >= PLANS_OF_FAULT.keys()
 
 
 def test_there_are_a_hundred_and_four_faults_and_eleven_cases() -> None:

@@ -14,7 +14,7 @@ from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.sanity import Sanity
 from acsard.core.motion.wheel_faults import WheelFaults
 from acsard.core.values import STILL, WHEELS, WheelSpeeds
-from tests.each import each
+from tests.each import each, more
 from tests.unit.core.motion.liars import (
     AT,
     LIES,
@@ -290,7 +290,6 @@ GOAL = 0.05
 COARSE = {(20, "reversed"): 0.25}
 """Larger share for the case in which many counts must pass before a failure shows."""
 
-NIGHTLY = [pytest.mark.slow, pytest.mark.nightly]
 SOAK = [pytest.mark.soak, pytest.mark.timeout(3600)]
 
 
@@ -299,7 +298,7 @@ SOAK = [pytest.mark.soak, pytest.mark.timeout(3600)]
     [
         (3200, 4),
         pytest.param(96, 30, marks=pytest.mark.slow),
-        *(pytest.param(*one, marks=NIGHTLY) for one in ((20, 30), (400, 30), (3200, 50))),
+        *(more(*one) for one in ((20, 30), (400, 30), (3200, 50))),
         *(pytest.param(counts, 1000, marks=SOAK) for counts in (20, 96, 400, 3200)),
     ],
 )
