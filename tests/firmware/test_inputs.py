@@ -221,6 +221,7 @@ def test_bumpers_and_the_driver_s_fault_take_no_voltage(board: Board, host: Host
 # the wire
 
 
+@pytest.mark.variations(6)
 @pytest.mark.parametrize(
     ("baud", "period", "letters", "least"),
     [(115200, 10, None, 9), (115200, 10, "", 9), (115200, 10, "S", 9),

@@ -14,6 +14,7 @@ import pytest
 from acsard.core.config.settings import Config, McuConfig, SimConfig
 from acsard.core.motion.path import Path
 from acsard.core.values import Outputs, Pose
+from tests.each import more
 from tests.scenarios.world import World
 
 
@@ -76,7 +77,7 @@ class Square:
 
 
 @pytest.mark.variations(12)
-@pytest.mark.parametrize("seed", [1, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 3))])
+@pytest.mark.parametrize("seed", [1, more(2), more(3)])
 @pytest.mark.parametrize("stalls", [False, True], ids=["", "stalls"])
 @pytest.mark.parametrize(
     "counts", [16, 3200, *(pytest.param(n, marks=pytest.mark.slow) for n in (20, 96, 400, 1000))]

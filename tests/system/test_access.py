@@ -454,6 +454,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
         yield robot
 
 
+@pytest.mark.variations(8)
 @pytest.mark.parametrize("verb", VERBS)
 @pytest.mark.parametrize("who", IDENTITIES)
 def test_each_may_do_what_the_table_says_and_nothing_else(

@@ -109,6 +109,7 @@ def test_no_screen_has_a_colour_where_nobody_wants_one(
     assert colours(shown(typed_at(shared, words), tmp_path, text, NO_COLOR="1")) == []
 
 
+@pytest.mark.variations(4)
 @pytest.mark.slow
 @pytest.mark.parametrize("words", [["drive"], ["top"], ["fleet"], ["doctor"]], ids=" ".join)
 def test_a_screen_has_colours_where_nobody_minds(

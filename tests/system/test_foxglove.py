@@ -532,6 +532,7 @@ def followed(bus: Bus) -> Iterator[tuple[list[Any], list[Any]]]:
 TIMEOUT_S, TICKS_S = 0.25, 0.02
 
 
+@pytest.mark.variations(4)
 @SLOW
 @pytest.mark.parametrize("how", ["cut", "withdrawn", "killed", "left"])
 def test_whoever_is_gone_while_driving_leaves_a_robot_that_ramps_down(

@@ -262,6 +262,7 @@ def test_who_has_no_mouse_sets_the_slider_by_the_arrows_and_drives_by_letters(pa
     bus.at_rest()
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("where", ["map", "limit", "tab-drive"])
 def test_a_second_finger_wherever_lets_go(page: Phone, where: str) -> None:
     page.hold()
@@ -403,6 +404,7 @@ def test_a_key_that_is_let_go_elsewhere_is_let_go(page: Phone) -> None:
         assert browser.js("document.getElementById('stick').matches('.held')") is False
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("other", ["MetaLeft", "menu", "drag"])
 def test_a_key_whose_end_a_system_may_keep_to_itself_is_let_go(page: Phone, other: str) -> None:
     browser, bus = page.browser, page.bus

@@ -481,6 +481,7 @@ def test_more_names_than_there_are_parameters_are_answered(ros: RmwClient) -> No
         assert len(decode("rcl_interfaces/msg/GetReply", reply.payload).values) == answered
 
 
+@pytest.mark.variations(4)
 @pytest.mark.parametrize("count", [100, 300])
 @pytest.mark.parametrize("service", ["acsard/get_parameters", "acsard/reset_odometry"])
 def test_of_many_calls_at_once_every_one_is_answered(

@@ -20,7 +20,7 @@ pytestmark = [pytest.mark.network, pytest.mark.slow]
 LINE = "python3 deploy/ros2/drive.py 0.2 0.0 3"
 
 
-@pytest.mark.parametrize("way", ["rmw", "bridge"])
+@pytest.mark.parametrize("way", ["rmw", pytest.param("bridge", marks=pytest.mark.nightly)])
 def test_the_line_of_the_pages_drives(tmp_path: Path, way: str) -> None:
     rclpy_stand_in.write(tmp_path)
     with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus:

@@ -123,6 +123,7 @@ def test_a_robot_reports_the_end_of_its_routers_certificate(where: Path) -> None
             until(lambda: client.state()["certificate_expiry"] == told, 10.0, told)
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
 def test_it_goes_whole(where: Path, number: signal.Signals) -> None:
     with watched_router(where, free_tls_endpoint()) as router:

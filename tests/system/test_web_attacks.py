@@ -520,6 +520,7 @@ ENDLESS: dict[str, tuple[str, int, Rate, str]] = {
 """A request that some clients send without end: their number, its rate, and the answer."""
 
 
+@pytest.mark.variations(5)
 @pytest.mark.parametrize("what", ENDLESS)
 async def test_a_client_that_asks_without_end_waits_and_is_not_refused(
     table: Table, bus: Bus, tokens: dict[str, str], what: str

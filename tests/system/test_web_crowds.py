@@ -192,7 +192,11 @@ class Scene:
 FREE_FILES, SILENT = 12, 80
 
 
-@pytest.mark.parametrize("near", [False, True], ids=["other host", "robot itself"])
+@pytest.mark.parametrize(
+    "near",
+    [False, pytest.param(True, marks=pytest.mark.nightly)],
+    ids=["other host", "robot itself"],
+)
 def test_a_page_that_runs_out_of_files_stops_the_robot_and_recovers(
     hosts: Hosts, robot: Daemon, where: Path, near: bool, tmp_path: Path
 ) -> None:

@@ -83,6 +83,7 @@ def verdict(
     return Verdict(dict(line.split("=", 1) for line in found), ran.err)
 
 
+@pytest.mark.variations(8)
 @pytest.mark.parametrize("ids", BOARDS)
 def test_a_usual_board_gets_the_name_and_starts_the_service(container: Container, ids: str) -> None:
     board = verdict(container, ids)
