@@ -417,9 +417,9 @@ def _later_and_later(plan: Plan, dice: random.Random) -> None:
 
 MOMENTS: dict[str, tuple[float, Callable[[Plan], bool], Callable[[Plan, random.Random], None]]] = {
     "late step": (0.05, _any, _late_step),
-    "half duplex": (0.03, _is_plain, _half_duplex),
-    "flip": (0.03, _is_plain, _flip),
-    "ideal board": (0.03, _may_be_ideal, _ideal),
+    "half duplex": (0.12, _is_plain, _half_duplex),
+    "flip": (0.12, _is_plain, _flip),
+    "ideal board": (0.08, _may_be_ideal, _ideal),
     "stop beside a press": (0.02, _without_check, _named_stop),
     "other board": (0.02, _without_check, _other_board),
     "slow sender": (0.03, _any, _slow_sender),
@@ -428,4 +428,5 @@ MOMENTS: dict[str, tuple[float, Callable[[Plan], bool], Callable[[Plan, random.R
     "backlogs of newcomers": (0.02, _any, _newcomers),
     "later and later": (0.02, _any, _later_and_later),
 }
-"""The share of the plans that have each moment, whether a plan can have it, and what makes it."""
+"""The share of the plans that have each moment, of those that can have it, whether a plan can have
+it, and what makes it."""
