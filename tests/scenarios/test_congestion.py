@@ -74,7 +74,7 @@ def test_a_constant_delay_that_comes_by_a_jump_is_not_taken_for_a_clock(
 
 
 @pytest.mark.slow
-@pytest.mark.variations(5)
+@pytest.mark.nightly
 @pytest.mark.parametrize("way", STAMPED)
 def test_no_shape_of_congestion_has_an_old_command_obeyed(way: Way) -> None:
     """Growth of 1 to 10 % and plateaus of 0.5 to 30 s follow one another, with jitter."""
@@ -225,6 +225,7 @@ def test_commands_that_were_lost_are_not_taken_for_a_pause(way: Way) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 @each("period", [2.1, 4.9])
 @each("way", STAMPED)
 def test_a_slow_sender_drives_a_source_with_a_long_timeout(way: Way, period: float) -> None:
@@ -239,6 +240,7 @@ def test_a_slow_sender_drives_a_source_with_a_long_timeout(way: Way, period: flo
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 @each("way", STAMPED)
 def test_the_old_commands_of_a_slow_sender_are_not_followed(way: Way) -> None:
     """It sends every 3 s with a timeout of 5 s, and the network begins to take 20 s."""

@@ -162,7 +162,9 @@ def drives(person: Person, bus: Bus) -> None:
     try:
         until(moves, 30.0, "the leg moves")
     except AssertionError as error:
-        raise AssertionError(f"{error}; it said {told}") from None
+        now = [person.browser.text(one) for one in ("guide-doing", "guide-words", "guide-story")]
+        state = {name: bus.state()[name] for name in ("mode", "reason", "linear")}
+        raise AssertionError(f"{error}; it said {told}, now {now}, and {state}") from None
 
 
 WAYS = ("stop",)
