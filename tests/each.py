@@ -1,7 +1,8 @@
-"""Provide parameter sets: `@each`, which makes one test of all of them, and `more`.
+"""Helpers for the parameter sets of tests.
 
-Ten thousand tests of a microsecond take longer to distribute and report than to run. A failure
-names its parameter set.
+`@each` is like `parametrize`, but makes one test of all sets, because ten thousand tests of a
+microsecond take longer to distribute and report than to run. A failure names its parameter set.
+`more` marks a set that only the nightly job runs.
 """
 
 from __future__ import annotations

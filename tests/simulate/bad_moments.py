@@ -369,9 +369,9 @@ def _routed(plan: Plan, dice: random.Random) -> None:
 
 
 def _newcomers(plan: Plan, dice: random.Random) -> None:
-    """Let one new sender after another drive, while the network holds its first commands back.
+    """Start one new sender after another, and let the network hold back the commands of each.
 
-    They wait, and then arrive faster than they were sent.
+    The commands wait, and then arrive faster than they were sent.
     """
     _best(plan)["timeout"] = dice.choice((0.25, 0.5, 1.0))
     first = _alone(plan, dice, [])
