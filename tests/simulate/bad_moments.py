@@ -299,6 +299,29 @@ def _other_board(plan: Plan, dice: random.Random) -> None:
     ]  # fmt: skip
 
 
+def _restart_in_fault(plan: Plan, dice: random.Random) -> None:
+    """End the daemon while a fault is latched whose cause is over, and start it again."""
+    _alone(plan, dice, _drives(plan, dice, 0.3, 1.5, 3.0))
+    plan["config"].pop("feedback", None)
+    driver, at = dice.random() < 0.5, 5.0
+    if driver:
+        _inputs(plan, dice, ("driver",))
+    while at < plan["seconds"] - 16.0:
+        lasts = round(dice.uniform(0.1, 1.0) if driver else dice.uniform(3.0, 5.0), 3)
+        kind = dice.choice(("dead_motor", "reversed_motor", "stuck_encoder"))
+        fault = _press(dice, plan, "driver", lasts) if driver else [kind, dice.randrange(4)]
+        ends = round(at + lasts + dice.choice((0.05, 1.0, 2.0)), 3)
+        away = round(dice.uniform(0.2, 2.0), 3)
+        way = dice.choice(("kill", "term", "crash before the robot", "crash behind the robot"))
+        clear = ends + away + dice.uniform(8.0, 12.0)
+        plan["events"] += [
+            {"at": round(at, 3), "do": "board", "for": round(lasts + 0.01, 3), "fault": fault},
+            {"at": ends, "do": "restart", "way": way, "for": away},
+            _call(clear, "clear", named=True),
+        ]
+        at = clear + dice.uniform(6.0, 10.0)
+
+
 def _slow_sender(plan: Plan, dice: random.Random) -> None:
     """Let a sender that keeps all rules send a command every few seconds, within its timeout."""
     source = _best(plan)
@@ -427,6 +450,7 @@ MOMENTS: dict[str, tuple[float, Callable[[Plan], bool], Callable[[Plan, random.R
     "behind a router": (0.02, _any, _routed),
     "backlogs of newcomers": (0.02, _any, _newcomers),
     "later and later": (0.02, _any, _later_and_later),
+    "restart in a fault": (0.06, _without_check, _restart_in_fault),
 }
 """The share of the plans that have each moment, of those that can have it, whether a plan can have
 it, and what makes it."""
