@@ -20,7 +20,7 @@ class Edit(NamedTuple):
 
 PLANS_OF_FAULT = {
     "estop": "estop", "away": "away", "battery": "battery", "driver": "driver_fault",
-    "moment": "late step",
+    "moment": "late step", "robot set": "late step",
     "freshness halves": "backlogs of newcomers", "freshness budget": "later and later",
 }  # fmt: skip
 """Kinds of plans by the name of a fault, or by the first word of its name."""
