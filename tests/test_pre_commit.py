@@ -62,5 +62,6 @@ def test_a_commit_of_code_or_of_the_contract_runs_every_check(clone: Path, name:
 
 def test_these_are_the_checks_that_a_change_must_pass() -> None:
     told = (ROOT / ".ci/run").read_text(encoding="utf-8")
-    found = re.findall(r"^ *\.venv/bin/((?:ruff|mypy|lint-imports)[^|\n]*?)(?: \|\|.*)?$", told, re.M)
+    pattern = r"^ *\.venv/bin/((?:ruff|mypy|lint-imports)[^|\n]*?)(?: \|\|.*)?$"
+    found = re.findall(pattern, told, re.M)
     assert set(found) == set(CHECKS)

@@ -54,6 +54,7 @@ from acsard.core.values import (
     Refusal,
     Request,
     Snapshot,
+    WheelSpeeds,
 )
 
 MAX_DT = 0.05
@@ -252,6 +253,9 @@ class Robot:
 
     def _fold(self, inputs: Inputs, events: list[Event]) -> tuple[Estimate, ...]:
         session, before = self.session, self.session.link
+        # The wheels in these lines followed the last line to the board. What the daemon does about
+        # these lines, for example after a press of a bumper, comes later.
+        commanded = self._speeds
         unsent = inputs.superseded or bool(inputs.guard_trip)
         feedback = session.update(
             inputs.now, inputs.port_open, inputs.opened, inputs.received, unsent, inputs.late_ns
@@ -298,7 +302,8 @@ class Robot:
         estimates: list[Estimate] = []
         for line in feedback:
             estimates += [
-                self._believe(one, now, events) for one in self._plausible(line, now, events)
+                self._believe(one, commanded, now, events)
+                for one in self._plausible(line, now, events)
             ]
         return tuple(estimates)
 
@@ -399,14 +404,19 @@ class Robot:
             Event("lines_rejected", why, "warning", kind="implausible", count=count, news=False)
         )
 
-    def _believe(self, line: Feedback, now: Instant, events: list[Event]) -> Estimate:
-        """Update the odometry with a plausible line, and return the estimate."""
+    def _believe(
+        self, line: Feedback, commanded: WheelSpeeds, now: Instant, events: list[Event]
+    ) -> Estimate:
+        """Update the odometry with a plausible line, and return the estimate.
+
+        `commanded` are the speeds of the last line before this one came, rad/s.
+        """
         checks = self._odometry.checks
         wheels = checks.wheels
         # A pressed emergency stop cuts the motors' power, so wheels that ignore the speeds are no
         # sign of a fault.
-        sent = None if self._estop.why else self._speeds
-        fault = wheels.watch(sent, line.speeds, line.since)
+        obeyed = None if self._estop.why else commanded
+        fault = wheels.watch(obeyed, line.speeds, line.since)
         if fault:
             self._fault(fault, now, events)
         if wheels.pushed:

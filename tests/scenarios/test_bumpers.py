@@ -6,7 +6,15 @@ import random
 
 import pytest
 
-from acsard.core.config.settings import Config, Place, SafetyConfig, SimConfig
+from acsard.core.config.settings import (
+    Config,
+    ControlConfig,
+    FeedbackConfig,
+    McuConfig,
+    Place,
+    SafetyConfig,
+    SimConfig,
+)
 from acsard.core.values import Outputs
 from tests.scenarios.taped import Tape, replayed
 from tests.scenarios.test_emergency_stop import MOST, Watch, out_of
@@ -47,6 +55,26 @@ class Lines:
         """Time from the press to the first line that left after it, ns, and that line."""
         at_ns, line = self.world.port.sent[self._first]
         return at_ns - self.pressed_ns, line
+
+
+def test_lines_from_before_a_press_that_are_read_late_are_no_evidence_against_wheels() -> None:
+    config = Config(
+        control=ControlConfig(rate=20.0),
+        mcu=McuConfig(reply_period=0.1),
+        feedback=FeedbackConfig(fault_time=0.2),
+        safety=STOP.safety,
+        sim=SimConfig(motor_time_constant=0.319),
+    )
+    world = World(config)
+    with world.mcu.bumpers(), world.mcu.free_running(0.1):
+        world.run(0.5)
+        world.drive(0.3, 0.0, seconds=4.0)
+        # The host stands still. The motors keep the last speeds until the daemon writes the zeros.
+        with world.mcu.bumper_pressed(1, 0.2, 1.0):
+            world.stall(0.25)
+            world.run(1.0)
+    assert "front bumper pressed" in world.state.reason
+    assert world.state.mode == "stopped"
 
 
 @pytest.mark.variations(4)
