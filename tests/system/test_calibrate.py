@@ -95,15 +95,20 @@ def asks(terminal: Terminal, program: Program, words: str, times: int, within: f
 
 
 def begun(terminal: Terminal, program: Program, bus: Bus) -> None:
-    """Wait until the first leg moves."""
+    """Wait until the first leg moves. Starts it again if a busy machine has disturbed it."""
     asks(terminal, program, STARTS, 1, 10.0)
     terminal.press("\n")
+    starts = 1
 
     def moves() -> bool:
+        nonlocal starts
         assert program.process.poll() is None, terminal.screen
+        if shown(terminal).count(STARTS) > starts:
+            terminal.press("\n")
+            starts += 1
         return bool((bus.state()["linear"] or 0.0) > 0.25)
 
-    until(moves, 10.0, "the first leg moves")
+    until(moves, 20.0, "the first leg moves")
     assert bus.state()["source"] == "app"
 
 

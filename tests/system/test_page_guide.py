@@ -145,14 +145,21 @@ def skidding(tmp_path: Path) -> Iterator[tuple[Daemon, Bus, Page]]:
 
 
 def drives(person: Person, bus: Bus) -> None:
-    """Wait until the first leg moves. Starts it again if a busy machine has ended it."""
+    """Wait until the first leg moves. Starts it again if a busy machine has cut it short."""
     told: list[str] = []
+    disturbed = 0
 
     def moves() -> bool:
+        nonlocal disturbed
         if person.hidden("guide"):
             person.begin("calibrate", method="")
             person.asked("1. Place the", 30.0)
             person.shows("guide-where", "SIMULATED")
+            person.press("start")
+            disturbed = 0
+        elif person.browser.text("guide-story").count("was disturbed") > disturbed:
+            disturbed += 1
+            person.asked("1. Place the", 30.0)
             person.press("start")
         elif not person.hidden("guide-close"):
             told.append(person.browser.text("guide-story"))
