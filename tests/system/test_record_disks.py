@@ -123,6 +123,7 @@ def lived_again(where: Path, record: Path) -> None:
     assert sum(replayed(where, path) for path in found) > 50
 
 
+@pytest.mark.nightly
 def test_a_disk_that_is_full_is_reported_and_costs_only_records(tmp_path: Path) -> None:
     with disk(tmp_path, "size=256k") as path:
         ballast = path / "ballast"
