@@ -72,7 +72,7 @@ async def test_who_opens_it_has_the_last_minute_and_what_was_wished_while_somebo
             await ours.say(subscribe="cmd_vel_out")
             await ours.say(subscribe="state", rate=50)
             await ours.until_driving(0.3)
-            await ours.hold(0.3, 0.5)
+            await ours.hold(0.3, 1.5)
             await ours.drive(0.0)
             await asyncio.to_thread(bus.at_rest)
             async with hands(page) as later:
