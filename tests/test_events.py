@@ -7,6 +7,8 @@ import re
 from pathlib import Path
 from typing import get_args
 
+import pytest
+
 from acsard.core.values import EventName, Verb
 
 ROOT = Path(__file__).parents[1]
@@ -32,6 +34,7 @@ def named() -> set[str]:
     return found
 
 
+@pytest.mark.slow
 def test_each_name_in_the_code_is_in_the_set() -> None:
     found = named()
     assert len(found) > 15

@@ -51,6 +51,7 @@ def run(place: Path, *words: str) -> None:
     assert done.returncode == 0, done
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["acsard/new.py", "pyproject.toml"])
 def test_a_commit_of_code_or_of_the_contract_runs_every_check(clone: Path, name: str) -> None:
     (clone / name).parent.mkdir(exist_ok=True)

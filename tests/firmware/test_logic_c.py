@@ -283,6 +283,7 @@ def test_a_wheel_that_trembles_is_not_said_to_race(
         assert max(map(abs, said)) <= (amplitude * omega + TICKS / window) * PITCH
 
 
+@pytest.mark.slow
 @each("speed", [0.2, 0.3, 0.4, 0.5, 0.6, 0.9, 2.0, -0.2, -0.6])
 def test_a_coarse_encoder_says_its_true_speed_however_slow(
     coarse: ctypes.CDLL, speed: float

@@ -207,6 +207,7 @@ def _with(line: bytes, at: int, byte: int) -> bytes:
     return line[:at] + bytes([byte]) + line[at + 1 :]
 
 
+@pytest.mark.slow
 def test_it_reads_the_host_s_language_and_no_other(parser: Parser) -> None:
     """Both parsers give the same result for valid lines with one to three changes."""
     rng = random.Random(1)

@@ -178,6 +178,7 @@ def test_a_loose_wire_counts_as_pressed(inputs: Inputs) -> None:
     assert inputs.stopped
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("defines", "free", "pressed"),
     [
@@ -219,6 +220,7 @@ def test_a_press_is_reported_before_the_fault_of_a_driver_that_lost_its_supply_a
     assert [i for i, one in enumerate(told) if one.driver_fault] > [pressed]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("high", [0, 1])
 def test_a_driver_s_fault_is_low_or_high(build: Build, high: int) -> None:
     inputs = build("-DDRIVER_INPUT=1", f"-DDRIVER_FAULT_HIGH={high}")

@@ -62,6 +62,7 @@ def test_the_zeros_of_one_program_never_release_another(way: Way, count: int) ->
         assert not moved(world, start_ns), seed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [10, more(40), long(1000)])
 def test_programs_whose_stamps_come_from_several_routers_never_release_each_other(
     count: int,
@@ -93,6 +94,7 @@ def test_programs_whose_stamps_come_from_several_routers_never_release_each_othe
         assert not moved(world, start_ns), seed
 
 
+@pytest.mark.slow
 def test_a_program_whose_stamping_router_changes_must_send_a_zero_again_and_then_drives() -> None:
     world = quiet()
     speaker = Speaker(world, "routed")
@@ -104,6 +106,7 @@ def test_a_program_whose_stamping_router_changes_must_send_a_zero_again_and_then
     speaker.open()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", SHARED)
 def test_a_shared_sender_that_a_crowd_pushed_out_must_let_go_as_before(way: Way) -> None:
     world = quiet()
@@ -146,6 +149,7 @@ def test_a_network_that_loses_all_for_a_while_arms_nobody(way: Way) -> None:
     assert not moved(world, since_ns)
 
 
+@pytest.mark.slow
 @each("way", OWN)
 def test_a_zero_of_an_identity_of_its_own_arms_at_once_right_behind_its_speeds(way: Way) -> None:
     world, (speaker,) = cleared(way, "a")
@@ -156,6 +160,7 @@ def test_a_zero_of_an_identity_of_its_own_arms_at_once_right_behind_its_speeds(w
     assert world.state.mode == "driving"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", SHARED)
 def test_a_zero_of_a_shared_identity_arms_when_no_speed_has_followed_for_a_second(way: Way) -> None:
     world, (speaker,) = cleared(way, "a")
@@ -199,6 +204,7 @@ def test_an_armed_sender_stays_armed_and_just_drives_again(
         assert world.state.mode == "driving", world.state.reason
 
 
+@pytest.mark.slow
 @each("way", get_args(Way))
 def test_a_first_command_without_a_zero_is_answered_in_plain_words(way: Way) -> None:
     world = quiet()
@@ -211,6 +217,7 @@ def test_a_first_command_without_a_zero_is_answered_in_plain_words(way: Way) -> 
     assert ("no speed for 1 s" in waits) == (way in SHARED)
 
 
+@pytest.mark.slow
 @each("way", STAMPED)
 def test_after_clear_a_held_key_stays_without_effect_until_it_is_let_go(way: Way) -> None:
     world, (speaker,) = cleared(way, "a")
@@ -220,6 +227,7 @@ def test_after_clear_a_held_key_stays_without_effect_until_it_is_let_go(way: Way
     assert "it has sent speeds for over 3 s" in world.state.reason
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [4, more(60)])
 def test_a_zero_that_was_proven_never_outlives_the_speeds_behind_it(count: int) -> None:
     """One program sends one plain zero, the other 0.5 m/s with a header through heavy jitter."""
@@ -239,6 +247,7 @@ def test_a_zero_that_was_proven_never_outlives_the_speeds_behind_it(count: int) 
         assert not moved(world, start_ns), seed
 
 
+@pytest.mark.slow
 @each("stall", [0.02, 0.1])
 def test_a_zero_from_before_a_restart_of_the_board_arms_nobody(stall: float) -> None:
     """A clear, a zero and the restart come while the loop stands. One step then obeys them all."""

@@ -96,6 +96,7 @@ def test_one_whose_command_does_not_count_pulls_no_line_forward(world: World) ->
     assert sent_after(world, at_ns) == []
 
 
+@pytest.mark.slow
 @given(
     st.lists(
         st.tuples(

@@ -54,6 +54,7 @@ def test_a_drained_battery_warns_and_then_stops_the_robot_until_it_is_charged() 
         assert world.state.mode == "driving"
 
 
+@pytest.mark.slow
 def test_the_simulated_battery_drops_by_two_volts_when_the_motors_start() -> None:
     config = Config(
         battery=BatteryConfig(warning_below=23.0), sim=SimConfig(faults=("battery=60:600",))

@@ -146,6 +146,7 @@ def test_a_bumper_that_limits_stands_within_a_period_and_then_lets_it_only_away(
     assert (retreats > 0) == (sign != 0)
 
 
+@pytest.mark.slow
 def test_the_virtual_robot_moves_away_from_the_obstacle() -> None:
     world = World(AWAY)
     with world.mcu.bumpers():
@@ -201,6 +202,7 @@ def test_a_robot_with_places_waits_for_its_bumpers_and_then_becomes_ready() -> N
         assert world.state.mode == "ready"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("config", [STOP, AWAY], ids=["stop", "away"])
 def test_a_recording_replays_presses_and_releases(config: Config) -> None:
     config = Config(

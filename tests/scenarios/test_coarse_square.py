@@ -100,6 +100,7 @@ def test_a_square_ends_where_the_raw_counter_says(
     assert far <= 1.05 * raw_far + (0.03 if fine else 0.005)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("counts", "coarse"), [(16, True), (96, True), (3200, False)])
 def test_state_counts_the_lines_of_coarse_encoders_whose_counts_nobody_knows(
     counts: int, coarse: bool

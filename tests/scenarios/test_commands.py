@@ -126,6 +126,7 @@ def test_a_robot_stopped_while_inactive_is_inactive_after_clear(world: World) ->
     assert world.state.mode == "inactive"
 
 
+@pytest.mark.slow
 @each(
     ("key", "payload", "put", "reason"),
     [
@@ -224,6 +225,7 @@ def test_stamps_that_zenoh_replaces_are_counted_and_no_matter(world: World) -> N
     assert world.state.counters["stamps_replaced"] == 40
 
 
+@pytest.mark.slow
 def test_hardware_whose_controller_failed_holds_the_robot_but_not_in_silence(world: World) -> None:
     """ros2_control's hardware sends these zeros for ever, while Nav2 goes on."""
     world.send(0.0, source="nav")

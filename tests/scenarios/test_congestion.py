@@ -114,6 +114,7 @@ def test_no_shape_of_congestion_has_an_old_command_obeyed(way: Way) -> None:
         assert oldest <= bound(way, seconds) + 0.1, seed
 
 
+@pytest.mark.slow
 def test_a_sender_with_a_steady_clock_drives_on_as_soon_as_it_is_prompt_again() -> None:
     world = quiet()
     speaker = Speaker(world, "client")
@@ -138,6 +139,7 @@ def test_what_is_forgiven_to_a_foreign_clock_is_counted_in_state() -> None:
     assert 550 <= world.state.counters["clock_adjustments_ms"] <= 650
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["rmw", "header", "zenoh"])
 def test_a_zenoh_clock_that_stands_until_it_was_caught_up_is_an_adjustment(way: Way) -> None:
     """Zenoh's clock never goes back: after its wall clock was set back by 3 s it nearly stands."""
@@ -156,6 +158,7 @@ def test_a_zenoh_clock_that_stands_until_it_was_caught_up_is_an_adjustment(way: 
 # order
 
 
+@pytest.mark.slow
 @each("timeout", [0.25, 5.0])
 @each("way", STAMPED)
 def test_an_older_command_behind_a_newer_one_is_not_obeyed(way: Way, timeout: float) -> None:
@@ -208,6 +211,7 @@ def test_numbers_alone_keep_the_order_too() -> None:
     assert world.state.counters["command_stale"] == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["signed", "rmw"])
 def test_commands_that_were_lost_are_not_taken_for_a_pause(way: Way) -> None:
     """After a loss of 2.2 s the daemon believed any constant delay, and obeyed commands 5 s old."""
@@ -260,6 +264,7 @@ def test_the_old_commands_of_a_slow_sender_are_not_followed(way: Way) -> None:
     assert oldest <= 5.0 + MARGIN_S
 
 
+@pytest.mark.slow
 @each("trouble", ["lost", "second lost", "twice"])
 @each("way", ["signed", "rmw"])
 def test_a_clock_that_is_set_back_while_a_command_is_lost_or_repeated_heals(

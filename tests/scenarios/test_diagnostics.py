@@ -32,6 +32,7 @@ def test_a_stop_is_a_warning_until_it_is_cleared(world: World) -> None:
     assert row(world, "mode").level == OK
 
 
+@pytest.mark.slow
 def test_a_source_that_is_refused_is_a_warning_as_long_as_it_is_refused(world: World) -> None:
     world.drive(0.3, seconds=0.5)
     assert row(world, "commands").level == OK

@@ -52,6 +52,7 @@ def test_a_left_turn_runs_the_right_wheels_forward_and_the_left_ones_back(world:
     assert world.state.yaw > 0
 
 
+@pytest.mark.slow
 def test_a_full_circle_comes_back_to_its_start(world: World) -> None:
     world.drive(0.5, 1.0, seconds=2 * math.pi)
     world.send(0.0)
@@ -61,6 +62,7 @@ def test_a_full_circle_comes_back_to_its_start(world: World) -> None:
     assert math.remainder(seen.yaw - true.yaw, math.tau) == pytest.approx(0.0, abs=0.02)
 
 
+@pytest.mark.slow
 def test_one_line_goes_out_every_period(world: World) -> None:
     before = len(world.port.sent)
     world.run(10.0)

@@ -121,6 +121,7 @@ def test_each_press_is_a_zero_line_within_a_period_and_no_release_moves_the_robo
     print(f"\n{mode}: {count} presses, first zero line after at most {slowest_ns / 1e6:.2f} ms")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", MOST)
 def test_a_press_on_the_ramp_of_a_stop_is_a_zero_line_within_a_period(count: int) -> None:
     """The mode does not change, so only the press itself asks for a line."""
@@ -202,6 +203,7 @@ def test_a_press_is_as_fast_in_a_flood_on_a_bad_wire_and_on_a_slow_one(
     )
 
 
+@pytest.mark.slow
 def test_a_board_that_falls_silent_about_its_button_stops_the_robot() -> None:
     world = World(Config(sim=SimConfig(faults=("estop_silent=2:3",))))
     world.run(0.2)
@@ -327,6 +329,7 @@ def test_a_clear_that_came_before_the_release_is_refused_also_if_one_step_takes_
         assert world.call("clear").success
 
 
+@pytest.mark.slow
 def test_a_recording_replays_a_press_and_its_release() -> None:
     config = Config(sim=SimConfig(faults=("estop_pressed=2:1",)))
     tape = Tape()

@@ -130,6 +130,7 @@ def assert_same(then: Sequence[Message], now: Sequence[Message]) -> None:
     assert len(then) == len(now) > 0
 
 
+@pytest.mark.slow
 @each("key", ["odom", "tf", "tf_static", "wheel_states", "cmd_vel_out", "battery"])
 def test_every_message_is_the_one_that_was_published(key: str, both: Any) -> None:
     world, _, said = both
@@ -258,6 +259,7 @@ def name_of(data: bytes) -> str:
     return data[20 : 19 + int.from_bytes(data[16:20], "little")].decode()
 
 
+@pytest.mark.slow
 def test_the_file_has_each_message_that_was_published_to_the_byte(
     recorded: Any, file: Path
 ) -> None:
@@ -317,6 +319,7 @@ def same(told: Any, ours: Any) -> bool:
     return bool(told == ours)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("library", ["seeking", "not seeking", "rosbags"])
 def test_two_libraries_make_of_the_definitions_in_the_file_what_was_published(
     library: str, recorded: Any, file: Path

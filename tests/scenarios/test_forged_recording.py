@@ -229,6 +229,7 @@ def test_a_replay_finds_every_forged_reason_name_and_event(
     assert codes == {Exit.FAILURE: count}, capsys.readouterr().out[-2000:]
 
 
+@pytest.mark.slow
 def test_a_recording_that_nobody_forged_replays_equal(
     original: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

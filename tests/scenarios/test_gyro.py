@@ -118,6 +118,7 @@ def test_the_diagnostics_show_bias_delay_and_the_track_it_implies() -> None:
     assert values["multiplier_in_use"] == 1.0
 
 
+@pytest.mark.slow
 def test_a_gyro_that_dies_is_reported_and_the_wheels_go_on() -> None:
     made = world()
     made.drive(0.3, 0.5, 1.0)
@@ -133,6 +134,7 @@ def test_a_gyro_that_dies_is_reported_and_the_wheels_go_on() -> None:
     assert told == ["waiting for rest", "used", "silent", "used"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("verb", "pose"), [("reset_odometry", b""), ("set_pose", b'{"x": 1.0, "y": 0.0, "yaw": 1.0}')]
 )

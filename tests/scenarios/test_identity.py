@@ -76,12 +76,14 @@ def driven() -> tuple[World, Speaker, list[bytes]]:
     return world, victim, list(published(world, tape))
 
 
+@pytest.mark.slow
 def test_the_secret_of_a_sender_is_published_nowhere() -> None:
     world, _, texts = driven()
     assert re.fullmatch(r"here/[0-9a-f]{16}", world.state.sender)
     assert not [text for text in texts if SECRET.encode() in text]
 
 
+@pytest.mark.slow
 def test_an_attacker_who_knows_all_that_is_published_cannot_drive_as_the_operator() -> None:
     world, victim, texts = driven()
     shown = world.state.sender
@@ -134,6 +136,7 @@ def test_a_stolen_secret_counts_under_no_other_certificate(certificate: str) -> 
     assert {event.by for event in refused} == {f"{shown.partition(' [')[0]} [mallory]"}
 
 
+@pytest.mark.slow
 def test_a_stolen_secret_counts_on_no_key_of_ros() -> None:
     world = World()
     victim = Speaker(world, "signed", VICTIM)

@@ -104,6 +104,7 @@ def test_a_stop_line_that_leaves_late_is_no_sample_of_the_time_before_it(link: s
     assert at[-1] > 1.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("after", "every"), [(0.8, 3), (2.0, 2)])
 def test_a_board_that_answered_late_before_loses_no_distance_with_its_replies(
     after: float, every: int
@@ -141,6 +142,7 @@ def test_an_adapter_that_batches_and_stalls_costs_a_prompted_mcu_little(
     assert drive.error() < 0.010
 
 
+@pytest.mark.slow
 def test_with_the_mcu_s_counts_bursts_of_lost_lines_cost_nothing() -> None:
     mcu = McuConfig(link_check="require", encoder_counts=COUNTS)
     world = World(Config(sim=SimConfig(encoder_counts=COUNTS), mcu=mcu))

@@ -58,6 +58,7 @@ def test_unplugging_is_reported_at_once_and_wishes_nothing(world: World) -> None
     assert outputs.speeds.as_tuple() == (0.0, 0.0, 0.0, 0.0)
 
 
+@pytest.mark.slow
 def test_a_speed_that_nobody_measures_any_more_is_not_reported(world: World) -> None:
     world.drive(1.0, seconds=3.0)
     moving_x = world.state.linear
@@ -457,6 +458,7 @@ def test_a_link_that_loses_lines_is_reported_once(fault: str) -> None:
     assert "answered only" in told[0].text
 
 
+@pytest.mark.slow
 def test_a_sound_link_is_not_said_to_lose_lines() -> None:
     world = World()
     world.drive(0.5, seconds=25.0)

@@ -269,6 +269,7 @@ def test_a_burst_of_damaged_replies_stops_asks_again_and_goes_on() -> None:
     assert off_by(world) < 0.001
 
 
+@pytest.mark.slow
 def test_noise_never_talks_an_mcu_out_of_the_check() -> None:
     world = started(config("auto"))
     world.drive(0.5, seconds=1.0)
@@ -446,6 +447,7 @@ def test_over_a_long_drive_counts_and_clock_wrap_and_nothing_jumps() -> None:
     assert world.state.counters.get("line_count_leap", 0) == 0
 
 
+@pytest.mark.slow
 def test_when_samples_stop_the_speeds_go_on_without_a_jump() -> None:
     world = started(config("require", 3200))
     for stop in (False, True, False):
@@ -658,6 +660,7 @@ def test_an_echo_beside_the_replies_of_a_board_is_found_out_when_the_speed_chang
         assert moving([line for _, line in list(world.port.sent)[sent:]]) == []
 
 
+@pytest.mark.slow
 @each("lag", [0.01, 0.02, 0.03, 0.05])
 @each("deceleration", [0.6, 1.0, 3.0])
 def test_an_ideal_board_whose_motors_lag_by_whole_periods_is_not_taken_for_an_echo(

@@ -206,6 +206,7 @@ def test_a_big_robot_that_responds_late_and_falls_short_is_a_warning(
         assert not made.state.wheel_fault
 
 
+@pytest.mark.slow
 def test_pushed_by_hand_with_a_dead_encoder_nothing_is_known_and_slip_is_reported() -> None:
     made = world()
     made.drive(0.3, seconds=0.5)
@@ -259,6 +260,7 @@ def test_ordinary_drives_are_never_doubted(counts: int, seconds: int) -> None:
 # faulty gyros
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("share", "does"),
     [

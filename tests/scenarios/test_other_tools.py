@@ -87,6 +87,7 @@ def test_the_table_of_the_page_has_the_tools_that_are_played_here() -> None:
 # Two publishers on one topic
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("road", "other", "least", "most"),
     [("rmw", 0.1, 0.38, 0.42), ("rmw", 0.0, 0.38, 0.42),
@@ -125,6 +126,7 @@ class Keyboard(Speaker):
         self.hold(linear, seconds - delay, hz)
 
 
+@pytest.mark.slow
 @by_each_road
 def test_keyboard_drives_after_k_was_held_for_a_second(world: World, road: Road) -> None:
     keyboard = Keyboard(world, road)
@@ -213,6 +215,7 @@ def test_joystick_drives_after_the_button_was_held_for_a_second_with_the_stick_a
     drives(world, lambda: joystick.joy(True, FAST, 0.5))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("road", "released"), [("rmw", 0.1), ("bridge", 1.1)])
 def test_teleop_twist_joy_drives_after_its_button_was_released(
     world: World, road: Road, released: float
@@ -226,6 +229,7 @@ def test_teleop_twist_joy_drives_after_its_button_was_released(
     drives(world, lambda: joystick.joy(True, FAST, 0.5))
 
 
+@pytest.mark.slow
 @by_each_road
 def test_joy_teleop_is_not_armed_by_releasing_its_button(world: World, road: Road) -> None:
     joystick = JoyTeleop(world, road)
@@ -268,6 +272,7 @@ def slide(steering: Steering, linear: float, seconds: float) -> None:
     steering.wait(seconds)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("road", "pause"), [("rmw", 0.1), ("bridge", 1.1)])
 def test_rqt_robot_steering_drives_after_stop_was_clicked(
     world: World, road: Road, pause: float
@@ -293,6 +298,7 @@ def topic_pub(world: World, road: Road, name: str, linear: float, seconds: float
     Speaker(world, road, name).hold(linear, seconds, 10.0)
 
 
+@pytest.mark.slow
 @by_each_road
 def test_topic_pub_of_a_speed_never_drives_however_often_it_is_started(
     world: World, road: Road
@@ -317,6 +323,7 @@ def test_topic_pub_once_of_a_zero_by_the_bridge_arms_after_a_second(world: World
 # drive.py
 
 
+@pytest.mark.slow
 @by_each_road
 def test_drive_py_drives_at_once_after_a_clear(world: World, road: Road) -> None:
     """It sends its opening zeros for the time that its file sets."""
@@ -456,6 +463,7 @@ def test_nav2_by_rmw_drives_a_goal_that_was_sent_again_right_after_the_zero(
     drives(world, lambda: nav2.goal(FAST, 0.5))
 
 
+@pytest.mark.slow
 @by_each_road
 def test_nav2_between_two_goals_must_be_given_a_goal_that_is_cancelled(
     world: World, road: Road
@@ -473,6 +481,7 @@ def test_nav2_between_two_goals_must_be_given_a_goal_that_is_cancelled(
     stands(world, lambda: nav2.goal(FAST, 3.0))
 
 
+@pytest.mark.slow
 @by_each_road
 def test_nav2_that_retries_a_goal_by_itself_drives_when_its_zero_counts(
     world: World, road: Road
@@ -502,6 +511,7 @@ def test_the_first_goal_of_nav2_after_a_start_does_not_move_the_robot_and_the_se
     drives(world, lambda: nav2.goal(FAST, 1.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("road", "moves"), [("rmw", False), ("bridge", True)])
 def test_a_nav2_that_was_started_again_must_send_a_zero_by_rmw_and_not_by_the_bridge(
     world: World, road: Road, moves: bool
@@ -531,6 +541,7 @@ def test_zeros_that_pass_through_nav2_after_its_start_replace_the_cancelled_goal
     drives(world, lambda: nav2.goal(FAST, 1.0))
 
 
+@pytest.mark.slow
 def test_zeros_that_pass_through_nav2_do_nothing_after_a_clear(world: World) -> None:
     """The collision monitor falls silent 2 s after its first zero, whatever zeros follow."""
     nav2 = Nav2(world, "rmw")
@@ -543,6 +554,7 @@ def test_zeros_that_pass_through_nav2_do_nothing_after_a_clear(world: World) -> 
     stands(world, lambda: nav2.goal(FAST, 2.0))
 
 
+@pytest.mark.slow
 def test_a_zero_on_cmd_vel_by_the_bridge_arms_nav2_after_a_clear(world: World) -> None:
     nav2 = Nav2(world, "bridge")
     nav2.receive_zeros(1.0)
@@ -578,6 +590,7 @@ def test_docking_has_its_own_place_above_nav2_and_below_ros2_control() -> None:
     assert rank["nav"] < rank["dock"] < rank["ros2_control"]
 
 
+@pytest.mark.slow
 @by_each_road
 def test_the_first_docking_after_a_start_must_be_cancelled_and_later_ones_pass_the_zeros_of_nav2(
     world: World, road: Road
@@ -597,6 +610,7 @@ def test_the_first_docking_after_a_start_must_be_cancelled_and_later_ones_pass_t
     assert moved(world, since_ns)
 
 
+@pytest.mark.slow
 @by_each_road
 @pytest.mark.parametrize(("stamps", "moves"), [("kept", True), ("continued", False)])
 def test_nav2_with_stamps_moves_again_only_if_its_last_zero_is_stamped_right(
@@ -647,6 +661,7 @@ class DiffDrive(Speaker):
             self.world.run(0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("road", "silence"), [("rmw", 1.0), ("bridge", 2.0)])
 def test_ros2_control_drives_after_nobody_sent_cmd_vel_for_a_while(
     world: World, road: Road, silence: float
@@ -660,6 +675,7 @@ def test_ros2_control_drives_after_nobody_sent_cmd_vel_for_a_while(
     drives(world, lambda: control.cycle(0.5, FAST))
 
 
+@pytest.mark.slow
 @by_each_road
 def test_ros2_control_that_sends_zeros_through_a_clear_is_armed_by_them(
     world: World, road: Road

@@ -51,6 +51,7 @@ def lives_again(tape: Tape, config: Config, first: int = 0, least: int = 100) ->
     assert comparison.apart == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("after", [0.1, 0.5, 1.2])
 def test_a_recording_that_begins_within_a_ramp_knows_how_long_that_may_take(after: float) -> None:
     """The guard of the replay lets the rest of the ramp pass, and nothing that comes too late."""
@@ -88,6 +89,7 @@ def test_a_drive_through_every_fault_is_replayed_to_the_last_bit(config: Config)
     lives_again(tape, config)
 
 
+@pytest.mark.slow
 def test_settings_that_were_changed_meanwhile_are_replayed_too() -> None:
     tape, world = recorded_world(PLAIN)
     world.drive(0.5, seconds=1.0)
@@ -126,6 +128,7 @@ def test_an_hour_through_every_fault_is_replayed() -> None:
     lives_again(taped(PLAIN, 3600.0), PLAIN)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("config", [PLAIN, FULL], ids=["plain", "checked, counted, with a gyro"])
 def test_a_recording_that_begins_in_a_drive_goes_on_from_its_state(config: Config) -> None:
     tape, world = recorded_world(config)
@@ -191,6 +194,7 @@ def test_other_limits_name_the_first_line_that_differs() -> None:
     assert comparison.fastest == (1000, 600)  # 0.5 and 0.3 m/s on wheels of 0.05 m
 
 
+@pytest.mark.slow
 def test_other_limits_take_over_in_the_middle_of_a_drive() -> None:
     tape, world = recorded_world()
     world.drive(0.5, 0.3, seconds=2.0)

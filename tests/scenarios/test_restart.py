@@ -200,6 +200,7 @@ def test_an_event_of_the_latch_file_reaches_the_log() -> None:
     assert event in host.world.events
 
 
+@pytest.mark.slow
 def test_a_fault_over_a_stop_takes_two_calls_after_a_restart_as_before() -> None:
     host = Host(random.Random(3))
     host.patrols(2 * CYCLE_S)
@@ -218,6 +219,7 @@ def test_a_fault_over_a_stop_takes_two_calls_after_a_restart_as_before() -> None
     assert host.world.state.mode == "driving"
 
 
+@pytest.mark.slow
 @each("away_s", [-(10**9), -60, 0, 1, 10**9])
 def test_a_plain_clear_waits_two_seconds_after_a_reboot_wherever_its_clock_is(away_s: int) -> None:
     at_ns = START.wall_ns - away_s * NS_PER_S
@@ -230,6 +232,7 @@ def test_a_plain_clear_waits_two_seconds_after_a_reboot_wherever_its_clock_is(aw
     assert world.state.mode == "ready"
 
 
+@pytest.mark.slow
 def test_a_limit_that_was_lowered_stays_lowered_until_it_is_raised() -> None:
     host = Host(random.Random(4))
     for speed in (0.2, 1.0):
@@ -242,6 +245,7 @@ def test_a_limit_that_was_lowered_stays_lowered_until_it_is_raised() -> None:
         assert max(applied) == min(speed, 0.5)
 
 
+@pytest.mark.slow
 def test_a_limit_lowered_after_a_higher_one_was_written_stays_lowered(tmp_path: Path) -> None:
     configuration, latches = tmp_path / "acsard.toml", MemoryFile()
     configuration.write_text("[limits]\nlinear_speed = 0.5\n")

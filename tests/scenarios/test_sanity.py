@@ -156,6 +156,7 @@ def test_a_bit_flipped_in_the_first_line_after_a_silence_costs_no_more_than_the_
     assert max(turned) < turned[0] + 0.06
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [1, 2, 3, 4])
 def test_a_bit_flipped_while_the_link_returns_is_no_fault(number: int) -> None:
     world = World()
@@ -168,6 +169,7 @@ def test_a_bit_flipped_while_the_link_returns_is_no_fault(number: int) -> None:
     assert (world.state.mode, told(world, "fault")) == ("ready", [])
 
 
+@pytest.mark.slow
 def test_a_bit_flipped_in_the_first_line_after_clear_is_no_fault_and_does_not_turn_the_pose(
     world: World,
 ) -> None:

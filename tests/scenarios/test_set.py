@@ -136,6 +136,7 @@ def test_a_payload_that_is_none_is_answered_with_one_that_is(world: World) -> No
         assert '{"settings": {"limits.linear_speed": 0.8}}' in reply.message
 
 
+@pytest.mark.slow
 def test_the_wheels_limit_waits_until_the_robot_stands_and_the_guard_goes_by_it() -> None:
     world = World(Config(limits=LimitsConfig(linear_speed=3.0, wheel_speed=10.0)))
     world.run(0.2)
@@ -213,6 +214,7 @@ def test_a_clock_stays_known_when_the_pause_changes(world: World) -> None:
     assert world.state.counters["command_stale"] == 1
 
 
+@pytest.mark.slow
 def test_a_new_pause_counts_for_senders_that_are_known(world: World) -> None:
     speaker = Speaker(world, "plain")
     speaker.open()

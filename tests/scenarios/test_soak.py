@@ -104,6 +104,7 @@ def silence(world: World, dice: random.Random, timeout: float) -> float:
     return took
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [50, more(200), long(10_000, 1200)])
 def test_after_silence_the_ramp_starts_within_the_timeout_and_a_tick(count: int) -> None:
     dice, kept, latest = random.Random(1), 0, 0.0
@@ -176,6 +177,7 @@ def start_over(world: World, kind: str, dice: random.Random) -> World:
     return world
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [8, more(48), long(1_000, 1800)])
 def test_nothing_moves_before_neutral_after_whatever_started_over(count: int) -> None:
     dice, kept, seen = random.Random(2), 0, Counter[str]()
@@ -255,6 +257,7 @@ def blackhole(dice: random.Random, slow: bool, seconds: float) -> tuple[int, int
     return stale, backward, accepted
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [2, more(10), long(200, 1800)])
 def test_no_stale_command_is_obeyed_after_a_blackhole(count: int) -> None:
     dice, stale, backward, accepted = random.Random(3), 0, 0, 0
@@ -474,6 +477,7 @@ def poured_out(dice: random.Random, way: Way, running: bool) -> bool:
     return moved(world, since_ns)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [3, more(24), long(500, 1800)])
 def test_no_backlog_moves_a_robot_that_never_heard_its_sender_nor_one_that_knows_it(
     count: int,
@@ -576,6 +580,7 @@ def stepped(dice: random.Random, way: Way, ahead: float, step: float) -> str:
     return "" if driving_again(world, speaker) else f"after the cut: {world.state.reason}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [2, more(16), long(400, 1800)])
 def test_a_sender_s_clock_may_be_anything_and_be_set_at_any_time(count: int) -> None:
     dice, wrong = random.Random(8), Counter[str]()

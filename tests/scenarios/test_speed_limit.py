@@ -54,6 +54,7 @@ def fastest(world: World) -> list[float]:
     return found
 
 
+@pytest.mark.slow
 def test_a_zone_slows_the_robot_and_its_end_lets_it_go_on_as_before(world: World) -> None:
     world.drive(0.8, seconds=2.0)
     limit(world, 25.0, percentage=True)
@@ -85,6 +86,7 @@ def test_the_robot_slows_down_by_its_deceleration_while_it_keeps_driving(world: 
     assert speeds[-1] == pytest.approx(0.4)
 
 
+@pytest.mark.slow
 @each("first", ["limit", "set"])
 @each("value", [0.2, 0.5])
 def test_of_a_limit_and_a_set_the_lower_one_wins_in_either_order(first: str, value: float) -> None:
@@ -240,6 +242,7 @@ def test_a_flood_of_limits_changes_the_robot_ten_times_a_second(world: World) ->
     assert sum(event.count for event in world.events if event.name == "set") <= 10 * seconds + 1
 
 
+@pytest.mark.slow
 def test_a_drive_through_a_zone_is_replayed_to_the_last_bit() -> None:
     """A recording has the requests that the limits became, so its replay needs no speed limit."""
     tape = Tape()

@@ -60,6 +60,7 @@ def quiet() -> Plan:
     return EMPTY | {"config": PLAIN["config"]}
 
 
+@pytest.mark.slow
 def test_a_seed_gives_the_same_bytes_again_also_when_its_plan_was_written_to_a_file() -> None:
     first, again = Trace(), Trace()
     one = made(4, 15.0)
@@ -71,6 +72,7 @@ def test_a_seed_gives_the_same_bytes_again_also_when_its_plan_was_written_to_a_f
     assert results[0].finding == results[1].finding == ""
 
 
+@pytest.mark.slow
 def test_every_configuration_of_a_plan_is_legal_and_every_kind_of_trouble_is_drawn() -> None:
     plans = [made(seed) for seed in range(30)]
     assert [problems(one["config"]) for one in plans] == [[]] * 30
@@ -87,10 +89,12 @@ def test_a_sender_sends_the_same_without_the_other_senders() -> None:
     assert both[0] == both[1] != []
 
 
+@pytest.mark.slow
 def test_a_quiet_plan_breaks_no_promise() -> None:
     assert played(quiet()).finding == ""
 
 
+@pytest.mark.slow
 def test_a_seed_of_a_replay_is_played_and_reported(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -103,6 +107,7 @@ def test_a_seed_of_a_replay_is_played_and_reported(
     assert " seed 17: a promise at 2.000 s: so\n" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_seeds_are_played_until_the_time_is_simulated_and_what_they_covered_is_printed(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -113,6 +118,7 @@ def test_seeds_are_played_until_the_time_is_simulated_and_what_they_covered_is_p
     assert re.search(r"^  way +\w+ \d", out, re.MULTILINE)
 
 
+@pytest.mark.slow
 def test_the_plan_of_each_finding_is_kept_and_the_first_ones_are_shrunk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -528,6 +534,7 @@ def test_in_a_quarter_of_the_plans_nobody_outranks_a_sender_that_keeps_all_rules
     assert 0.15 <= lawful / len(plans) <= 0.4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noted", [True, False])
 def test_a_sender_that_must_send_a_zero_without_an_event_is_a_finding(noted: bool) -> None:
     run = Run(driven(events=[{"at": 8.0, "do": "reset", "deaf": 0.3}]))
@@ -539,6 +546,7 @@ def test_a_sender_that_must_send_a_zero_without_an_event_is_a_finding(noted: boo
     assert run.counts["lawful looks"] > 100
 
 
+@pytest.mark.slow
 def test_a_zero_before_the_greeting_of_a_board_arms_nobody() -> None:
     """The greeting may be the first bytes of all (seed 182028320)."""
     config = PLAIN["config"] | {"sim": PLAIN["config"]["sim"] | {"boot_time": 0.5}}
@@ -546,6 +554,7 @@ def test_a_zero_before_the_greeting_of_a_board_arms_nobody() -> None:
     assert (result.finding, result.counts["lawful looks"]) == ("", 0)
 
 
+@pytest.mark.slow
 def test_a_plan_may_switch_the_robot_off_behind_its_end() -> None:
     """Seed 182028330."""
     call = {"verb": "deactivate", "late": 0.0, "lost": False, "twice": False, "via": "native"}
@@ -781,6 +790,7 @@ def test_a_sender_behind_routers_has_the_identity_of_the_session_that_stamps() -
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_some_plans_have_several_senders_behind_routers_on_one_source() -> None:
     together = 0
     for seed in range(200):
@@ -1121,6 +1131,7 @@ def test_rare_events_come_at_the_time_of_a_drive() -> None:
     assert min(found.values()) > 5
 
 
+@pytest.mark.slow
 def test_a_stall_in_a_step_counts_from_the_step_that_it_delays() -> None:
     stall = {"at": 2.0, "do": "stall in step", "for": 0.2}
     run = Run(quiet_with(stall))
@@ -1157,6 +1168,7 @@ def with_a_set_before_sigterm(settings: dict[str, float]) -> Plan:
     return quiet() | {"seconds": 3.0, "events": events}
 
 
+@pytest.mark.slow
 def test_a_limit_that_was_lowered_on_the_way_down_is_no_finding() -> None:
     lowered = {"limits.wheel_speed": 0.1 * PLAIN["config"]["limits"]["wheel_speed"]}
     assert played(with_a_set_before_sigterm(lowered)).finding == ""
@@ -1167,6 +1179,7 @@ def quiet_with(*events: dict[str, Any]) -> Plan:
     return quiet() | {"seconds": 6.0, "events": list(events)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moment", ["before", "behind"])
 def test_a_stop_that_arrives_in_the_step_that_crashes_is_latched_afterwards(moment: str) -> None:
     crash = {"do": "restart", "way": f"crash {moment} the robot", "stop": True}
@@ -1544,6 +1557,7 @@ def test_a_slope_that_grows_faster_than_the_jerk_is_seen_through_the_rounding() 
 # shrinking
 
 
+@pytest.mark.slow
 def test_shrinking_leaves_what_the_finding_needs(monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(one: Plan) -> Result:
         verbs = [event.get("verb") for event in one["events"]]
@@ -1663,6 +1677,7 @@ def plans_of_moments() -> dict[str, Plan]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MOMENTS)
 def test_a_plan_with_a_moment_is_legal_and_an_older_product_knows_its_faults(name: str) -> None:
     plan = plans_of_moments()[name]

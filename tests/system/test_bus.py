@@ -274,6 +274,7 @@ def test_a_delete_on_stop_is_counted_as_not_a_put_and_latches_nothing(bus: Bus) 
     bus.at_rest()
 
 
+@pytest.mark.slow
 def test_a_flood_of_deletes_on_stop_around_a_put_pushes_no_stop_out(
     bus: Bus, shared: Daemon, tmp_path: Path
 ) -> None:
@@ -310,6 +311,7 @@ def test_a_flood_of_deletes_on_stop_around_a_put_pushes_no_stop_out(
 # the publications
 
 
+@pytest.mark.slow
 def test_every_published_key_names_its_encoding_and_is_there_in_json_with_the_same_fields(
     bus: Bus,
 ) -> None:
@@ -363,6 +365,7 @@ def test_a_key_in_json_answers_by_its_exact_name_and_not_once_more_by_a_wildcard
     assert not [one.key for one in bus.ask("**") if one.key.startswith("json/")]
 
 
+@pytest.mark.slow
 def test_odometry_comes_a_hundred_times_a_second_and_state_ten_times(bus: Bus) -> None:
     begun, pid = time.monotonic(), bus.get("info")["pid"]
     waited = kept_waiting(pid)

@@ -434,6 +434,7 @@ def test_positions_that_are_missing_or_of_another_type_are_reported(
             until(came, 5.0, "a sample")
 
 
+@pytest.mark.slow
 def test_a_state_that_cannot_be_read_ends_the_leg_and_says_so(free: str) -> None:
     with router(free) as said, client_session(free, "") as heard:
         client = Client(heard, "acsar", "app")

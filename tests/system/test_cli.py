@@ -194,6 +194,7 @@ def test_echo_tf_static_prints_the_latched_one_at_once(shared: Daemon, bus: Bus)
     assert ended.seconds < 4.0 + lost(begun)
 
 
+@pytest.mark.slow
 def test_echo_shows_commands_of_others_whatever_they_send(shared: Daemon, bus: Bus) -> None:
     words = acsard("echo", "cmd/stranger", "-n", "2", "--config", str(shared.config))
     with Program(words, shared.config.parent) as echo:
@@ -541,6 +542,7 @@ def test_a_faulty_simulator_misbehaves_and_says_so(tmp_path: Path) -> None:
     assert "faults: mute" in sim.stderr
 
 
+@pytest.mark.slow
 def test_a_simulator_does_not_remove_the_link_of_the_one_that_replaced_it(tmp_path: Path) -> None:
     link = tmp_path / "mcu"
     with Program(acsard("sim", "--link", "mcu"), tmp_path) as first:
@@ -688,6 +690,7 @@ def test_the_last_word_without_a_screen_is_of_a_robot_that_stands(shared: Daemon
     assert "forward +0.00 m/s" in terminal.screen.partition("left: ")[2]
 
 
+@pytest.mark.slow
 def test_a_terminal_closed_under_a_shell_stops_its_drive_by_a_zero_not_by_silence(
     shared: Daemon, bus: Bus
 ) -> None:
@@ -705,6 +708,7 @@ def test_a_terminal_closed_under_a_shell_stops_its_drive_by_a_zero_not_by_silenc
     bus.at_rest()
 
 
+@pytest.mark.slow
 def test_a_held_key_drives_and_letting_go_stops_by_itself(shared: Daemon, bus: Bus) -> None:
     with without_a_screen(shared) as (terminal, program):
         with held(terminal, "i"):
@@ -719,6 +723,7 @@ def test_a_held_key_drives_and_letting_go_stops_by_itself(shared: Daemon, bus: B
         assert program.process.poll() is None
 
 
+@pytest.mark.slow
 def test_space_stops_at_once(shared: Daemon, bus: Bus) -> None:
     with without_a_screen(shared) as (terminal, _):
         with held(terminal, "i"):
@@ -761,6 +766,7 @@ def test_speed_keys_change_what_the_next_key_drives(shared: Daemon, bus: Bus) ->
     bus.at_rest()
 
 
+@pytest.mark.slow
 def test_ctrl_c_while_driving_stops_and_leaves_with_0_and_the_terminal_as_it_was(
     shared: Daemon, bus: Bus
 ) -> None:
@@ -783,6 +789,7 @@ def test_ctrl_c_while_driving_stops_and_leaves_with_0_and_the_terminal_as_it_was
         assert after == fresh.settings
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
 def test_a_drive_that_is_ended_from_outside_leaves_the_terminal_as_it_was(
     shared: Daemon, bus: Bus, number: signal.Signals

@@ -333,6 +333,7 @@ def test_services_answer_in_words(shared: Daemon, fresh: Bus) -> None:
         assert (pose.x, pose.y, pose.yaw) == pytest.approx((1.0, 2.0, 0.5))
 
 
+@pytest.mark.slow
 def test_a_drive_of_a_stopped_robot_raises_the_daemon_s_reason(shared: Daemon, fresh: Bus) -> None:
     with connect(shared.endpoint) as robot:
         robot.call("stop")
@@ -437,6 +438,7 @@ def test_a_reader_sleeps_between_messages(shared: Daemon, fresh: Bus) -> None:
     assert looks <= 20
 
 
+@pytest.mark.slow
 def test_the_first_send_is_a_zero_and_drives_ends_with_one(shared: Daemon, fresh: Bus) -> None:
     with connect(shared.endpoint) as robot, fresh.follow("cmd/app") as commands:
         begun = time.monotonic()

@@ -203,6 +203,7 @@ def speed(step: Any) -> float:
 LONG = (pytest.mark.soak, pytest.mark.timeout(1200))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [2, pytest.param(200, marks=LONG)])
 def test_when_a_commander_is_killed_the_ramp_starts_within_its_timeout_and_a_tick(
     far: tuple[FarPeer, Daemon], count: int
@@ -369,6 +370,7 @@ def replugged(tmp_path: Path, peer: Peer, cycles: int) -> tuple[list[float], lis
     return noticed, zeros
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cycles", [3, pytest.param(200, marks=LONG)])
 def test_an_unplug_is_seen_and_a_replug_under_another_name_found_in_time_without_leaks(
     tmp_path: Path, peer: Peer, cycles: int
@@ -382,6 +384,7 @@ def test_an_unplug_is_seen_and_a_replug_under_another_name_found_in_time_without
 # the far end does not read
 
 
+@pytest.mark.slow
 def test_a_peer_that_stops_reading_and_answering_finds_at_most_quiet_of_drive_lines(
     tmp_path: Path, peer: Peer
 ) -> None:
@@ -409,6 +412,7 @@ def test_a_peer_that_stops_reading_and_answering_finds_at_most_quiet_of_drive_li
         assert len(found) - first_zero <= 10 * (heard - begun) + 2
 
 
+@pytest.mark.slow
 def test_a_full_line_holds_no_line_of_ours_back(tmp_path: Path, peer: Peer) -> None:
     # Feedback goes on, so only the kernel's refusal shows that nothing goes out.
     with (
@@ -585,6 +589,7 @@ def test_after_half_a_second_s_stall_no_speed_is_resumed_for_a_commander_that_ha
         assert {heard.line for heard in peer.since(woken)} == {ZERO_TEXT}
 
 
+@pytest.mark.slow
 def test_after_half_a_second_s_stall_a_commander_that_goes_on_drives_from_zero_by_the_ramp(
     far: tuple[FarPeer, Daemon],
 ) -> None:

@@ -33,6 +33,7 @@ def tool(daemon: Daemon, *words: str) -> Finished:
     return typed("set", *words, "--connect", daemon.endpoint)
 
 
+@pytest.mark.slow
 def test_a_kept_setting_survives_a_restart_and_its_comments_stay(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     with Daemon(tmp_path, config={"limits": {"linear_speed": 0.5}}, endpoint=endpoint) as daemon:
@@ -61,6 +62,7 @@ def test_without_keep_the_file_stays(tmp_path: Path) -> None:
         assert daemon.config.read_bytes() == before
 
 
+@pytest.mark.slow
 def test_keep_and_a_refusal_of_the_robot(tmp_path: Path) -> None:
     with Daemon(tmp_path) as daemon:
         before = daemon.config.read_bytes()

@@ -24,6 +24,7 @@ def drives(robot: Client) -> float:
             assert lost(begun) > 0.1
 
 
+@pytest.mark.slow
 def test_the_daemon_drives_checked_with_samples_and_leaves_with_a_stop(tmp_path: Path) -> None:
     config = {"mcu": {"port": "sim", "link_check": "require", "encoder_counts": 3200}}
     started = time.monotonic()

@@ -83,6 +83,7 @@ def answer_all(terminal: Terminal, wheels: tuple[str, ...], ways: str, within: f
         )
 
 
+@pytest.mark.slow
 def test_what_a_person_at_the_terminal_sees_becomes_the_wheel_map(tmp_path: Path) -> None:
     (tmp_path / "acsard.toml").write_text("# mine\n")
     with at_terminal(tmp_path, "mcu", "check", "--port", "sim", "--write") as (terminal, program):
@@ -98,6 +99,7 @@ def test_what_a_person_at_the_terminal_sees_becomes_the_wheel_map(tmp_path: Path
     }
 
 
+@pytest.mark.slow
 def test_ctrl_c_at_the_first_question_ends_it_with_130(tmp_path: Path) -> None:
     with at_terminal(tmp_path, "mcu", "check", "--port", "sim") as (terminal, program):
         until(lambda: "lifted" in terminal.screen, 10.0, "the question")

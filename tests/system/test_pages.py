@@ -149,6 +149,7 @@ def test_the_broken_board_of_the_firmware_page_is_found_broken(tmp_path: Path) -
     assert re.search("^FAIL +motor b ", done.out, re.M)
 
 
+@pytest.mark.slow
 def test_the_first_page_pulls_a_cable_and_the_robot_waits_until_it_is_back(tmp_path: Path) -> None:
     place = with_acsard(tmp_path)
     typed_there = ("acsard sim --link ./mcu", "acsard run --port ./mcu")

@@ -32,6 +32,7 @@ def held(pid: int) -> set[str]:
     return {os.readlink(one) for one in Path(f"/proc/{pid}/fd").iterdir()}
 
 
+@pytest.mark.slow
 @needs_permission
 def test_the_control_loop_alone_is_real_time_and_memory_is_locked(tmp_path: Path) -> None:
     with running(tmp_path) as (daemon, _):
@@ -56,6 +57,7 @@ def test_it_can_be_switched_off(tmp_path: Path) -> None:
         assert daemon.events("real_time") == []
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can take root's permissions away")
 def test_without_permission_it_runs_all_the_same_and_says_so_in_one_line(tmp_path: Path) -> None:
     without = ["setpriv", "--bounding-set", "-sys_nice,-ipc_lock"]

@@ -132,6 +132,7 @@ def test_fifty_kills_cost_little_each(tmp_path: Path) -> None:
         killed(where, 1.5 + 0.03 * number)
 
 
+@pytest.mark.slow
 def test_an_orderly_end_is_whole_and_only_the_service_and_its_group_read_it(
     tmp_path: Path,
 ) -> None:
@@ -162,6 +163,7 @@ def test_a_full_disk_is_reported_and_costs_only_records(tmp_path: Path) -> None:
         assert replayed(tmp_path, path) > 0
 
 
+@pytest.mark.slow
 def test_a_directory_that_cannot_be_made_is_reported_and_the_robot_runs(tmp_path: Path) -> None:
     with (
         Daemon(tmp_path, words=["--record", "/proc/nowhere"]) as daemon,

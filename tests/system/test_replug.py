@@ -74,6 +74,7 @@ def test_unplug_and_replug_while_driving_says_so_reconnects_and_sends_nothing_ol
         assert bus.state()["x"] > moved, "odometry went on from where it was"
 
 
+@pytest.mark.slow
 def test_a_stop_stays_latched_over_a_replug(tmp_path: Path, peer: Peer) -> None:
     with (
         running(tmp_path, peer.path) as (_, bus),

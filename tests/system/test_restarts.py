@@ -245,6 +245,7 @@ def kills_after_a_stop(robot: Robot, times: int, longest_s: float) -> list[float
     return lost
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("times", [2, pytest.param(200, marks=pytest.mark.soak)])
 @pytest.mark.timeout(1200)
 def test_a_stop_that_was_answered_survives_a_kill_at_any_moment(robot: Robot, times: int) -> None:
@@ -265,6 +266,7 @@ os.replace = slow
 """Put into the daemon: while the file $SLOW exists, each replacement of a file takes 0.5 s."""
 
 
+@pytest.mark.slow
 def test_the_answer_of_a_stop_says_that_a_slow_disk_has_not_stored_it_yet(
     tmp_path: Path, peer: Peer
 ) -> None:
@@ -284,6 +286,7 @@ def test_the_answer_of_a_stop_says_that_a_slow_disk_has_not_stored_it_yet(
         assert "lose" not in bus.get("srv/stop")["message"]
 
 
+@pytest.mark.slow
 def test_a_state_directory_that_takes_no_file_starts_the_robot_stopped_and_says_so(
     tmp_path: Path, peer: Peer
 ) -> None:
@@ -298,6 +301,7 @@ def test_a_state_directory_that_takes_no_file_starts_the_robot_stopped_and_says_
         bus.comes_to("ready")
 
 
+@pytest.mark.slow
 def test_a_second_daemon_of_the_same_robot_on_another_bus_ends_with_75(
     tmp_path: Path, peer: Peer
 ) -> None:

@@ -73,6 +73,7 @@ def test_a_signal_while_driving_ramps_ends_with_stop_and_exits_0_within_1_s(
     assert not daemon.stdout.count("Traceback")
 
 
+@pytest.mark.slow
 def test_a_signal_at_rest_ends_with_stop_and_exits_0_at_once(tmp_path: Path, peer: Peer) -> None:
     with running(tmp_path, peer.path) as (daemon, _):
         sent = time.monotonic()
@@ -84,6 +85,7 @@ def test_a_signal_at_rest_ends_with_stop_and_exits_0_at_once(tmp_path: Path, pee
     assert peer.session.stream.endswith(ZERO_LINE)
 
 
+@pytest.mark.slow
 def test_a_ramp_longer_than_0_6_s_is_cut_there_with_stop_last(tmp_path: Path, peer: Peer) -> None:
     config = {"limits": SLOW_STOP}
     with running(tmp_path, peer.path, config) as (daemon, bus), bus.commanding(2.0):
@@ -141,6 +143,7 @@ def test_a_second_signal_cuts_the_ramp(tmp_path: Path, peer: Peer, second: signa
     assert ended - sent < 1.0 + machine_s
 
 
+@pytest.mark.slow
 def test_a_signal_while_the_peer_is_silent_ends_with_stop_and_exits_0(
     tmp_path: Path, peer: Peer
 ) -> None:
@@ -167,6 +170,7 @@ def method(*arguments):
 """Put into the daemon: while the file $BUG exists, a method raises an exception."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("module", "kind", "method"),
     [

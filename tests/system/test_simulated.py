@@ -105,6 +105,7 @@ def test_a_drive_is_recorded_as_calibrate_reads_it(tmp_path: Path) -> None:
         assert (told.code, "drive.csv: " in told.err) == (1, True)
 
 
+@pytest.mark.slow
 def test_who_sends_beside_the_simulated_gyro_is_refused_counted_and_told(tmp_path: Path) -> None:
     tables: dict[str, dict[str, object]] = {"odometry": {"gyro": True}}
     with Daemon(tmp_path, config=tables) as daemon, Bus(daemon.endpoint) as bus:

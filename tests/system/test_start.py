@@ -35,6 +35,7 @@ from tests.system.strangers import DRIVE, FIRST_ODOMETRY, words
 from tests.system.typed import typed
 
 
+@pytest.mark.slow
 def test_first_odometry_reaches_another_process_within_3_s_of_the_start(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     with Program(words(FIRST_ODOMETRY, endpoint), tmp_path) as watcher:
@@ -62,6 +63,7 @@ def test_half_a_metre_per_second_for_2_s_moves_odometry_by_1_m(tmp_path: Path) -
     assert position["y"] == pytest.approx(0.0, abs=0.01)
 
 
+@pytest.mark.slow
 def test_a_port_that_is_missing_at_the_start_is_reported_and_picked_up_when_it_appears(
     tmp_path: Path,
 ) -> None:

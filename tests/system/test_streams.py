@@ -39,6 +39,7 @@ def slow(value: str) -> object:
 STREAMS = {"readerless pipe": readerless_pipe, "full disk": full_disk}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stream", ["readerless pipe", slow("full disk")])
 @pytest.mark.parametrize("which", [slow("stdout"), slow("stderr"), "both"])
 def test_control_goes_on_when_output_cannot_be_written(
@@ -51,6 +52,7 @@ def test_control_goes_on_when_output_cannot_be_written(
         drives_and_leaves(daemon, peer)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "redirection", [slow(">&-"), slow("2>&-"), slow(">&- 2>&-"), "<&- >&- 2>&-"]
 )

@@ -61,6 +61,7 @@ async def test_who_opens_it_is_told_the_robot_and_follows_it(page: Page, bus: Bu
         await ours.find(lambda said: [r["robot"] for r in said.get("fleet", ())] == ["acsar"])
 
 
+@pytest.mark.slow
 async def test_who_opens_it_has_the_last_minute_and_what_was_wished_while_somebody_looked(
     daemon: Daemon, bus: Bus, tmp_path: Path
 ) -> None:

@@ -101,6 +101,7 @@ def test_speeds_on_the_wire_grow_by_the_acceleration_limit_only(started: Started
     assert max(after - before for before, after in itertools.pairwise(sped)) <= 20 * 0.05 + 0.01
 
 
+@pytest.mark.slow
 def test_a_trailing_comma_and_wired_signs_and_letters_apply_on_the_wire(
     tmp_path: Path, peer: Peer
 ) -> None:
@@ -207,6 +208,7 @@ REFUSED: dict[str, tuple[str, Reply]] = {
 }
 
 
+@pytest.mark.slow
 def test_every_refused_form_is_counted_and_only_zeros_are_sent_until_a_good_one_comes(
     tmp_path: Path, peer: Peer
 ) -> None:

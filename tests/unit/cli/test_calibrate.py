@@ -57,6 +57,7 @@ def test_json_is_one_object(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert found["reference"] == "yaw_rate"
 
 
+@pytest.mark.slow
 def test_write_keeps_the_comments_and_a_second_time_finds_nothing_to_improve(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -77,6 +78,7 @@ def test_write_keeps_the_comments_and_a_second_time_finds_nothing_to_improve(
     assert (tmp_path / "acsard.toml").read_text() == text
 
 
+@pytest.mark.slow
 def test_a_result_that_cannot_be_written_is_printed_before_the_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -90,6 +92,7 @@ def test_a_result_that_cannot_be_written_is_printed_before_the_error(
     assert (tmp_path / "acsard.toml").read_text() == "# mine\n"
 
 
+@pytest.mark.slow
 def test_a_distance_measures_the_wheels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     straight = usual(plan=[(1, 0, 0), (10, 0.4, 0), (1, 0, 0)])
     metres = 1.1 * abs(straight.where[-1])
@@ -108,6 +111,7 @@ def test_a_distance_measures_the_wheels(tmp_path: Path, capsys: pytest.CaptureFi
     assert written.odometry.distance_scale_std == deviations["distance_scale_std"] > 0.0
 
 
+@pytest.mark.slow
 def test_of_two_logs_put_together_a_distance_is_the_straight_one_s(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -199,6 +203,7 @@ def test_a_bag_that_was_cut_off_is_read_up_to_the_cut(
     assert "bag.mcap is cut off" in json.loads(capsys.readouterr().out)["notes"][0]
 
 
+@pytest.mark.slow
 def test_the_files_of_a_bag_are_one_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     seen = usual(plan=GUIDED[:10])
     messages = in_order(joint_states(seen), imu(seen))
@@ -268,6 +273,7 @@ def test_the_page_s_converter_makes_a_log_of_a_bag(
     assert found["wheel_separation_multiplier"] == pytest.approx(1.6 * 1.06, abs=0.05)
 
 
+@pytest.mark.slow
 def test_the_page_s_converter_makes_a_log_of_counts(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -38,6 +38,7 @@ def called(where: Path, *words: str, text: str = "") -> int:
     return int(args.main(args))
 
 
+@pytest.mark.slow
 def test_the_simulator_passes_and_the_lines_are_toml(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -50,6 +51,7 @@ def test_the_simulator_passes_and_the_lines_are_toml(
     assert parse(lines.encode()).mcu.encoder_counts == 3200
 
 
+@pytest.mark.slow
 def test_a_check_that_this_computer_was_too_late_for_has_not_passed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -63,6 +65,7 @@ def test_a_check_that_this_computer_was_too_late_for_has_not_passed(
     assert "FAIL" not in [one["verdict"] for one in found["findings"]]
 
 
+@pytest.mark.slow
 def test_json_is_one_object(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert called(tmp_path, "--port", "sim", "--yes", "--json") == 0
     out, err = capsys.readouterr()
@@ -76,6 +79,7 @@ def test_json_is_one_object(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert (watchdog["verdict"], watchdog["figure"][:2]) == ("PASS", "30")
 
 
+@pytest.mark.slow
 def test_write_changes_the_file_and_a_second_check_has_nothing_to_change(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -93,6 +97,7 @@ def test_write_changes_the_file_and_a_second_check_has_nothing_to_change(
 REAL = "[mcu]\nport = '/dev/acsar_mcu'\n"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", [["--yes"], ["--yes", "--json"]])
 def test_what_the_simulator_shows_is_not_offered_for_a_robot_s_file(
     tmp_path: Path, how: list[str], capsys: pytest.CaptureFixture[str]
@@ -172,6 +177,7 @@ def test_the_simulator_is_never_taken_for_a_board(
     assert capsys.readouterr().out == ""
 
 
+@pytest.mark.slow
 def test_the_port_that_was_named_is_written_with_the_rate_it_has(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -244,6 +250,7 @@ def on_terminal(columns: int, do: Callable[[], object], monkeypatch: pytest.Monk
     return written.decode().removesuffix("$")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("columns", [0, 40, 120])
 def test_progress_is_one_line_on_a_terminal_that_the_next_one_writes_over(
     tmp_path: Path, columns: int, monkeypatch: pytest.MonkeyPatch
@@ -258,6 +265,7 @@ def test_progress_is_one_line_on_a_terminal_that_the_next_one_writes_over(
     assert written.endswith("\r\033[K"), "what is printed at last stands on a line of its own"
 
 
+@pytest.mark.slow
 def test_progress_does_not_go_into_a_pipe(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -58,6 +58,7 @@ def log(where: Path, *words: str) -> tuple[int, str, str]:
     return told.code, told.out, told.err
 
 
+@pytest.mark.slow
 def test_the_list_has_a_line_for_each_recording_with_its_events(where: Path) -> None:
     set_age(where, 60.0)
     code, out, _ = log(where)
@@ -129,6 +130,7 @@ def test_the_list_takes_no_seconds_and_a_replay_no_time(where: Path) -> None:
         assert told.code == Exit.USAGE
 
 
+@pytest.mark.slow
 def test_the_configuration_names_the_directory_of_the_recordings(
     where: Path, tmp_path: Path
 ) -> None:
@@ -146,6 +148,7 @@ def test_the_configuration_names_the_directory_of_the_recordings(
         assert (told.code, bool(told.out)) == (0, True)
 
 
+@pytest.mark.slow
 def test_the_list_tells_a_start_from_a_file_that_goes_on(tmp_path: Path) -> None:
     """The files are whole, truncated, recovered into a second file, and recovered in place."""
     tape, world = recorded_world(every=200)
@@ -268,6 +271,7 @@ def test_a_time_of_day_is_found_over_midnight_for_a_table_and_for_pictures(
     assert re.search(r"<dt>Duration</dt><dd>(2\.9|3) s", (tmp_path / "new.html").read_text())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cut", [False, True])
 def test_what_a_kill_has_cut_says_so_once_it_is_whole(
     cut: bool, where: Path, tmp_path: Path

@@ -54,6 +54,7 @@ def test_the_newest_becomes_a_file_beside_you_with_a_name_of_its_own(
     assert [path.name for path in here.iterdir()] == [name]
 
 
+@pytest.mark.slow
 def test_a_number_and_a_name_are_taken_and_what_is_there_stays(
     where: Path, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -26,6 +26,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "verb", ["replay", pytest.param("report", marks=SLOW), pytest.param("export", marks=SLOW)]
 )

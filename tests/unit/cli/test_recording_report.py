@@ -61,6 +61,7 @@ def test_the_numbers_of_the_file_are_those_of_the_recording(
     assert "Plotly" in text
 
 
+@pytest.mark.slow
 def test_nothing_is_overwritten_without_force(tmp_path: Path) -> None:
     new = tmp_path / "here.html"
     new.write_text("mine")
@@ -83,6 +84,7 @@ def test_a_recording_never_goes_not_even_by_force(tmp_path: Path) -> None:
     assert new.read_bytes() == QUIET.read_bytes()
 
 
+@pytest.mark.slow
 def test_what_was_there_goes_only_when_all_of_the_new_one_is(tmp_path: Path) -> None:
     new = tmp_path / "here.html"
     new.write_text("mine")
@@ -95,6 +97,7 @@ def test_what_was_there_goes_only_when_all_of_the_new_one_is(tmp_path: Path) -> 
     assert [*tmp_path.iterdir()] == [new]
 
 
+@pytest.mark.slow
 def test_a_part_of_the_time_and_what_was_cut(tmp_path: Path) -> None:
     cut, new = tmp_path / "cut.mcap", tmp_path / "cut.html"
     shutil.copy(QUIET, cut)
@@ -107,6 +110,7 @@ def test_a_part_of_the_time_and_what_was_cut(tmp_path: Path) -> None:
     assert times[-1] - times[0] == pytest.approx(1000, abs=30)
 
 
+@pytest.mark.slow
 def test_what_is_damaged_is_left_out_and_said(tmp_path: Path) -> None:
     bad, new = tmp_path / "bad.mcap", tmp_path / "bad.html"
     data = bytearray((RECORDINGS / "faults.mcap").read_bytes())
@@ -122,6 +126,7 @@ def test_what_is_damaged_is_left_out_and_said(tmp_path: Path) -> None:
     assert "steps are missing" in text
 
 
+@pytest.mark.slow
 def test_of_a_time_without_steps_there_is_no_report(tmp_path: Path) -> None:
     new = tmp_path / "none.html"
     code, _, err = report(QUIET, new, "--from", "9999")

@@ -85,6 +85,7 @@ def test_a_range_over_several_files_names_all_of_them(ring: Ring) -> None:
     assert recording(where, "show", "all")[1].count("  stop: ") == FILES
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("verb", ["show", "export", "report"])
 def test_a_time_without_a_recording_is_refused_with_the_nearest_recordings(
     verb: str, ring: Ring, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -104,6 +105,7 @@ def test_a_time_without_a_recording_is_refused_with_the_nearest_recordings(
     assert not [*tmp_path.iterdir()]
 
 
+@pytest.mark.slow
 def test_a_time_between_two_recordings_names_both(tmp_path: Path) -> None:
     tape, later = Tape(), Tape()
     World(recorder=tape).run(1.0)
@@ -127,6 +129,7 @@ def test_a_time_between_two_recordings_names_both(tmp_path: Path) -> None:
     assert "nothing was recorded" not in recording(tmp_path, "show", "--to", local(0.9))[2]
 
 
+@pytest.mark.slow
 def test_a_time_of_day_is_looked_up_before_now_in_the_ring(
     ring: Ring, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -143,6 +146,7 @@ def test_a_time_of_day_is_looked_up_before_now_in_the_ring(
     assert (code, out.count("  stop: "), names[7] in err) == (0, 1, True)
 
 
+@pytest.mark.slow
 def test_a_drive_across_a_rotation_is_one_drive(tmp_path: Path) -> None:
     """The drive begins in the first of four files and ends in the last one."""
     tape, world = recorded_world(every=STEPS)
@@ -162,6 +166,7 @@ def test_a_drive_across_a_rotation_is_one_drive(tmp_path: Path) -> None:
     assert f"4 of 4 recordings in {tmp_path}: {', '.join(names)}" in err
 
 
+@pytest.mark.slow
 def test_a_file_alone_says_that_its_drive_began_before_it_and_goes_on_after_it(
     tmp_path: Path,
 ) -> None:
@@ -200,6 +205,7 @@ def test_an_export_goes_on_across_a_rotation(
     assert float(rows[-1].split(",")[0]) - float(rows[1].split(",")[0]) == pytest.approx(3, abs=0.1)
 
 
+@pytest.mark.slow
 def test_a_report_goes_on_across_a_rotation(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -243,6 +249,7 @@ def test_two_runs_of_the_daemon_become_two_files(
     assert len([*tmp_path.glob("00000[12]-*.csv")]) == 2
 
 
+@pytest.mark.slow
 def test_a_search_reports_the_drive_and_the_cut_at_the_end_of_the_newest_recording(
     tmp_path: Path,
 ) -> None:

@@ -186,6 +186,7 @@ sys.exit(main(["tls", *sys.argv[1:]]))
 """A program without umask that reports every change of a new file's mode, before and after."""
 
 
+@pytest.mark.slow
 def test_a_key_is_never_readable_by_others_not_even_while_it_is_written(own: Path) -> None:
     key = own / "key.pem"
     key.chmod(0o666)
@@ -253,6 +254,7 @@ def test_add_makes_one_more_by_the_same_authority_and_touches_nothing_else(own: 
     assert abs(left - timedelta(days=7)) < timedelta(minutes=10)
 
 
+@pytest.mark.slow
 @each("name", ["anna.meyer", "anna_b.meyer", "10.0.0.5", "2001:db8::9", "anna b.meyer"])
 def test_a_certificate_whose_name_looks_like_a_host_is_valid_and_names_its_owner(
     own: Path, name: str
@@ -628,6 +630,7 @@ def encrypt(own: Path, password: bytes) -> None:
     )
 
 
+@pytest.mark.slow
 def test_an_encrypted_authority_s_password_is_asked_for(own: Path) -> None:
     encrypt(own, b"secret")
     words = [sys.executable, "-m", "acsard", "tls", "renew", "--directory", str(own)]
@@ -646,6 +649,7 @@ def test_an_encrypted_authority_s_password_is_asked_for(own: Path) -> None:
     assert certificate(own).serial_number != before
 
 
+@pytest.mark.slow
 def test_an_encrypted_authority_without_a_terminal_says_so(own: Path) -> None:
     encrypt(own, b"secret")
     words = [sys.executable, "-m", "acsard", "tls", "renew", "--directory", str(own)]

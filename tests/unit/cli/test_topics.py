@@ -47,6 +47,7 @@ def test_without_any_tree_there_is_nothing_to_list() -> None:
     assert ros_table(Config(ros=RosConfig(bridge=False, rmw=False))).topics == []
 
 
+@pytest.mark.slow
 def test_no_verb_but_the_one_that_is_called_is_loaded() -> None:
     code = "import sys\nfrom acsard.cli import main\nmain(['topics'])\nprint(*sys.modules)"
     run = subprocess.run(

@@ -164,6 +164,7 @@ def test_the_busiest_program_is_searched_once_in_ten_seconds(
         assert kernel.searches == 1
 
 
+@pytest.mark.slow
 def test_reports_are_a_second_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     with watching(monkeypatch) as (watch, kernel):
         monkeypatch.setattr(late_watch, "PAUSE_NS", 1000 * MS)

@@ -88,6 +88,7 @@ def test_a_urdf_that_only_names_xacro_is_one(tmp_path: Path) -> None:
     assert robot_description(str(written(tmp_path, text))) == text
 
 
+@pytest.mark.slow
 @each("filler", ["x", '"', "\n", "é"])
 def test_the_longest_description_fits_into_a_message_of_each_encoding(
     filler: str, tmp_path: Path

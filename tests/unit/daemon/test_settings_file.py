@@ -169,6 +169,7 @@ def refusal(made: SettingsFile) -> str:
     return answer.message
 
 
+@pytest.mark.slow
 def test_a_setting_is_written_after_the_robot_has_obeyed(tmp_path: Path, started: Started) -> None:
     file = tmp_path / "acsard.toml"
     file.write_text(f"# mine\n{TEXT}")
@@ -250,6 +251,7 @@ def test_nothing_is_set_if_the_daemon_has_no_file(started: Started) -> None:
     assert answer.message.startswith("nothing is set: the daemon runs without a configuration file")
 
 
+@pytest.mark.slow
 def test_a_file_beside_tracked_ones_is_changed(tmp_path: Path, started: Started) -> None:
     other, file = tmp_path / "tracked.toml", tmp_path / "acsard.toml"
     other.write_text(TEXT)
@@ -277,6 +279,7 @@ def test_settings_that_the_robot_would_refuse_are_refused_in_its_words(
     assert "absent.toml" not in message
 
 
+@pytest.mark.slow
 def test_a_file_that_changes_between_check_and_writing_keeps_both_changes(
     file: Path, made: SettingsFile
 ) -> None:
@@ -287,6 +290,7 @@ def test_a_file_that_changes_between_check_and_writing_keeps_both_changes(
     assert file.read_text() == f"# new\n{TEXT.replace('0.5', '0.8')}[rates]\nstate = 5.0\n"
 
 
+@pytest.mark.slow
 def test_a_failure_after_the_robot_has_obeyed_is_no_success(file: Path, made: SettingsFile) -> None:
     check(made)
     read_only(file)
@@ -326,6 +330,7 @@ def test_a_disk_that_hangs_gets_an_answer_and_a_late_result_changes_nothing(
     assert made.results(0, []) == []
 
 
+@pytest.mark.slow
 def test_a_request_that_the_robot_has_is_not_reported_as_not_set(made: SettingsFile) -> None:
     """While a speed limit is in force, a `set` may wait for the step after the one before it."""
     check(made)
@@ -333,6 +338,7 @@ def test_a_request_that_the_robot_has_is_not_reported_as_not_set(made: SettingsF
     assert made.obeyed(OBEYED)
 
 
+@pytest.mark.slow
 def test_a_limit_below_a_kept_one_is_lowered_at_the_next_start(
     file: Path, started: Started
 ) -> None:
@@ -366,6 +372,7 @@ def test_a_pipe_in_place_of_the_file_is_not_read(file: Path, made: SettingsFile)
     assert "it is not a regular file" in answer.message
 
 
+@pytest.mark.slow
 def test_a_request_that_is_checked_too_late_is_not_obeyed(made: SettingsFile) -> None:
     made.keep(REQUEST, 0)
     until(lambda: made._results.waiting)
@@ -400,6 +407,7 @@ def test_too_many_requests_are_refused_and_overdue_ones_take_no_more_time(
     assert len(checked) == 2  # the first one, which hung, and the last one
 
 
+@pytest.mark.slow
 def test_changed_settings_do_not_displace_a_change_of_the_file(
     file: Path, made: SettingsFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -415,6 +423,7 @@ def test_changed_settings_do_not_displace_a_change_of_the_file(
     assert result(made) == Answer(7, True, f"{OBEYED.message}; written to {file}")
 
 
+@pytest.mark.slow
 def test_a_change_that_the_robot_has_obeyed_is_written_before_the_next_check(
     file: Path, made: SettingsFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -437,6 +446,7 @@ def test_a_change_that_the_robot_has_obeyed_is_written_before_the_next_check(
     assert done == ["check", "write", "check"]
 
 
+@pytest.mark.slow
 def test_an_editor_that_writes_while_the_change_is_computed_loses_nothing(
     file: Path, made: SettingsFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -458,6 +468,7 @@ def test_an_editor_that_writes_while_the_change_is_computed_loses_nothing(
     assert file.read_text() == f"# second\n# first\n{TEXT.replace('0.5', '0.8')}"
 
 
+@pytest.mark.slow
 def test_the_directory_is_on_the_disk_before_the_answer(
     tmp_path: Path, file: Path, made: SettingsFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -121,6 +121,7 @@ def test_a_child_that_falls_silent_is_killed_although_it_is_stopped(
     assert "stopped or hung" in child.silent
 
 
+@pytest.mark.slow
 def test_a_child_that_gives_signs_of_life_is_not_killed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "BEAT_S", 0.4)
     monkeypatch.setattr(module, "SILENT_NS", 9 * NS_PER_S // 10)
@@ -233,6 +234,7 @@ def test_a_child_ends_when_its_parent_is_killed() -> None:
 # the parent, as the child sees it
 
 
+@pytest.mark.slow
 def test_signs_of_life_reach_the_parent_and_never_wait_for_it() -> None:
     ours, its = socket.socketpair()
     with ours, its:

@@ -52,6 +52,7 @@ def connects(where: Path, server: Path, name: str, client: Path) -> bool:
     return True
 
 
+@pytest.mark.slow
 @each("name", [*PERMITTED, *BARRED])
 def test_a_certificate_is_valid_for_a_permitted_name_only(
     authority: tuple[Authority, Path], name: str, tmp_path: Path

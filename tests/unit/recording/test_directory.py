@@ -137,6 +137,7 @@ def test_recording_works_in_a_directory_of_another_user(
     assert modes(tmp_path) == {0o644}
 
 
+@pytest.mark.slow
 def test_beyond_the_limit_in_bytes_the_oldest_files_go_first_and_protected_ones_last(
     tmp_path: Path,
 ) -> None:
@@ -171,6 +172,7 @@ def test_the_time_to_make_room_is_proportional_to_the_number_of_files(tmp_path: 
     assert many < 24 * few, "8 times as many; their square would be 64 times"
 
 
+@pytest.mark.slow
 def test_protected_files_count_for_the_limit_in_bytes(tmp_path: Path) -> None:
     one = ring(tmp_path)
     for _ in range(30):
@@ -180,6 +182,7 @@ def test_protected_files_count_for_the_limit_in_bytes(tmp_path: Path) -> None:
     assert newest.exists()
 
 
+@pytest.mark.slow
 def test_old_files_go_except_the_last_fifty_with_an_incident(
     tmp_path: Path,
 ) -> None:

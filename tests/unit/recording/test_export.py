@@ -79,6 +79,7 @@ TOPICS = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_mcap_library_finds_the_export_finished_indexed_and_compressed(
     path: Path, tmp_path: Path
 ) -> None:
@@ -116,6 +117,7 @@ def counted(reader: Any) -> Counter[str]:
     return counts
 
 
+@pytest.mark.slow
 def test_rosbags_reads_every_message_with_the_definitions_in_the_file(
     path: Path, tmp_path: Path
 ) -> None:
@@ -131,6 +133,7 @@ def test_rosbags_reads_every_message_with_the_definitions_in_the_file(
     assert bag.total() == one.count == other.count
 
 
+@pytest.mark.slow
 def test_a_bag_is_a_directory_whose_metadata_match_its_file(path: Path, tmp_path: Path) -> None:
     export(Recording(path), tmp_path / "bag", "rosbag2")
     assert {one.name for one in (tmp_path / "bag").iterdir()} == {"bag_0.mcap", "metadata.yaml"}
@@ -173,6 +176,7 @@ def test_a_time_span_without_messages_writes_no_file(path: Path, tmp_path: Path)
     assert not [*tmp_path.iterdir()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_existing_file_is_replaced_only_with_force(
     kind: Kind, path: Path, tmp_path: Path
@@ -198,6 +202,7 @@ def test_a_directory_that_is_not_a_bag_is_never_replaced(path: Path, tmp_path: P
     assert [*tmp_path.iterdir()] == [new]
 
 
+@pytest.mark.slow
 def test_a_bag_with_other_files_in_it_is_never_replaced(path: Path, tmp_path: Path) -> None:
     for name in ("notes.txt", "photos", "kept.mcap"):
         new = tmp_path / f"bag {name}"
@@ -216,6 +221,7 @@ def test_a_bag_with_other_files_in_it_is_never_replaced(path: Path, tmp_path: Pa
         assert sorted(new.iterdir()) == before
 
 
+@pytest.mark.slow
 def test_a_link_to_a_bag_is_replaced_and_the_bag_stays(path: Path, tmp_path: Path) -> None:
     bag, link = tmp_path / "bag", tmp_path / "link"
     export(Recording(path), bag, "rosbag2")
@@ -276,6 +282,7 @@ def test_the_umask_decides_who_may_read_an_export(mask: int, path: Path, tmp_pat
     assert stat.S_IMODE((tmp_path / "bag").stat().st_mode) == 0o777 & ~mask
 
 
+@pytest.mark.slow
 def test_the_readable_part_of_a_cut_recording_is_exported(path: Path, tmp_path: Path) -> None:
     cut = tmp_path / "cut.mcap"
     begin, end = chunks(path.read_bytes())[-1]

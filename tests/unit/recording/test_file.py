@@ -46,6 +46,7 @@ def numbers(path: Path) -> list[int]:
     return [step.number for step in steps(Recording(path))]
 
 
+@pytest.mark.slow
 def test_all_recorded_data_is_read_back(tape: Tape, whole: Path) -> None:
     recording = Recording(whole)
     read = list(steps(recording))
@@ -94,6 +95,7 @@ def on_a_machine(tape: Tape) -> None:
         tape.taken[at] = taken._replace(inputs=replace(taken.inputs, now=now, received=reads))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("speed", "most"), [(None, 90e6), (0.5, 400e6)])
 def test_an_idle_day_is_less_than_90_mb_and_one_of_driving_less_than_400(
     speed: float | None, most: float, tmp_path: Path

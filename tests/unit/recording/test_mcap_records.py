@@ -88,6 +88,7 @@ def test_the_mcap_library_reads_a_complete_chunk_and_a_cut_chunk_that_was_ended(
         assert struct.unpack_from("<Q", data, 1)[0] == len(data) - 9
 
 
+@pytest.mark.slow
 def test_damage_never_changes_a_message_and_damage_in_the_head_costs_no_message() -> None:
     for at in range(len(COMPLETE)):
         bad = bytearray(COMPLETE)
@@ -108,6 +109,7 @@ def test_each_compression_name_may_belong_to_the_head_of_a_chunk() -> None:
     assert read_chunk(ZSTD, 0) is None
 
 
+@pytest.mark.slow
 def test_the_time_to_read_a_chunk_is_proportional_to_the_number_of_its_blocks() -> None:
     chunk, data, message = GrowingChunk(), GROWING_HEAD, Message(1, 5, b"")
     parts = []

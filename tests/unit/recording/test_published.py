@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import pytest
 from msgspec.structs import replace
 
 from acsard.core.config.settings import Config
@@ -76,6 +77,7 @@ def test_values_that_a_recording_lacks_are_not_published() -> None:
     assert all(one.latencies == {} and one.certificate_expiry == "" for one in states)
 
 
+@pytest.mark.slow
 def test_the_log_has_the_same_lines_as_the_timeline() -> None:
     tape = driven()
     timeline, steps = TimelineWriter(Config()), tape.steps()

@@ -79,6 +79,7 @@ def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
     return Bench(tmp_path, monkeypatch)
 
 
+@pytest.mark.slow
 def test_a_recorded_drive_replays_bit_by_bit(bench: Bench) -> None:
     bench.world.drive(0.5, 0.2, seconds=1.0)
     bench.drive(2.0)
@@ -90,6 +91,7 @@ def test_a_recorded_drive_replays_bit_by_bit(bench: Bench) -> None:
     assert bench.recorder.status.missing == 0
 
 
+@pytest.mark.slow
 def test_a_drive_that_begins_with_kept_latches_replays_bit_by_bit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -106,6 +108,7 @@ def test_a_drive_that_begins_with_kept_latches_replays_bit_by_bit(
     assert result.comparison.steps == bench.world.steps
 
 
+@pytest.mark.slow
 def test_a_file_that_begins_with_a_state_replays_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -123,6 +126,7 @@ def test_a_file_that_begins_with_a_state_replays_alone(
     assert count == bench.world.steps
 
 
+@pytest.mark.slow
 def test_if_the_queue_is_full_steps_are_lost_and_counted_and_the_loop_never_waits(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -170,6 +174,7 @@ def slow_syncs(bench: Bench, seconds: float, stalls: bool = False) -> Iterator[N
         yield
 
 
+@pytest.mark.slow
 def test_a_disk_that_hangs_is_reported_after_three_seconds_and_so_is_its_return(
     bench: Bench,
 ) -> None:
@@ -192,6 +197,7 @@ def test_a_disk_that_hangs_is_reported_after_three_seconds_and_so_is_its_return(
     ]
 
 
+@pytest.mark.slow
 def test_a_disk_that_takes_long_for_every_sync_is_reported_once(bench: Bench) -> None:
     bench.world.drive(0.5, 0.2, seconds=1.0)
     bench.write()
@@ -223,6 +229,7 @@ def test_a_process_that_did_not_run_is_not_a_disk_that_hangs(bench: Bench) -> No
     assert {event.level for event in bench.said} == {"info"}
 
 
+@pytest.mark.slow
 def test_a_disk_that_refuses_is_reported_and_tried_again_and_driving_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -388,6 +395,7 @@ def break_robot(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Robot, "step", step)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("broken", ["robot", "port"])
 def test_a_bug_of_the_daemon_is_recorded_with_the_inputs_of_the_failed_step(
     broken: str, bench: Bench, monkeypatch: pytest.MonkeyPatch
@@ -489,6 +497,7 @@ def test_a_bug_in_the_first_step_is_recorded(bench: Bench, monkeypatch: pytest.M
     assert last.said == "start"
 
 
+@pytest.mark.slow
 def test_the_minute_before_a_bug_is_retained(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(step_writer, "MAX_FILE_NS", 2_000_000_000)
     bench.world.drive(0.5, 0.2, seconds=1.0)
@@ -526,6 +535,7 @@ def test_a_jump_of_the_clock_costs_no_recording(
     assert seen <= there()
 
 
+@pytest.mark.slow
 def test_a_file_that_the_disk_cut_keeps_its_retention_class(bench: Bench) -> None:
     bench.world.drive(0.5, 0.2, seconds=1.0)
     bench.drive(2.0)
@@ -761,6 +771,7 @@ def test_a_disk_that_hangs_delays_the_end_of_the_daemon_only_briefly(
     eager.recorder._thread.join(20.0)
 
 
+@pytest.mark.slow
 def test_protected_files_are_not_all_deleted_for_a_disk_that_keeps_refusing(
     eager: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -783,6 +794,7 @@ def test_protected_files_are_not_all_deleted_for_a_disk_that_keeps_refusing(
     assert len(again.end()) == 5
 
 
+@pytest.mark.slow
 def test_a_file_that_cannot_be_finished_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -796,6 +808,7 @@ def test_a_file_that_cannot_be_finished_is_reported(
     assert len(bench.end()) == 2
 
 
+@pytest.mark.slow
 def test_a_directory_that_was_removed_is_reported_and_created_again(bench: Bench) -> None:
     bench.world.drive(0.5, 0.2, seconds=1.0)
     bench.drive(2.0)

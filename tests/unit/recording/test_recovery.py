@@ -53,6 +53,7 @@ def read_by_the_library(path: Path) -> list[tuple[str, int, bytes]]:
         return [(channel.topic, one.log_time, one.data) for _, channel, one in found]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("room", [False, True])
 def test_all_readable_data_stays_and_the_end_record_names_the_cut(
     data: bytes, room: bool, tmp_path: Path
@@ -164,6 +165,7 @@ def test_chunks_whose_beginning_is_damaged_are_not_thrown_away(data: bytes, tmp_
     assert list(tmp_path.iterdir()) == [whole]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("room", [False, True])
 def test_a_chunk_that_still_grew_keeps_all_its_seconds(
     growing: bytes, room: bool, tmp_path: Path

@@ -85,6 +85,7 @@ def test_every_field_of_the_inputs_is_recorded() -> None:
     assert set(PARTS) == set(Inputs.__struct_fields__)
 
 
+@pytest.mark.slow
 @given(st.lists(INPUTS, min_size=1, max_size=6), st.integers(0, 1 << 40))
 def test_all_inputs_are_read_back(inputs: list[Inputs], first: int) -> None:
     outputs = Robot(Config()).step(Inputs(Instant(1, 2), True, True))

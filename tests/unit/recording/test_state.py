@@ -71,6 +71,7 @@ def test_damaged_bytes_are_refused_with_a_message(tmp_path: Path) -> None:
     assert isinstance(thaw(data).robot, Robot)
 
 
+@pytest.mark.slow
 def test_with_any_bit_flipped_the_bytes_are_a_robot_or_refused() -> None:
     data, dice, refused = freeze(World().loop.robot, Memory()), random.Random(1), list[str]()
     for _ in range(60):
@@ -95,6 +96,7 @@ def of_older_code(path: Path, forget: Callable[[Robot], None]) -> Recording:
     return Recording(path)
 
 
+@pytest.mark.slow
 def test_attributes_that_an_older_robot_lacks_come_from_a_new_robot(tmp_path: Path) -> None:
     def forget(robot: Robot) -> None:
         for side in robot._odometry.checks.wheels._sides:
@@ -157,6 +159,7 @@ def drawn(recording: Recording) -> None:
         raise RecordingError(looked.notes[0])
 
 
+@pytest.mark.slow
 def test_a_missing_part_that_a_new_robot_lacks_too_gives_a_message(tmp_path: Path) -> None:
     def forget(robot: Robot) -> None:
         for sender in robot._arbiter._sources["app"].senders.values():

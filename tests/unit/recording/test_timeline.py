@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import pytest
 from msgspec.structs import replace
 
 from acsard.core.config.settings import Config, McuConfig
@@ -117,6 +118,7 @@ def held_by_neutral_first() -> tuple[Tape, float]:
     return tape, began
 
 
+@pytest.mark.slow
 def test_a_reason_that_changes_without_the_mode_has_an_entry() -> None:
     tape, began = held_by_neutral_first()
     held, silent = [one for one in story(tape) if one.name == "reason"]
@@ -146,6 +148,7 @@ def waits(first: str, second: str, seconds: float = 3.0) -> list[tuple[str, str]
     return [(entry.text, entry.by) for entry in entries if entry.name == "waits"]
 
 
+@pytest.mark.slow
 def test_a_sender_that_waits_for_another_source_or_sender_has_one_entry_with_both_names() -> None:
     somebody, eve = public_name("somebody"), public_name("eve")
     text = "this sender must wait: the robot follows the speeds of"
@@ -154,11 +157,13 @@ def test_a_sender_that_waits_for_another_source_or_sender_has_one_entry_with_bot
     assert waits("app", "app") == [(f"{text} app ({somebody}), which came first", f"app ({eve})")]
 
 
+@pytest.mark.slow
 def test_a_sender_of_an_unknown_source_has_no_entry() -> None:
     """The robot refuses its commands, and the log has an event about that."""
     assert waits("nav", "stranger") == []
 
 
+@pytest.mark.slow
 def test_senders_under_many_names_make_an_entry_a_second() -> None:
     tape, world = recorded_world()
     world.drive(0.5, seconds=1.0, source="teleop")
@@ -206,6 +211,7 @@ def test_a_clock_that_was_set_has_an_entry_with_the_time_of_the_new_clock() -> N
     assert "was set back by 2 h:" in back.text
 
 
+@pytest.mark.slow
 def test_a_recording_that_was_cut_ends_with_the_reason() -> None:
     tape, writer = driven(), TimelineWriter()
     for step in decode(encode(0, tape.taken)):
@@ -215,6 +221,7 @@ def test_a_recording_that_was_cut_ends_with_the_reason() -> None:
     assert cut.seconds == tape.taken[-1].inputs.now.wall_ns / 1e9
 
 
+@pytest.mark.slow
 def test_a_link_that_is_lost_briefly_has_the_reason_of_its_event_only() -> None:
     tape = Tape()
     checked = McuConfig(port="/dev/ttyACM0", link_check="auto", encoder_counts=3200)

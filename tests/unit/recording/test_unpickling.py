@@ -45,6 +45,7 @@ def said() -> dict[str, str]:
     return words
 
 
+@pytest.mark.slow
 @each("name", ATTACKS)
 def test_an_attack_is_refused_with_a_message_and_has_no_effect(
     name: str, said: dict[str, str]
@@ -100,6 +101,7 @@ def test_nesting_is_limited_in_depth_and_doubling_in_size() -> None:
         unpickle(whole(doubled(most + 1)), part_class)
 
 
+@pytest.mark.slow
 def test_the_largest_robot_is_within_the_limits() -> None:
     tape, world = recorded_world(CHECKED, every=100)
     drive_through_faults(world, 1.0)

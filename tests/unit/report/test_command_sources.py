@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from acsard.core.thinning import Span
 from acsard.report.command_sources import OTHERS
 from tests.scenarios.world import World
@@ -13,6 +15,7 @@ def spans(source: str) -> list[Span]:
     return report.sources.bands[source].spans()
 
 
+@pytest.mark.slow
 def test_the_driving_source_is_the_recorded_one() -> None:
     report, steps = drive_of_two()
     for name in ("nav", "teleop"):

@@ -48,6 +48,7 @@ def test_no_two_symbols_of_a_picture_look_alike() -> None:
     assert keys >= {"stop", "link down", "driving, teleop drives"}
 
 
+@pytest.mark.slow
 def test_a_curve_under_another_curve_stays_visible(figures: dict[str, Figure]) -> None:
     for name, beneath in (("speeds", "limited"), ("wheels", "commanded"), ("link", "sent")):
         widths = {one["name"]: one["line"]["width"] for one in figures[name].data}
@@ -80,6 +81,7 @@ def faster_than_any_robot(world: World) -> None:
     world.drive(0.3, seconds=1.0, source="nav")
 
 
+@pytest.mark.slow
 def test_one_command_of_99_m_s_does_not_flatten_the_speeds() -> None:
     report, _ = report_of(faster_than_any_robot)
     figure = TimeFigures(report, OFFSET_S).speeds()

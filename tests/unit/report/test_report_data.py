@@ -139,6 +139,7 @@ def test_the_events_of_a_clock_that_was_set_have_the_time_of_the_clock() -> None
     assert any("was set during this recording" in note for note in notes(report, ORIGIN))
 
 
+@pytest.mark.slow
 def test_a_pose_that_was_set_adds_no_distance() -> None:
     def set_away(world: World) -> None:
         world.drive(0.3, seconds=0.3)
@@ -151,6 +152,7 @@ def test_a_pose_that_was_set_adds_no_distance() -> None:
     assert [place.new for place in report.path.places()].count(True) == 2
 
 
+@pytest.mark.slow
 def test_only_steps_of_the_time_window_are_collected() -> None:
     _, steps = drive_of_two()
     begin = START.wall_ns / 1e9 + 1.0
@@ -163,6 +165,7 @@ def test_only_steps_of_the_time_window_are_collected() -> None:
     assert report_from(steps, begin=begin + 1e6).began is None
 
 
+@pytest.mark.slow
 def test_missing_steps_are_counted() -> None:
     _, steps = drive_of_two()
     report = report_from(steps[:200] + steps[260:])

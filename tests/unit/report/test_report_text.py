@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from msgspec.structs import replace
 
 from acsard.core.config.settings import BatteryConfig, Config, Source
@@ -57,6 +58,7 @@ def test_a_pressed_emergency_stop_is_counted_and_listed_and_drawn_on_the_path() 
     assert "emergency stop" in {key.meaning for key in path_figure(report).keys}
 
 
+@pytest.mark.slow
 def test_a_pressed_bumper_is_counted_and_listed_and_drawn_on_the_path() -> None:
     def pressed(world: World) -> None:
         with world.mcu.bumpers():
@@ -73,6 +75,7 @@ def test_a_pressed_bumper_is_counted_and_listed_and_drawn_on_the_path() -> None:
     assert "bumper pressed" in {key.meaning for key in path_figure(report).keys}
 
 
+@pytest.mark.slow
 def test_a_battery_stop_is_counted_and_listed_and_drawn_on_the_path() -> None:
     config = Config(battery=BatteryConfig(stop_below=21.0))
 

@@ -207,6 +207,7 @@ states = st.builds(
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(
     states, states | st.none(), number, anything, anything, st.integers(1, 140), st.integers(1, 50)

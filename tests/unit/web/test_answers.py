@@ -128,6 +128,7 @@ def test_a_page_without_its_stop_is_not_sent(page: Path) -> None:
     assert Files(page).get("index.html") is None
 
 
+@pytest.mark.slow
 def test_a_report_is_unpacked_in_pieces_that_cost_little_memory() -> None:
     for body in (b"".join(b"%d " % number for number in range(300_000)), bytes(10_000_000), b""):
         pieces = list(_unpacked(gzip.compress(body)))

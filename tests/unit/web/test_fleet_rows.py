@@ -71,6 +71,7 @@ async def row(fleet: Fleet, look: Callable[[Row], Any]) -> Row:
             await asyncio.sleep(0.01)
 
 
+@pytest.mark.slow
 async def test_a_robot_that_is_present_and_silent_is_not_shown_in_its_last_mode(
     session: zenoh.Session,
 ) -> None:

@@ -56,6 +56,7 @@ def test_it_is_openapi_as_its_validator_reads_it() -> None:
     assert [one.message for one in OpenAPIV31SpecValidator(whole).iter_errors()] == []
 
 
+@pytest.mark.slow
 def test_every_schema_is_one() -> None:
     for schema in WHOLE["components"]["schemas"].values():
         Draft202012Validator.check_schema(schema)

@@ -114,6 +114,7 @@ async def test_a_recording_that_has_grown_is_drawn_anew_and_one_that_has_not_is_
     await become(found, A, "ready", stamp=3)
 
 
+@pytest.mark.slow
 @each(
     ("program", "why"),
     [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import msgspec
+import pytest
 from aiohttp import web
 from aiohttp.test_utils import make_mocked_request
 
@@ -22,6 +23,7 @@ async def test_a_key_that_is_due_soon_does_not_wait_longer_for_what_goes_out_bef
     assert await out._send_due(one, due) > due
 
 
+@pytest.mark.slow
 async def test_a_refusal_is_reported_once_a_second_for_each_kind_of_message_and_reason() -> None:
     counts = Counts()
     out = Outgoing(web.WebSocketResponse(), make_mocked_request("GET", "/ws"), counts, "")

@@ -120,5 +120,6 @@ def test_robots_that_share_the_file_know_their_own_tokens_alone(tmp_path: Path) 
         first.revoke("phone")
 
 
+@pytest.mark.slow
 def test_what_is_kept_has_no_more_than_it_needs() -> None:
     assert Token.__struct_fields__ == ("name", "role", "digest", "made", "ends", "robot")

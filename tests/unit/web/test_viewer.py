@@ -85,6 +85,7 @@ def test_a_token_that_commands_without_end_is_refused_except_a_zero_after_a_spee
     assert commands.give("another", "teleop", other, sender, AHEAD)
 
 
+@pytest.mark.slow
 async def test_a_zero_is_obeyed_beyond_the_limit_on_messages() -> None:
     """A burst of other messages, as after a gap of the network, must not keep a robot moving."""
     put: list[tuple[float, str]] = []

@@ -119,6 +119,7 @@ VALUES: dict[str, list[object]] = {
 }
 
 
+@pytest.mark.slow
 @each(("key", "value"), [(key, value) for key, values in VALUES.items() for value in values])
 @each("beside", [{}, {"limits.angular_speed": 20.0, "limits.linear_speed": 4.5}])
 def test_a_change_is_judged_as_the_file_is(

@@ -413,6 +413,7 @@ def test_the_error_says_all_its_problems() -> None:
 # numbers
 
 
+@pytest.mark.slow
 @each("text", ["inf", "-inf", "nan"])
 @each("key", FLOATS)
 def test_a_number_that_is_not_finite_is_refused_at_every_key(key: Key, text: str) -> None:
@@ -632,6 +633,7 @@ def test_any_toml_like_text_is_a_configuration_or_a_list_of_lines(text: str) -> 
     assert is_config_or_lines(outcome(text.encode()))
 
 
+@pytest.mark.slow
 @given(st.binary(max_size=60) | st.text(max_size=60).map(lambda text: text.encode("utf-8")))
 @settings(max_examples=300)
 @example(b"\xef\xbb\xbf[robot]")
@@ -639,6 +641,7 @@ def test_any_bytes_are_a_configuration_or_a_list_of_lines(data: bytes) -> None:
     assert is_config_or_lines(outcome(data))
 
 
+@pytest.mark.slow
 @given(data=st.data())
 @settings(max_examples=150)
 def test_the_reference_file_with_a_piece_changed_is_a_configuration_or_a_list_of_lines(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -40,6 +41,7 @@ def test_a_printed_configuration_is_printed_the_same_again() -> None:
     assert printed(parse(text.encode())) == text
 
 
+@pytest.mark.slow
 @given(st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), min_size=1))
 def test_any_text_survives_printing(port: str) -> None:
     config = Config(mcu=McuConfig(port=port[:256]))

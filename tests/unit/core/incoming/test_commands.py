@@ -656,6 +656,7 @@ def damage(payload: bytes, other: bytes, rnd: random.Random) -> bytes:
     return payload
 
 
+@pytest.mark.slow
 def test_twenty_thousand_damaged_payloads_raise_nothing_but_decode_errors() -> None:
     rnd = random.Random(20_000)
     encodings = ["", "", "", "application/json", "application/msgpack", "application/cdr"]

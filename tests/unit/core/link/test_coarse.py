@@ -60,6 +60,7 @@ def drive(counts: int, seed: int, seconds: float, configured: int = 0) -> Driven
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("counts", COUNTS)
 def test_no_true_line_is_dropped_and_half_a_minute_ends_where_the_lines_say(counts: int) -> None:
     one = drive(counts, 1, 25.0)

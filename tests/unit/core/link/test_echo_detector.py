@@ -141,6 +141,7 @@ def test_a_steady_ramp_shows_no_echo() -> None:
     assert bench.exchange(0.03 * 399)  # the end of the ramp shows the echo
 
 
+@pytest.mark.slow
 @each("acceleration", [3.0, 5.0, 20.0, 400.0])
 @each("lag", [1, 2, 3, 7])
 @each("reports", [1, 2, 3])

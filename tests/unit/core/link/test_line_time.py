@@ -69,6 +69,7 @@ def slack(seeds: int) -> np.ndarray:
     return SLACK if seeds == 1 else 0.0 * SLACK
 
 
+@pytest.mark.slow
 @EFFORT
 @pytest.mark.parametrize("prompted", [False, True], ids=["reporting", "prompted"])
 def test_an_adapter_that_holds_lines_back_costs_nothing(
@@ -80,6 +81,7 @@ def test_an_adapter_that_holds_lines_back_costs_nothing(
     assert np.all(found[FOUND] <= 1.05 * found[FLOOR] + slack(seeds))
 
 
+@pytest.mark.slow
 @EFFORT
 @pytest.mark.parametrize("prompted", [False, True], ids=["reporting", "prompted"])
 def test_a_fifth_of_the_lines_lost_costs_little(prompted: bool, seconds: float, seeds: int) -> None:
@@ -131,6 +133,7 @@ def test_a_lost_answer_in_a_hundred_leaves_a_batched_link_its_clock() -> None:
     assert host.errors()[FOUND, 0] <= 0.25
 
 
+@pytest.mark.slow
 @EFFORT
 def test_bursts_of_lost_lines_are_bridged(seconds: float, seeds: int) -> None:
     case = Case(burst_every=30.0)
@@ -138,6 +141,7 @@ def test_bursts_of_lost_lines_are_bridged(seconds: float, seeds: int) -> None:
     assert found[FOUND, 0] <= 7.5
 
 
+@pytest.mark.slow
 def test_every_slot_of_a_drive_is_counted_once() -> None:
     host = drive(Case(stall=0.25, stall_every=2.0), 1, 30.0)
     clocked = [feedback.dt for feedback in host.heard[100:]]
@@ -163,6 +167,7 @@ def test_time_never_goes_back(case: Case) -> None:
     assert all(f.at.mono_ns <= f.heard_ns for f in heard)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("adapter", ["acm", "ftdi"])
 def test_a_stamp_is_when_the_sample_was_made(adapter: str) -> None:
     host = drive(Case("ftdi" if adapter == "ftdi" else "acm", stall=0.15), 3, 40.0)

@@ -101,6 +101,7 @@ def test_lines_with_a_time_are_no_lost_ones() -> None:
     assert (bench.error, bench.least) == (0, 0)
 
 
+@pytest.mark.slow
 @settings(max_examples=60)
 @given(
     stalls=st.lists(st.tuples(st.integers(1, 110), st.floats(0.0, 9.0)), max_size=20),

@@ -799,6 +799,7 @@ def test_each_list_of_a_joint_state_is_bounded(field: str) -> None:
         Cdr(JointState).decode(payload)
 
 
+@pytest.mark.slow
 def test_no_memory_is_kept_for_each_length_that_a_stranger_may_send() -> None:
     codec = Cdr(Numbers)
     payloads = [
@@ -932,6 +933,7 @@ def test_damaged_payloads_raise_nothing_but_cdr_errors_and_yield_no_more_than_th
     assert count * 0.2 < seen["accepted"] < count * 0.8
 
 
+@pytest.mark.slow
 @given(st.binary(max_size=200), st.sampled_from([LITTLE, BIG, b""]), st.sampled_from(samples()))
 @settings(max_examples=300)
 def test_any_bytes_are_a_message_or_a_cdr_error(body: bytes, head: bytes, like: Message) -> None:

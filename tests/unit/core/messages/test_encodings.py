@@ -255,6 +255,7 @@ headed = st.builds(
 )
 
 
+@pytest.mark.slow
 @given(
     st.binary(max_size=80) | headed,
     st.sampled_from(["", "application/json", "application/msgpack", "application/cdr"]),

@@ -51,6 +51,7 @@ def as_json(message: Message) -> Any:
 # the form of the schemas
 
 
+@pytest.mark.slow
 @each("name", SCHEMAS)
 def test_each_is_a_schema_of_the_dialect_it_names_and_has_an_id_of_its_own(name: str) -> None:
     schema = SCHEMAS[name]

@@ -486,6 +486,7 @@ def test_a_rate_of_zero_is_every_sample(key: str) -> None:
     assert times_of(key, CONFIG) == list(range(1000))
 
 
+@pytest.mark.slow
 @each("key", ["odom", "wheel_states", "cmd_vel_out", "state", "diagnostics"])
 @each("hz", [1.0, 3.0, 10.0, 30.0, 50.0, 80.0, 100.0])
 def test_the_average_rate_is_the_configured_one(key: str, hz: float) -> None:

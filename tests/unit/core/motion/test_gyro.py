@@ -166,6 +166,7 @@ def test_a_robot_that_is_turned_by_hand_while_its_wheels_stand_is_followed() -> 
     assert bench.told - begun == pytest.approx(0.5, abs=0.02)
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.floats(0.01, 1.5), min_size=2, max_size=6), st.integers(0, 60))
 def test_in_the_end_the_turn_is_whole_however_late_it_came(
@@ -411,6 +412,7 @@ def test_the_track_it_implies_is_shown_once_it_has_turned_enough() -> None:
     assert bench.gyro.status.track == pytest.approx(1.7, rel=0.02)
 
 
+@pytest.mark.slow
 def test_how_well_it_knows_the_track_is_a_share_of_that() -> None:
     even, uneven = Bench(skid=1.7), Bench(skid=1.7)
     for bench in (even, uneven):

@@ -172,6 +172,7 @@ def test_a_gap_that_is_bridged_while_the_gyro_is_on_trial_costs_nothing() -> Non
     assert bench.off == pytest.approx(0.0, abs=0.006)  # the robot treats its samples as steps
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(st.floats(0.0, 0.4), st.floats(0.4, 2.0), st.floats(0.2, 1.0))
 def test_a_lie_told_while_the_gyro_is_on_trial_is_put_right_once(
@@ -198,6 +199,7 @@ def proved(scale: float) -> Turning:
     return bench
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turns", [2, 20])
 def test_the_error_of_a_gyros_scale_grows_with_the_turns(turns: int) -> None:
     bench = proved(1 + GYRO_SCALE)

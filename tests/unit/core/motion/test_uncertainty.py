@@ -232,6 +232,7 @@ def test_the_error_of_a_radius_is_driven_back_with_the_way() -> None:
     assert one.covariance.yawyaw == pytest.approx(two.covariance.yawyaw)
 
 
+@pytest.mark.slow
 def test_a_heading_error_that_comes_and_goes_shortens_a_straight() -> None:
     # 60 m at k = 1e-5 gives q = 2 k / L2 of yaw per metre. The area between path and chord has the
     # variance q2 s4 / 48.

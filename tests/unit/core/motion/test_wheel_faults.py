@@ -437,6 +437,7 @@ def slipping(rng: np.random.Generator, counts: int, speed: float = 0.0) -> float
     return math.inf
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "count", [10, pytest.param(300, marks=[pytest.mark.soak, pytest.mark.timeout(1800)])]
 )

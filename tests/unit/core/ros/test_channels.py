@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import pytest
 from mcap_ros2._vendor.rosidl_adapter.parser import parse_message_string
 from msgspec import Struct, inspect
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -74,6 +75,7 @@ def same(ours: Any, theirs: Any) -> bool:
     return bool(ours == theirs) or (isinstance(ours, float) and math.isnan(ours))
 
 
+@pytest.mark.slow
 @each("channel", CHANNELS)
 def test_what_is_encoded_is_what_the_definition_says(channel: Channel) -> None:
     store = get_typestore(Stores.EMPTY)

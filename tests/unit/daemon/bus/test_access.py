@@ -371,6 +371,7 @@ def test_a_robot_grants_nothing_to_the_clients_of_another_robot(one: str, other:
 # rules that depend on the configuration
 
 
+@pytest.mark.slow
 @given(st.lists(IDS, min_size=1, max_size=5, unique=True))
 def test_only_configured_sources_may_send_commands(names: list[str]) -> None:
     sources = tuple(Source(name, priority=1, timeout=0.25) for name in names)
