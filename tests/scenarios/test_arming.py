@@ -41,6 +41,7 @@ def cleared(way: Way, *names: str) -> tuple[World, list[Speaker]]:
     return world, speakers
 
 
+@pytest.mark.slow
 @pytest.mark.variations(4)
 @pytest.mark.parametrize("count", [2, more(30), long(100)])
 @pytest.mark.parametrize("way", get_args(Way))

@@ -77,6 +77,7 @@ def test_lines_from_before_a_press_that_are_read_late_are_no_evidence_against_wh
     assert world.state.mode == "stopped"
 
 
+@pytest.mark.slow
 @pytest.mark.variations(4)
 @pytest.mark.parametrize("count", MOST)
 @pytest.mark.parametrize("config", [STOP, Config()], ids=["places", "no places"])

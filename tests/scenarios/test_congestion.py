@@ -46,6 +46,7 @@ def driven_over(way: Way, delay: Callable[[float], float], seconds: float) -> tu
     return oldest, obeyed
 
 
+@pytest.mark.slow
 @pytest.mark.variations(20)
 @pytest.mark.parametrize(
     ("share", "seconds"), [(0.095, 30.0), (0.01, 60.0), (0.02, 60.0), (0.05, 60.0)]
@@ -59,6 +60,7 @@ def test_delays_that_grow_slowly_are_not_taken_for_a_clock(
     assert oldest <= bound(way, seconds)
 
 
+@pytest.mark.slow
 @pytest.mark.variations(20)
 @pytest.mark.parametrize("plateau", [3.0, 0.5, 8.0, 30.0])
 @pytest.mark.parametrize("way", STAMPED)

@@ -84,6 +84,7 @@ def out_of(world: World) -> None:
     assert world.state.mode == "ready"
 
 
+@pytest.mark.slow
 @pytest.mark.variations(5)
 @pytest.mark.parametrize("count", MOST)
 @pytest.mark.parametrize("mode", ["driving", "ready", "stopped", "inactive", "fault"])

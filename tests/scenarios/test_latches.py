@@ -136,6 +136,7 @@ def test_a_stop_that_arrives_ahead_of_its_query_is_one_latch(world: World) -> No
     assert world.state.latch == ahead > 0
 
 
+@pytest.mark.slow
 @pytest.mark.variations(50)
 @pytest.mark.parametrize("seed", range(100))
 def test_no_delayed_clear_releases_a_stop_that_its_sender_had_not_seen(seed: int) -> None:

@@ -447,6 +447,7 @@ def test_the_mcu_stops_the_motors_by_itself_when_the_host_dies(world: World) -> 
     assert world.mcu.vehicle.set_points == [0.0] * 4
 
 
+@pytest.mark.slow
 @pytest.mark.variations(9)
 @pytest.mark.parametrize("fault", ["lost_replies", "lost_commands"])
 def test_a_link_that_loses_lines_is_reported_once(fault: str) -> None:

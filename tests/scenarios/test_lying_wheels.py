@@ -176,6 +176,7 @@ def test_forty_robots_of_96_counts_with_a_reversed_encoder_are_all_found() -> No
     assert kept < 0.05 * phantom
 
 
+@pytest.mark.slow
 @pytest.mark.variations(3)
 @pytest.mark.parametrize(
     ("lag", "reaches"), [(0.6, 0.6), pytest.param(0.6, 1.0, marks=SLOW), pytest.param(0.2, 0.6)]

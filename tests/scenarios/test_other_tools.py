@@ -197,6 +197,7 @@ class JoyTeleop(Joystick):
     zero_on_release = False
 
 
+@pytest.mark.slow
 @pytest.mark.variations(4)
 @by_each_road
 @pytest.mark.parametrize("kind", [Joystick, JoyTeleop])
@@ -430,6 +431,7 @@ class Nav2(Speaker):
             )
 
 
+@pytest.mark.slow
 @pytest.mark.variations(4)
 @by_each_road
 @pytest.mark.parametrize("smoother", [True, False])
@@ -494,6 +496,7 @@ def test_nav2_that_retries_a_goal_by_itself_drives_when_its_zero_counts(
     drives(world, lambda: nav2.goal(FAST, 1.0))
 
 
+@pytest.mark.slow
 @pytest.mark.variations(2)
 @by_each_road
 def test_the_first_goal_of_nav2_after_a_start_does_not_move_the_robot_and_the_second_one_does(
@@ -527,6 +530,7 @@ def test_a_nav2_that_was_started_again_must_send_a_zero_by_rmw_and_not_by_the_br
     (drives if moves else stands)(world, lambda: again.goal(FAST, 2.0))
 
 
+@pytest.mark.slow
 @pytest.mark.variations(4)
 @by_each_road
 @pytest.mark.parametrize("smoother", [True, False])

@@ -158,12 +158,14 @@ def cut(data: bytes) -> bytes:
     return data[: random.Random(len(data)).randrange(len(data) - 1)]
 
 
+@pytest.mark.slow
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_latched_robot_stands_after_a_restart_until_it_is_released(kind: Kind) -> None:
     stands_until_released(Host(random.Random(1)), kind, whole)
 
 
+@pytest.mark.slow
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_robot_whose_latch_file_is_cut_stands_until_it_is_cleared(kind: Kind) -> None:

@@ -701,6 +701,7 @@ def test_who_never_lets_go_never_drives_on_by_itself(kind: str, count: int) -> N
     assert not +found
 
 
+@pytest.mark.slow
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("way", SHARED)
 @pytest.mark.parametrize("count", [4, more(12)])

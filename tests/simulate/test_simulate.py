@@ -1189,6 +1189,7 @@ def test_a_stop_that_arrives_in_the_step_that_crashes_is_latched_afterwards(mome
     assert result.counts["clear"] == 1
 
 
+@pytest.mark.slow
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("damage", ["cut", "zeros", "version"])
 def test_a_robot_with_a_damaged_latch_file_starts_stopped(damage: str) -> None:
@@ -1198,6 +1199,7 @@ def test_a_robot_with_a_damaged_latch_file_starts_stopped(damage: str) -> None:
     assert result.counts["mode stopped"] == 1
 
 
+@pytest.mark.slow
 @pytest.mark.variations(4)
 @pytest.mark.parametrize("fault", [["endless"], ["wrong_baud", 9600], ["partial_line"], ["noise"]])
 def test_a_board_that_cannot_be_read_loses_the_link_and_comes_back(fault: list[Any]) -> None:
