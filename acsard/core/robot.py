@@ -54,7 +54,6 @@ from acsard.core.values import (
     Refusal,
     Request,
     Snapshot,
-    WheelSpeeds,
 )
 
 MAX_DT = 0.05
@@ -106,6 +105,9 @@ class Robot:
             self._first_events.append(Event("mode", why, "warning", kind=f"start -> {mode}"))
         self._choice = Choice()
         self._speeds = STILL
+        self._computed = self._written = STILL
+        """Wheel speeds in the last computed line, and in the last line written to the port. The
+        wheels follow the latter, also after a press whose zeros cannot be written yet."""
         self._made_of: tuple[int | None, Mode] | None = (None, self._life.mode)
         """The command and the mode for which the last line was computed. The command is represented
         by its arrival time, monotonic ns, or None without a command. After a press of the emergency
@@ -115,7 +117,7 @@ class Robot:
         self._made = self._said = (self._limiter.state, 0)
         """Two states of the limiter, each with its monotonic time, ns. `_made` belongs to the last
         computed line, and `_said` to the last line written to the port. If a line was not written,
-        `_settle` sets `_made` back to `_said`."""
+        `_settle` sets `_made` back to `_said`. After a press or without a link, both are rest."""
         self._status = ("", "", "", "")
         self._battery_level = ""
         """The level of the battery in the previous step, "" before the board's first report."""
@@ -245,17 +247,15 @@ class Robot:
             # The guard has replaced the line with STOP.
             self._limiter.cut()
             self._made = (self._limiter.state, self._made_ns)
+            self._computed = STILL
         if not inputs.superseded:
-            self._said = self._made
-        self._made = self._said
+            self._said, self._written = self._made, self._computed
+        self._made, self._computed = self._said, self._written
 
     # Feedback.
 
     def _fold(self, inputs: Inputs, events: list[Event]) -> tuple[Estimate, ...]:
         session, before = self.session, self.session.link
-        # The wheels in these lines followed the last line to the board. What the daemon does about
-        # these lines, for example after a press of a bumper, comes later.
-        commanded = self._speeds
         unsent = inputs.superseded or bool(inputs.guard_trip)
         feedback = session.update(
             inputs.now, inputs.port_open, inputs.opened, inputs.received, unsent, inputs.late_ns
@@ -302,8 +302,7 @@ class Robot:
         estimates: list[Estimate] = []
         for line in feedback:
             estimates += [
-                self._believe(one, commanded, now, events)
-                for one in self._plausible(line, now, events)
+                self._believe(one, now, events) for one in self._plausible(line, now, events)
             ]
         return tuple(estimates)
 
@@ -404,19 +403,14 @@ class Robot:
             Event("lines_rejected", why, "warning", kind="implausible", count=count, news=False)
         )
 
-    def _believe(
-        self, line: Feedback, commanded: WheelSpeeds, now: Instant, events: list[Event]
-    ) -> Estimate:
-        """Update the odometry with a plausible line, and return the estimate.
-
-        `commanded` are the speeds of the last line before this one came, rad/s.
-        """
+    def _believe(self, line: Feedback, now: Instant, events: list[Event]) -> Estimate:
+        """Update the odometry with a plausible line, and return the estimate."""
         checks = self._odometry.checks
         wheels = checks.wheels
         # A pressed emergency stop cuts the motors' power, so wheels that ignore the speeds are no
         # sign of a fault.
-        obeyed = None if self._estop.why else commanded
-        fault = wheels.watch(obeyed, line.speeds, line.since)
+        commanded = None if self._estop.why or self._estop.pressed_now else self._written
+        fault = wheels.watch(commanded, line.speeds, line.since)
         if fault:
             self._fault(fault, now, events)
         if wheels.pushed:
@@ -558,7 +552,7 @@ class Robot:
         else:
             limiter.coast(since, stop=self._life.mode in HALTED)
         self._made, self._made_ns = (limiter.state, now_ns), now_ns
-        self._speeds = self._kinematics.wheel_speeds(limiter.twist)
+        self._speeds = self._computed = self._kinematics.wheel_speeds(limiter.twist)
         return self.session.line(now_ns, self._speeds)
 
     # Report.

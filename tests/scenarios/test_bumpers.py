@@ -57,15 +57,18 @@ class Lines:
         return at_ns - self.pressed_ns, line
 
 
+SLUGGISH = Config(
+    control=ControlConfig(rate=20.0),
+    mcu=McuConfig(reply_period=0.1),
+    feedback=FeedbackConfig(fault_time=0.2),
+    safety=STOP.safety,
+    sim=SimConfig(motor_time_constant=0.319),
+)
+"""A board with its own clock and slow motors, for which a fault is proved by few lines."""
+
+
 def test_lines_from_before_a_press_that_are_read_late_are_no_evidence_against_wheels() -> None:
-    config = Config(
-        control=ControlConfig(rate=20.0),
-        mcu=McuConfig(reply_period=0.1),
-        feedback=FeedbackConfig(fault_time=0.2),
-        safety=STOP.safety,
-        sim=SimConfig(motor_time_constant=0.319),
-    )
-    world = World(config)
+    world = World(SLUGGISH)
     with world.mcu.bumpers(), world.mcu.free_running(0.1):
         world.run(0.5)
         world.drive(0.3, 0.0, seconds=4.0)
@@ -77,7 +80,21 @@ def test_lines_from_before_a_press_that_are_read_late_are_no_evidence_against_wh
     assert world.state.mode == "stopped"
 
 
-@pytest.mark.slow
+def test_wheels_turn_on_while_the_zeros_after_a_press_cannot_be_written() -> None:
+    world = World(SLUGGISH)
+    with world.mcu.bumpers(), world.mcu.free_running(0.1):
+        world.run(0.5)
+        world.drive(0.4, 0.0, seconds=4.07)
+        world.run(0.09)
+        with world.mcu.bumper_pressed(1, 0.0, 1.0):
+            world.port.blocked = True
+            world.run(0.2)
+            world.port.blocked = False
+            world.run(1.0)
+    assert world.loop.robot.counters["lines_superseded"] > 0
+    assert world.state.mode == "stopped"
+
+
 @pytest.mark.variations(4)
 @pytest.mark.parametrize("count", MOST)
 @pytest.mark.parametrize("config", [STOP, Config()], ids=["places", "no places"])
