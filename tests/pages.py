@@ -364,7 +364,7 @@ COMMANDS: dict[str, How] = {
         CALIBRATE, "test_of_two_logs_put_together_a_distance_is_the_straight_one_s"
     ),
     "sudo apt install gcc libsimavr-dev libelf-dev": InCi("libsimavr-dev"),
-    ".venv/bin/pytest tests/firmware": PYTEST,
+    '.venv/bin/pytest -m "not (firmware or soak)" tests/firmware': PYTEST,
     '.venv/bin/pytest -s -m "firmware and not soak" tests/firmware': PYTEST,
     # deploy/web
     "acsard tls init --directory tls": Elsewhere(
