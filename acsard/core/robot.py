@@ -117,7 +117,7 @@ class Robot:
         self._made = self._said = (self._limiter.state, 0)
         """Two states of the limiter, each with its monotonic time, ns. `_made` belongs to the last
         computed line, and `_said` to the last line written to the port. If a line was not written,
-        `_settle` sets `_made` back to `_said`. After a press or without a link, both are rest."""
+        `_settle` sets `_made` back to `_said`. After a press or without a link, both are zero."""
         self._status = ("", "", "", "")
         self._battery_level = ""
         """The level of the battery in the previous step, "" before the board's first report."""
