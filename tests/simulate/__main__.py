@@ -42,7 +42,7 @@ def results(seed: int, seconds: float, workers: int, within_s: float) -> Iterato
     """Play this seed and the following ones, for simulated `seconds` or for real `within_s`."""
     end = time.monotonic() + within_s
     with ProcessPoolExecutor(workers, initializer=collect_seldom) as pool:
-        running = {pool.submit(_play, seed + n) for n in range(workers)}
+        running = {pool.submit(played, made(seed + n)) for n in range(workers)}
         following, total = seed + workers, 0.0
         while running:
             done, running = wait(running, return_when=FIRST_COMPLETED)
@@ -51,12 +51,8 @@ def results(seed: int, seconds: float, workers: int, within_s: float) -> Iterato
                 total += result.simulated_s
                 yield result
                 if total < seconds and time.monotonic() < end:
-                    running.add(pool.submit(_play, following))
+                    running.add(pool.submit(played, made(following)))
                     following += 1
-
-
-def _play(seed: int) -> Result:
-    return played(made(seed))
 
 
 def show(result: Result) -> None:
