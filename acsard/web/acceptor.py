@@ -29,7 +29,7 @@ from aiohttp.web_protocol import RequestHandler
 
 from acsard.host import clock
 from acsard.host.rate_limits import Buckets
-from acsard.web.answers import HEADERS, problem
+from acsard.web.answers import HEADERS, cut, problem
 from acsard.web.callers import Who, is_loopback, network_of, unmapped
 from acsard.web.limits import HANDSHAKES, SOCKETS_HERE, UNREAD_BYTES, Sockets, sockets_for
 from acsard.web.metrics import Counts
@@ -322,7 +322,7 @@ class _Connection(asyncio.Protocol):
     def cut(self) -> None:
         self._leave()
         if self._transport is not None:
-            self._transport.abort()  # type: ignore[attr-defined]
+            cut(self._transport)
         elif self._task is None:
             self._acceptor.give_up(self)
             self._loop.remove_reader(self._socket)

@@ -19,6 +19,7 @@ from acsard.daemon.bus.address import require_id
 from acsard.host import clock
 from acsard.host.errors import UsageError
 from acsard.host.rate_limits import Buckets, Rate
+from acsard.web.answers import cut
 from acsard.web.callers import Reason
 from acsard.web.limits import STREAMS, STREAMS_OF_ONE, UNREAD_BYTES, Shares
 from acsard.web.metrics import Counts
@@ -114,9 +115,8 @@ class Outgoing:
         if self._closing:
             return
         self._closing = True
-        if self._transport is not None:
-            # A client that does not answer the close in time is cut off.
-            asyncio.get_running_loop().call_later(1.0, self._transport.abort)
+        # A client that does not answer the close in time is cut off.
+        asyncio.get_running_loop().call_later(1.0, cut, self._transport)
         said = aiohttp.WSCloseCode.POLICY_VIOLATION.to_bytes(2, "big") + why.encode()
         with suppress(ConnectionError):
             await self._socket.send_frame(said, aiohttp.WSMsgType.CLOSE)
@@ -124,8 +124,7 @@ class Outgoing:
     def cut(self) -> None:
         """End the connection at once, without a reason."""
         self._closing = True
-        if self._transport is not None:
-            self._transport.abort()
+        cut(self._transport)
 
     def pong(self, data: bytes) -> None:
         """Queue the answer to a ping, in place of an unsent answer to an earlier ping.

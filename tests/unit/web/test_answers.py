@@ -5,17 +5,21 @@ They are served by plain names only, compressed where it helps, and reloaded on 
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import gzip
 import hashlib
 import os
 import re
+import ssl
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from aiohttp.test_utils import make_mocked_request
 
-from acsard.web.answers import INLINED, PAGE, PIECE, Files, _unpacked, sent
+from acsard.machine.authority import Authority
+from acsard.web.answers import INLINED, PAGE, PIECE, Files, _unpacked, cut, sent
 
 
 @pytest.fixture
@@ -134,3 +138,34 @@ def test_a_report_is_unpacked_in_pieces_that_cost_little_memory() -> None:
         pieces = list(_unpacked(gzip.compress(body)))
         assert b"".join(pieces) == body
         assert max(map(len, pieces)) <= PIECE
+
+
+@pytest.mark.parametrize("secure", [True, False])
+@pytest.mark.parametrize("closed", [0, 1, 2])
+async def test_a_connection_is_cut_at_once_whatever_happened_to_it_before(
+    tmp_path: Path, secure: bool, closed: int
+) -> None:
+    ours = trusted = None
+    if secure:
+        Authority.make(tmp_path, "test", 1, ["127.0.0.1"]).issue(
+            tmp_path / "robot", "robot", ["127.0.0.1"], 1
+        )
+        ours = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+        ours.load_cert_chain(tmp_path / "robot" / "certificate.pem", tmp_path / "robot" / "key.pem")
+        trusted = ssl.create_default_context(cafile=str(tmp_path / "ca.pem"))
+    accepted = asyncio.Queue[asyncio.StreamWriter]()
+    server = await asyncio.start_server(
+        lambda _, writer: accepted.put_nowait(writer), "127.0.0.1", 0, ssl=ours
+    )
+    async with server, asyncio.timeout(5.0):
+        port = server.sockets[0].getsockname()[1]
+        reader, writer = await asyncio.open_connection("127.0.0.1", port, ssl=trusted)
+        transport = (await accepted.get()).transport
+        for _ in range(closed):
+            transport.close()
+        cut(transport)
+        cut(transport)
+        cut(None)
+        with suppress(ConnectionError):
+            assert await reader.read() == b""
+        writer.close()
