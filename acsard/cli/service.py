@@ -52,7 +52,10 @@ def main_install(args: argparse.Namespace) -> int:
         if not (args.dry_run or args.force):
             return int(Exit.FAILURE)
     files = service.files()
-    _do(service.installing(files, service.present(files), force=args.force), args.dry_run)
+    steps = service.installing(
+        files, service.present(files), service.unguarded(files), force=args.force
+    )
+    _do(steps, args.dry_run)
     if not args.dry_run:
         print("\nnow set [mcu] and [robot] in /etc/acsard/acsard.toml, then:")
         print("systemctl restart acsard && acsard doctor --config /etc/acsard/acsard.toml")

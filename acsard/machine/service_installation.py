@@ -14,7 +14,7 @@ import shutil
 import stat
 import subprocess
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from pathlib import Path
 
 from msgspec import Struct
@@ -133,15 +133,25 @@ class File(Struct, frozen=True):
         except OSError as error:
             raise _unreadable(self.path, error) from None
 
+    def guarded(self) -> bool:
+        """Return False if the existing file has another mode, or if root does not own it.
+
+        The user decides about a `kept` file.
+        """
+        status = self.path.stat()
+        return self.kept or (stat.S_IMODE(status.st_mode), status.st_uid) == (self.mode, 0)
+
     def condition(self) -> str:
-        """Return "missing", "as installed", "changed" or "unreadable"."""
+        """Return "missing", "as installed", "changed", "wrong mode or owner" or "unreadable"."""
         try:
             found = self.found()
         except MendableError:
             return "unreadable"
         if found is None:
             return "missing"
-        return "as installed" if found == self.content else "changed"
+        if found != self.content:
+            return "changed"
+        return "as installed" if self.guarded() else "wrong mode or owner"
 
 
 class Write(Struct, frozen=True):
@@ -333,19 +343,28 @@ def present(wanted: Iterable[File]) -> dict[Path, bytes | None]:
     return {file.path: file.found() for file in wanted}
 
 
-def installing(wanted: Iterable[File], found: Found, *, force: bool) -> list[Step]:
+def unguarded(wanted: Iterable[File]) -> set[Path]:
+    """Return the existing files whose mode or owner is not that of the installation."""
+    return {file.path for file in wanted if file.path.exists() and not file.guarded()}
+
+
+def installing(
+    wanted: Iterable[File], found: Found, unguarded: Container[Path] = (), *, force: bool
+) -> list[Step]:
     """Return the steps that install the service; `found` has the present contents of the files.
 
-    Raises `MendableError` if a step would replace a changed file, unless `force` is set.
+    The files `unguarded` have a wrong mode or owner. If they are not changed, they are written
+    again. Raises `MendableError` if a step would replace a changed file, unless `force` is set.
     """
     steps: list[Step] = []
     changed: list[str] = []
     for file in wanted:
         there = found[file.path]
-        if there == file.content or (file.kept and there is not None):
+        same = there == file.content
+        if (same and file.path not in unguarded) or (file.kept and there is not None):
             steps.append(Keep(file.path))
             continue
-        if there is not None:
+        if there is not None and not same:
             changed.append(str(file.path))
         steps.append(Write(file))
     if changed and not force:

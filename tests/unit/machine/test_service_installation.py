@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import resource
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -32,6 +34,7 @@ from acsard.machine.service_installation import (
     present,
     source,
     strangers,
+    unguarded,
     uninstalling,
 )
 from tests.each import each
@@ -130,6 +133,29 @@ def test_the_daemon_starts_before_the_page_whose_unit_mounts_its_directory() -> 
 
 def test_what_is_as_installed_is_kept_and_the_commands_run_all_the_same() -> None:
     assert installing(ALL, there(), force=False) == [*(Keep(f.path) for f in ALL), *INSTALLED]
+
+
+def test_a_file_with_a_wrong_mode_is_written_again_unless_its_content_differs() -> None:
+    # Without its mode the stop script sends no zeros after the daemon's end.
+    steps = installing(ALL, there(), {STOP_FILE.path, OWN.path}, force=False)
+    assert [step for step in steps if isinstance(step, Write)] == [Write(STOP_FILE)]
+    with pytest.raises(MendableError, match="differ"):
+        installing(ALL, there(stop=b"mine"), {STOP_FILE.path}, force=False)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give files away")
+@pytest.mark.parametrize(
+    "spoil", [lambda path: path.chmod(0o644), lambda path: os.chown(path, 1, 1)]
+)
+def test_a_wrong_mode_or_owner_is_seen(tmp_path: Path, spoil: Callable[[Path], None]) -> None:
+    file = File(tmp_path / "stop", b"stop", 0o755)
+    assert unguarded([file]) == set()
+    Write(file).do()
+    assert (unguarded([file]), file.condition()) == (set(), "as installed")
+    spoil(file.path)
+    assert (unguarded([file]), file.condition()) == ({file.path}, "wrong mode or owner")
+    Write(file).do()
+    assert (unguarded([file]), file.condition()) == (set(), "as installed")
 
 
 def test_somebody_else_s_file_is_overwritten_by_force_only() -> None:
@@ -261,7 +287,7 @@ def test_written_and_removed_a_directory_is_as_it_was(tmp_path: Path) -> None:
     (tmp_path / "elsewhere").write_text("untouched")
     file = File(tmp_path / "acsard" / "bin" / "tool", b"new", 0o755)
     Write(file).do()
-    assert file.condition() == "as installed"
+    assert file.found() == b"new"
     assert file.path.stat().st_mode & 0o777 == 0o755
     file.path.unlink()
     file.path.symlink_to(tmp_path / "elsewhere")
