@@ -30,6 +30,9 @@ ANSWER_S = 10.0
 LATE_S = 0.1
 """A host that is this late has not kept its pace."""
 
+MS = 1_000_000
+"""Nanoseconds in a millisecond."""
+
 Speeds = tuple[float, float, float, float]
 
 STOP = b"ap00.00,bp00.00,cp00.00,dp00.00"
@@ -235,6 +238,16 @@ class Board:
                 self._errors.seek(0)
                 raise AssertionError(f"the runner ended: {self._errors.read()!r}")
             self._held += data
+
+
+def passes(board: Board, ms: float) -> Status:
+    """Return the state after this much of the board's time."""
+    end = board.status().virtual_ns + ms * MS
+    return until(
+        lambda: status if (status := board.status()).virtual_ns >= end else None,
+        10.0 + ms / 100,
+        f"{ms} ms pass",
+    )
 
 
 def speeds_line(speeds: Sequence[float]) -> bytes:

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from tests.firmware.board import Board, Host, Identity, Status
+from tests.firmware.board import MS, Board, Host, Identity, Status, passes
 from tests.firmware.conftest import BUMPERS, ESTOP, FREE_SPEEDS, wired_board
 from tests.system.harness import (
     ZERO,
@@ -33,7 +33,6 @@ from tests.system.harness import (
 
 pytestmark = pytest.mark.firmware
 
-MS = 1_000_000
 
 RADIUS, TRACK = 0.05, 0.3
 """m, as in the daemon's configuration."""
@@ -83,16 +82,6 @@ def running(
     with Daemon(where, port or board.path, config) as daemon, Bus(daemon.endpoint) as bus:
         bus.linked()
         yield Rig(board, daemon, bus)
-
-
-def passes(board: Board, ms: float) -> Status:
-    """Return the state after this much of the board's time."""
-    end = board.status().virtual_ns + ms * MS
-    return until(
-        lambda: status if (status := board.status()).virtual_ns >= end else None,
-        10.0 + ms / 100,
-        f"{ms} ms pass",
-    )
 
 
 def turns(board: Board, speed: float) -> Status | None:

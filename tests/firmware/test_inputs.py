@@ -9,13 +9,14 @@ import pytest
 
 from acsard.core.link.board_status import STATUS, BoardStatus, decode_status
 from tests.firmware.board import (
+    MS,
     STOP,
     Board,
     Host,
     Reply,
     Speeds,
-    Status,
     checked,
+    passes,
     read_reply,
     speeds_line,
 )
@@ -24,7 +25,6 @@ from tests.system.harness import until
 
 pytestmark = pytest.mark.firmware
 
-MS = 1_000_000
 
 DRIVE: Speeds = (10.0, -5.0, 20.0, -30.0)
 
@@ -52,12 +52,6 @@ def reports(host: Host) -> list[BoardStatus]:
 def awaited(host: Host, wanted: BoardStatus) -> None:
     """Wait for that status line."""
     until(lambda: wanted in reports(host), 5.0, f"{wanted}")
-
-
-def passes(board: Board, ms: float) -> Status:
-    """Return the state after this much of the board's time."""
-    end = board.status().virtual_ns + ms * MS
-    return until(lambda: s if (s := board.status()).virtual_ns >= end else None, 10.0, f"{ms} ms")
 
 
 def asks(board: Board, host: Host, speeds: Speeds, ms: float) -> None:
