@@ -55,7 +55,7 @@ if sys.dont_write_bytecode or not os.access(__file__, os.W_OK):
 LIVE = ("bench", "firmware", "system", "systemd")
 """Directories whose tests run real processes in real time. They run before the computed tests."""
 
-VARIATIONS_PER_CI_TEST = 6
+VARIATIONS_PER_CI_TEST = 10
 """`.ci/run` runs about one of this number of slow variations. The nightly job runs the others."""
 
 LOUD = (

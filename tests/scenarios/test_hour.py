@@ -105,6 +105,7 @@ def test_two_minutes_end_as_they_always_did() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_ten_minutes_end_as_they_always_did() -> None:
     ends_as_it_always_did(SLOW)
 

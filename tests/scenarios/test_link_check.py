@@ -697,7 +697,7 @@ def test_a_checked_link_that_begins_to_echo_while_it_drives_is_found_out(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("speeds", [4, pytest.param(40, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("speeds", [4, pytest.param(40, marks=pytest.mark.nightly)])
 @each("period", [0.0, 0.05])
 @each(
     ("lag", "counts"),

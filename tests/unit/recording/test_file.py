@@ -123,7 +123,9 @@ def test_only_the_service_and_its_group_may_read_a_recording(whole: Path) -> Non
     assert whole.stat().st_mode & 0o777 == MODE == 0o640
 
 
-@pytest.mark.parametrize("cuts", [30, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "cuts", [30, pytest.param(1000, marks=[pytest.mark.slow, pytest.mark.nightly])]
+)
 def test_every_complete_chunk_of_a_cut_file_is_read(whole: Path, tmp_path: Path, cuts: int) -> None:
     data, dice, path = whole.read_bytes(), random.Random(1), tmp_path / "cut.mcap"
     (first, _), *_ = ends = chunks(data)
