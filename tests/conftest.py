@@ -56,7 +56,7 @@ LIVE = ("bench", "firmware", "system", "systemd")
 """Directories whose tests run real processes in real time. They run before the computed tests."""
 
 VARIATIONS_PER_CI_TEST = 10
-"""`.ci/run` runs about one of this number of slow variations. The nightly job runs the others."""
+"""`.ci/run` runs about one in this many slow variations. The nightly job runs the others."""
 
 LOUD = (
     "test_bad_commands.py", "test_board.py", "test_bus.py", "test_daemon.py", "test_faults.py",

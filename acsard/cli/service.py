@@ -53,7 +53,7 @@ def main_install(args: argparse.Namespace) -> int:
             return int(Exit.FAILURE)
     files = service.files()
     steps = service.installing(
-        files, service.present(files), service.unguarded(files), force=args.force
+        files, service.present(files), service.wrong_modes(files), force=args.force
     )
     _do(steps, args.dry_run)
     if not args.dry_run:

@@ -133,13 +133,15 @@ class File(Struct, frozen=True):
         except OSError as error:
             raise _unreadable(self.path, error) from None
 
-    def guarded(self) -> bool:
-        """Return False if the existing file has another mode, or if root does not own it.
+    def is_as_written(self) -> bool:
+        """Return whether the existing file has the mode of the installation, and root owns it.
 
-        The user decides about a `kept` file.
+        Return True for a `kept` file and for a symbolic link: the user decides about these.
         """
-        status = self.path.stat()
-        return self.kept or (stat.S_IMODE(status.st_mode), status.st_uid) == (self.mode, 0)
+        status = self.path.lstat()
+        if self.kept or stat.S_ISLNK(status.st_mode):
+            return True
+        return (stat.S_IMODE(status.st_mode), status.st_uid) == (self.mode, 0)
 
     def condition(self) -> str:
         """Return "missing", "as installed", "changed", "wrong mode or owner" or "unreadable"."""
@@ -151,16 +153,22 @@ class File(Struct, frozen=True):
             return "missing"
         if found != self.content:
             return "changed"
-        return "as installed" if self.guarded() else "wrong mode or owner"
+        return "as installed" if self.is_as_written() else WRONG_MODE
+
+
+WRONG_MODE = "wrong mode or owner"
 
 
 class Write(Struct, frozen=True):
+    """Step that writes a file. `why` is the reason that the user reads, or ""."""
+
     file: File
+    why: str = ""
 
     def __str__(self) -> str:
-        return (
-            f"write   {self.file.path}  ({len(self.file.content)} bytes, mode {self.file.mode:o})"
-        )
+        why = f"; {self.why}" if self.why else ""
+        size, mode = len(self.file.content), self.file.mode
+        return f"write   {self.file.path}  ({size} bytes, mode {mode:o}{why})"
 
     def do(self) -> None:
         """Write the file, and create its directories so that the service's user may enter them."""
@@ -343,30 +351,31 @@ def present(wanted: Iterable[File]) -> dict[Path, bytes | None]:
     return {file.path: file.found() for file in wanted}
 
 
-def unguarded(wanted: Iterable[File]) -> set[Path]:
+def wrong_modes(wanted: Iterable[File]) -> set[Path]:
     """Return the existing files whose mode or owner is not that of the installation."""
-    return {file.path for file in wanted if file.path.exists() and not file.guarded()}
+    return {file.path for file in wanted if file.path.exists() and not file.is_as_written()}
 
 
 def installing(
-    wanted: Iterable[File], found: Found, unguarded: Container[Path] = (), *, force: bool
+    wanted: Iterable[File], found: Found, wrong: Container[Path], *, force: bool
 ) -> list[Step]:
     """Return the steps that install the service; `found` has the present contents of the files.
 
-    The files `unguarded` have a wrong mode or owner. If they are not changed, they are written
-    again. Raises `MendableError` if a step would replace a changed file, unless `force` is set.
+    `wrong` are the files with a wrong mode or owner. Such a file is written again if its content
+    is that of the installation. Raises `MendableError` if a step would replace a changed file,
+    unless `force` is set.
     """
     steps: list[Step] = []
     changed: list[str] = []
     for file in wanted:
         there = found[file.path]
         same = there == file.content
-        if (same and file.path not in unguarded) or (file.kept and there is not None):
+        if (same and file.path not in wrong) or (file.kept and there is not None):
             steps.append(Keep(file.path))
             continue
         if there is not None and not same:
             changed.append(str(file.path))
-        steps.append(Write(file))
+        steps.append(Write(file, f"it has a {WRONG_MODE}" if same else ""))
     if changed and not force:
         paths = ", ".join(changed)
         raise MendableError(

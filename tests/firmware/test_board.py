@@ -537,7 +537,8 @@ def test_an_overflow_costs_its_lines_and_spares_the_next(
 
 def test_a_port_that_vanishes_stops_it_and_a_new_one_works(board: Board, host: Host) -> None:
     host.drive(DRIVE, 0.3)
-    passes(board, 30)  # the last line is executed, so no part of a line follows it
+    # The board hears the whole last line. Otherwise it might hear a part of it and then nothing.
+    passes(board, 30)
     board.command("unplug")
     status = until(lambda: s if is_off(s := board.status()) else None, 3.0, "motors off")
     assert 250 <= (status.off_ns - status.heard_ns) / MS <= 350

@@ -239,7 +239,7 @@ def shove(world: World, mode: str, dice: random.Random) -> None:
     "count",
     [
         8,
-        pytest.param(40, marks=[pytest.mark.slow, pytest.mark.nightly]),
+        pytest.param(40, marks=pytest.mark.nightly),
         pytest.param(1000, marks=[pytest.mark.soak, pytest.mark.timeout(1800)]),
     ],
 )

@@ -42,6 +42,8 @@ def results(seed: int, seconds: float, workers: int, within_s: float) -> Iterato
     """Play this seed and the following ones, for simulated `seconds` or for real `within_s`."""
     end = time.monotonic() + within_s
     with ProcessPoolExecutor(workers, initializer=collect_seldom) as pool:
+        # A worker that is not forked, as in Python 3.14, does not import a package's `__main__`, so
+        # the function must be in another module.
         running = {pool.submit(played, made(seed + n)) for n in range(workers)}
         following, total = seed + workers, 0.0
         while running:

@@ -253,7 +253,7 @@ def taken_over(
                     str(s["waits_for"]) for s in bus.state()["sources"] if s["name"] == successor
                 )
 
-            until(lambda: "first" in waiting(), 5.0, "only the first one keeps it waiting")
+            until(lambda: waiting().startswith("first has "), 5.0, "only the first one counts")
             driven = peer.lines[-1].line.startswith(text(0.3))
             first.signal(signal.SIGKILL)
             first.ended(5.0)

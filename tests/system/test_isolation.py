@@ -190,8 +190,8 @@ class Robot:
             time.sleep(seconds)
             # A query waits as long as the lock is held.
             until(lambda: bus.ask("info"), 30.0, "the bus is free again")
-            ended = bus.state()
-        return Periods.between(begun, ended), ended["counters"], lost(now)
+            ended, taken = bus.state(), lost(now)
+        return Periods.between(begun, ended), ended["counters"], taken
 
     def _under(
         self,

@@ -139,7 +139,7 @@ def test_a_gateway_that_is_killed_is_open_again_and_the_daemon_does_not_notice(
     opened(container)
     daemon, first = container.main_pid(), container.show("MainPID", GATEWAY)
     os.kill(container.main_pid(GATEWAY), signal.SIGKILL)
-    # Until systemd starts the unit again, it has no process and still the old one's text.
+    # Until systemd starts the unit again, MainPID is 0, and StatusText is the killed process's.
     until(
         lambda: container.show("MainPID", GATEWAY) not in {"0", first}, 10.0, "it is started again"
     )

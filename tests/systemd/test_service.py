@@ -19,6 +19,7 @@ pytestmark = pytest.mark.systemd
 ACSARD = "/opt/acsard/venv/bin/acsard"
 PLACES = ("/etc", "/opt/acsard/bin")
 CONFIGURATION = "/etc/acsard/acsard.toml"
+STOP = "/opt/acsard/bin/acsard-stop"
 RECORDINGS = ROOT / "tests" / "recordings"
 
 
@@ -67,7 +68,7 @@ def test_a_dry_run_prints_every_file_and_command_and_touches_nothing(bare: Conta
         f"/etc/systemd/system/{UNIT}",
         f"/etc/systemd/system/{GATEWAY}",
         f"/etc/systemd/system/{PAGE}",
-        "/opt/acsard/bin/acsard-stop",
+        STOP,
         "/etc/udev/rules.d/70-acsar.rules",
         CONFIGURATION,
     ]
@@ -83,6 +84,11 @@ def test_installed_it_runs_and_uninstalled_nothing_is_left(bare: Container) -> N
     assert bare.show("UnitFileState") == "enabled"
     status = bare.run(ACSARD, "service", "status")
     assert (status.code, status.out.count("as installed")) == (0, 6)
+    assert bare.run("chmod", "644", STOP).code == 0
+    status = bare.run(ACSARD, "service", "status")
+    assert f"wrong mode or owner  {STOP}" in status.out, status.out
+    assert bare.run(ACSARD, "service", "install").code == 0
+    assert bare.run("stat", "-c", "%a", STOP).out.strip() == "755"
     gone = bare.run(ACSARD, "service", "uninstall")
     assert gone.code == 0, gone.out + gone.err
     assert listing(bare) == before

@@ -34,8 +34,8 @@ from acsard.machine.service_installation import (
     present,
     source,
     strangers,
-    unguarded,
     uninstalling,
+    wrong_modes,
 )
 from tests.each import each
 
@@ -121,7 +121,7 @@ NOTHING: Found = {file.path: None for file in ALL}
 
 
 def test_all_files_are_written_where_there_is_none_then_the_commands_run() -> None:
-    assert installing(ALL, NOTHING, force=False) == [*map(Write, ALL), *INSTALLED]
+    assert installing(ALL, NOTHING, (), force=False) == [*map(Write, ALL), *INSTALLED]
 
 
 def test_the_daemon_starts_before_the_page_whose_unit_mounts_its_directory() -> None:
@@ -132,13 +132,15 @@ def test_the_daemon_starts_before_the_page_whose_unit_mounts_its_directory() -> 
 
 
 def test_what_is_as_installed_is_kept_and_the_commands_run_all_the_same() -> None:
-    assert installing(ALL, there(), force=False) == [*(Keep(f.path) for f in ALL), *INSTALLED]
+    assert installing(ALL, there(), (), force=False) == [*(Keep(f.path) for f in ALL), *INSTALLED]
 
 
 def test_a_file_with_a_wrong_mode_is_written_again_unless_its_content_differs() -> None:
     # Without its mode the stop script sends no zeros after the daemon's end.
     steps = installing(ALL, there(), {STOP_FILE.path, OWN.path}, force=False)
-    assert [step for step in steps if isinstance(step, Write)] == [Write(STOP_FILE)]
+    (step,) = (step for step in steps if isinstance(step, Write))
+    assert step.file == STOP_FILE
+    assert str(step).endswith("(4 bytes, mode 755; it has a wrong mode or owner)")
     with pytest.raises(MendableError, match="differ"):
         installing(ALL, there(stop=b"mine"), {STOP_FILE.path}, force=False)
 
@@ -149,32 +151,37 @@ def test_a_file_with_a_wrong_mode_is_written_again_unless_its_content_differs() 
 )
 def test_a_wrong_mode_or_owner_is_seen(tmp_path: Path, spoil: Callable[[Path], None]) -> None:
     file = File(tmp_path / "stop", b"stop", 0o755)
-    assert unguarded([file]) == set()
+    assert wrong_modes([file]) == set()
     Write(file).do()
-    assert (unguarded([file]), file.condition()) == (set(), "as installed")
+    assert (wrong_modes([file]), file.condition()) == (set(), "as installed")
     spoil(file.path)
-    assert (unguarded([file]), file.condition()) == ({file.path}, "wrong mode or owner")
+    assert (wrong_modes([file]), file.condition()) == ({file.path}, "wrong mode or owner")
     Write(file).do()
-    assert (unguarded([file]), file.condition()) == (set(), "as installed")
+    assert (wrong_modes([file]), file.condition()) == (set(), "as installed")
+    file.path.rename(tmp_path / "elsewhere")
+    file.path.symlink_to(tmp_path / "elsewhere")
+    spoil(file.path)
+    assert wrong_modes([file]) == set()
+    assert wrong_modes([File(tmp_path / "elsewhere", b"stop", 0o755)])
 
 
 def test_somebody_else_s_file_is_overwritten_by_force_only() -> None:
     found = there(unit=b"mine", own=None)
     with pytest.raises(MendableError, match=f"this version of acsard installs: {UNIT_FILE.path};"):
-        installing(ALL, found, force=False)
-    steps = installing(ALL, found, force=True)
+        installing(ALL, found, (), force=False)
+    steps = installing(ALL, found, (), force=True)
     assert [step for step in steps if isinstance(step, Write)] == [Write(UNIT_FILE), Write(OWN)]
 
 
 @pytest.mark.parametrize("force", [False, True])
 def test_a_configuration_that_was_written_is_never_replaced(force: bool) -> None:
-    assert Keep(OWN.path) in installing(ALL, there(own=b"mine"), force=force)
+    assert Keep(OWN.path) in installing(ALL, there(own=b"mine"), (), force=force)
 
 
 def test_all_that_is_as_installed_is_removed() -> None:
     removed = [Remove(file.path) for file in ALL]
     leaving = Run(("systemctl", "disable", "--now", PAGE, GATEWAY, UNIT))
-    assert uninstalling(ALL, there(), force=False) == [leaving, *removed, *GONE]
+    assert uninstalling(ALL, there(), (), force=False) == [leaving, *removed, *GONE]
 
 
 def test_a_unit_that_is_not_there_is_not_disabled() -> None:
@@ -184,11 +191,11 @@ def test_a_unit_that_is_not_there_is_not_disabled() -> None:
 
 
 def test_where_nothing_is_nothing_is_stopped_or_removed() -> None:
-    assert uninstalling(ALL, NOTHING, force=False) == [*GONE]
+    assert uninstalling(ALL, NOTHING, (), force=False) == [*GONE]
 
 
 def kept(found: Found, *, force: bool) -> set[Path]:
-    steps = uninstalling(ALL, found, force=force)
+    steps = uninstalling(ALL, found, (), force=force)
     return {step.path for step in steps if isinstance(step, Keep)}
 
 
@@ -245,7 +252,7 @@ def test_a_purge_installs_a_unit_for_systemd_to_find_the_state_that_an_uninstall
 
 @pytest.mark.parametrize("purge", [False, True])
 def test_recordings_and_invitations_stay_unless_purged(purge: bool) -> None:
-    steps = uninstalling(ALL, there(), force=False, purge=purge, stateful=STATES)
+    steps = uninstalling(ALL, there(), (), force=False, purge=purge, stateful=STATES)
     kept = {step.path for step in steps if isinstance(step, Keep)}
     cleans = {Run(("systemctl", "clean", "--what=state", unit)) for unit in (UNIT, PAGE)}
     assert kept == (set() if purge else {where for where, _ in STATES.values()})

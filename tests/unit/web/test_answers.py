@@ -142,7 +142,7 @@ def test_a_report_is_unpacked_in_pieces_that_cost_little_memory() -> None:
 
 @pytest.mark.parametrize("secure", [True, False])
 @pytest.mark.parametrize("closed", [0, 1, 2])
-async def test_a_connection_is_cut_at_once_whatever_happened_to_it_before(
+async def test_a_connection_can_be_cut_however_often_it_was_closed(
     tmp_path: Path, secure: bool, closed: int
 ) -> None:
     ours = trusted = None
