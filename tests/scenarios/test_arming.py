@@ -123,7 +123,7 @@ def test_a_shared_sender_that_a_crowd_pushed_out_must_let_go_as_before(way: Way)
     assert not moved(world, start_ns)
 
 
-@pytest.mark.variations(4)
+@pytest.mark.variations(8)
 @pytest.mark.parametrize("pauses", [(1.1, 1.1, 5.0), pytest.param((60.0,), marks=pytest.mark.slow)])
 @pytest.mark.parametrize("way", get_args(Way))
 def test_a_pause_arms_no_sender(way: Way, pauses: tuple[float, ...]) -> None:
@@ -188,7 +188,7 @@ def test_more_zeros_of_a_shared_identity_neither_help_nor_harm(way: Way, hz: flo
     assert world.state.mode == "driving"
 
 
-@pytest.mark.variations(4)
+@pytest.mark.variations(8)
 @pytest.mark.parametrize(
     "pauses", [(0.3, 1.0, 10.0), pytest.param((60.0,), marks=pytest.mark.slow)]
 )

@@ -95,6 +95,7 @@ def test_wheels_turn_on_while_the_zeros_after_a_press_cannot_be_written() -> Non
     assert world.state.mode == "stopped"
 
 
+@pytest.mark.slow
 @pytest.mark.variations(4)
 @pytest.mark.parametrize("count", MOST)
 @pytest.mark.parametrize("config", [STOP, Config()], ids=["places", "no places"])
@@ -125,6 +126,7 @@ def test_each_press_stops_the_robot_within_a_period_until_a_clear(
     assert slowest_ns <= world.period_ns
 
 
+@pytest.mark.slow
 @pytest.mark.variations(4)
 @pytest.mark.parametrize("count", [5, pytest.param(25, marks=pytest.mark.slow), MOST[1]])
 @pytest.mark.parametrize(("place", "sign"), [*zip(PLACES, (-1, 1, 0, 0), strict=True)])

@@ -76,7 +76,7 @@ class Square:
         return math.dist((pose.x, pose.y), (true.x, true.y)), yaw
 
 
-@pytest.mark.variations(12)
+@pytest.mark.variations(36)
 @pytest.mark.parametrize("seed", [1, more(2), more(3)])
 @pytest.mark.parametrize("stalls", [False, True], ids=["", "stalls"])
 @pytest.mark.parametrize(

@@ -55,6 +55,7 @@ def test_positions_of_a_drive_are_cut_at_gaps_of_the_wheels() -> None:
     assert begin.t[-1] < 20.0 < 40.0 < end.t[0]
 
 
+@pytest.mark.slow
 def test_an_ideal_robot_is_off_by_its_track_now_and_by_nothing_then() -> None:
     _, better = held(ideal())
     assert better.turn.before == pytest.approx(0.6 * 360, rel=0.02)

@@ -380,6 +380,7 @@ def test_noise_that_is_right_already_stays(found: Calibration) -> None:
     assert any("stay as configured" in note for note in again.notes)
 
 
+@pytest.mark.slow
 def test_noise_of_a_robot_whose_geometry_is_right_is_written_alone(found: Calibration) -> None:
     """The deviations of the radii give way to that of their ratio, which contains them."""
     geometry = configs(found)[0]

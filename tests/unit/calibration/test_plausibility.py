@@ -184,6 +184,7 @@ def test_sides_of_different_size_are_reported() -> None:
     assert not list(remarks({}, 0.0, turned, np.array([1.6, 0.96, 1.04]), BASE, sized=True))
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize(("gyro", "places"), [(True, False), (False, True), (True, True)])
 def test_it_begins_near_the_truth(gyro: bool, places: bool) -> None:
     made = ready(table(usual(), gyro=gyro, places=places))

@@ -89,6 +89,7 @@ def test_it_begins_near_the_truth(separation: float, radius: float) -> None:
     assert found.parameters[P.INVERSE_TRACK] == pytest.approx(separation / 0.5, rel=0.15)
 
 
+@pytest.mark.slow
 def test_a_reversed_side_and_a_mirrored_path_show_in_the_signs() -> None:
     seen = usual()
     left, mirrored = replace(seen, left=-seen.left), replace(seen, place=seen.place.conj())

@@ -148,6 +148,7 @@ TEN: list[tuple[str, str, str, str, str, dict[str, object]]] = [
 ]  # fmt: skip
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize(("fault", "name", "verdict", "text", "mend", "changes"), TEN)
 def test_a_planted_fault_is_found_and_named(
     fault: str, name: str, verdict: str, text: str, mend: str, changes: dict[str, object]
@@ -252,6 +253,7 @@ def test_a_dead_last_motor_is_no_missing_comma() -> None:
     assert "mcu.trailing_comma" not in checked.changes
 
 
+@pytest.mark.variations(4)
 @pytest.mark.parametrize("fault", ["dead_motor=d", "stuck_encoder=d"])
 @pytest.mark.parametrize("counts", [16, 48, 150, 400])
 def test_a_motor_that_coasts_between_two_counts_is_not_moved_by_the_next_one(

@@ -96,6 +96,7 @@ def test_a_motor_that_does_not_turn_as_told_cannot_show_it() -> None:
         assert watchdog.finding(board, []).verdict == "SKIPPED"
 
 
+@pytest.mark.variations(4)
 @pytest.mark.parametrize("kind", [("plain_only",), ("no_sample",), (), ("free_running",)])
 @pytest.mark.parametrize("lag", [0.0, pytest.param(0.6, marks=pytest.mark.slow)])
 def test_one_that_broken_lines_feed_fails_and_no_other(kind: tuple[str, ...], lag: float) -> None:

@@ -165,6 +165,7 @@ SECTOR = 512
 """Bytes that a disk writes at once."""
 
 
+@pytest.mark.slow
 def test_a_power_cut_in_the_middle_of_a_sync_costs_nothing_of_the_syncs_before(
     tape: Tape, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -147,13 +147,14 @@ def with_a_gyro(lines: list[Line], before: float = 0.0) -> Share:
     return share(budget(Received(made, [], gyro=True), CONFIG), "gyro")
 
 
-@pytest.mark.variations(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("before", [-10, 10])
 def test_what_a_gyro_costs_a_turn_does_not_depend_on_what_was_turned_before(before: int) -> None:
     found, fresh = (with_a_gyro(driven().lines, turns) for turns in (before, 0.0))
     assert found.deg_per_turn == pytest.approx(fresh.deg_per_turn, rel=0.02)
 
 
+@pytest.mark.slow
 def test_at_rest_a_gyro_costs_nothing_and_says_nothing_of_a_drive() -> None:
     lines = driven().lines
     still = [

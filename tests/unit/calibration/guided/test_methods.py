@@ -79,6 +79,7 @@ def test_standard_deviations_cover_the_truth(way: str, count: int) -> None:
     assert count == FEW or rms > 0.3
 
 
+@pytest.mark.variations(5)
 @so_many
 @each_way
 def test_ninety_seconds_of_driving_are_enough(way: str, count: int) -> None:

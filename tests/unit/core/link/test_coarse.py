@@ -68,7 +68,7 @@ def test_no_true_line_is_dropped_and_half_a_minute_ends_where_the_lines_say(coun
     assert one.ours == pytest.approx(one.plain, abs=0.004)
 
 
-@pytest.mark.variations(4)
+@pytest.mark.variations(8)
 @pytest.mark.parametrize("counts", COUNTS + FINER)
 def test_with_configured_counts_a_minute_ends_exactly_where_the_counter_says(counts: int) -> None:
     one = drive(counts, 2, 60.0, counts)
