@@ -461,6 +461,7 @@ class Robot:
                 if not released:
                     return "nothing to clear: the robot is neither stopped nor in fault"
                 self._forget()
+                self._estop.powered()
                 self._arbiter.require_neutral(asked_ns)
                 return released
             case "activate":

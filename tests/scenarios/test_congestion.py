@@ -132,6 +132,26 @@ def test_a_sender_with_a_steady_clock_drives_on_as_soon_as_it_is_prompt_again() 
     assert world.state.mode == "driving"
 
 
+@each("way", STAMPED)
+def test_a_release_brakes_at_once_while_the_delay_of_its_sender_is_in_doubt(way: Way) -> None:
+    source = Source("app", 50, 2.0)
+    world = World(Config(commands=CommandsConfig(sources=(source,))))
+    world.run(0.5)
+    speaker = Speaker(world, way)
+    for n in range(60):
+        message = speaker.message(0.0 if n < 30 else 1.0)
+        world.run(0.06)
+        speaker.deliver(message)
+        world.run(0.04)
+    assert world.loop.outputs.applied.linear == 1.0
+    # The delay falls by 60 ms, so the daemon does not know any more whether these are prompt.
+    speaker.send(1.0)
+    world.run(0.1)
+    speaker.send(0.0)
+    world.run(0.05)
+    assert world.loop.outputs.applied.linear < 1.0
+
+
 def test_what_is_forgiven_to_a_foreign_clock_is_counted_in_state() -> None:
     world = quiet()
     speaker = Speaker(world, "rmw")

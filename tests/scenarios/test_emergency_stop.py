@@ -205,6 +205,21 @@ def test_a_press_is_as_fast_in_a_flood_on_a_bad_wire_and_on_a_slow_one(
 
 
 @pytest.mark.slow
+def test_a_robot_that_is_rolled_by_hand_after_a_press_latches_no_fault() -> None:
+    # The robot drove at the press, so its wheels turned by command before they had no power.
+    world = World()
+    with world.mcu.estop():
+        world.run(0.5)
+        world.drive(0.8, seconds=1.5)
+        with world.mcu.estop_pressed(0.0, 4.0):
+            world.run(3.0)
+            assert max(map(abs, world.state.wheels)) == 0.0
+            with world.mcu.pushed(0.5):
+                world.run(2.5)
+    assert world.state.mode == "stopped"
+    assert world.state.counters["uncommanded_motion"] > 0
+
+
 def test_a_board_that_falls_silent_about_its_button_stops_the_robot() -> None:
     world = World(Config(sim=SimConfig(faults=("estop_silent=2:3",))))
     world.run(0.2)

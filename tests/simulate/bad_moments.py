@@ -299,6 +299,35 @@ def _other_board(plan: Plan, dice: random.Random) -> None:
     ]  # fmt: skip
 
 
+def _behind_a_press(plan: Plan, dice: random.Random) -> None:
+    """Press the emergency stop while the robot drives.
+
+    Until some time after the release, a person rolls the robot, or its motor drivers have no power.
+    """
+    _alone(plan, dice, _drives(plan, dice, 0.3, 1.5, 4.0))
+    _inputs(plan, dice, ("estop",))
+    drivers, at = dice.random() < 0.5, 5.0
+    if drivers:
+        plan["board"].append(["driver_fault", NEVER_S, 1.0])
+    while at < plan["seconds"] - 22.0:
+        lasts = dice.choice((0.06, 0.5, 3.0, 6.0))
+        longer = round(dice.uniform(0.2, 3.0), 3)
+        rolls = round(lasts * dice.uniform(0.5, 0.9), 3)
+        speed = dice.choice((-1, 1)) * round(dice.uniform(0.2, 0.8), 2)
+        whole = round(lasts + longer, 3)
+        begins, lacks, fault = at + rolls, round(whole - rolls, 3), ["pushed", speed]
+        if drivers:
+            begins, lacks, fault = at + 0.02, whole, ["driver_fault", 0.0, whole]
+        press = ["estop_pressed", 0.0, lasts]
+        plan["events"] += [
+            {"at": round(at, 3), "do": "board", "for": round(lasts + 0.2, 3), "fault": press},
+            {"at": round(begins, 3), "do": "board", "for": lacks, "fault": fault},
+            _call(at + whole + 1.0, "clear", named=True),
+            _call(at + whole + 1.5, "clear", named=True),
+        ]
+        at += whole + dice.uniform(8.0, 12.0)
+
+
 def _restart_in_fault(plan: Plan, dice: random.Random) -> None:
     """End the daemon while a fault is latched whose cause is over, and start it again."""
     _alone(plan, dice, _drives(plan, dice, 0.3, 1.5, 3.0))
@@ -451,6 +480,7 @@ MOMENTS: dict[str, tuple[float, Callable[[Plan], bool], Callable[[Plan, random.R
     "backlogs of newcomers": (0.02, _any, _newcomers),
     "later and later": (0.02, _any, _later_and_later),
     "restart in a fault": (0.06, _without_check, _restart_in_fault),
+    "behind a press": (0.04, _without_check, _behind_a_press),
 }
 """The share of the plans that have each moment, of those that can have it, whether a plan can have
 it, and what makes it."""

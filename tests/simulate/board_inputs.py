@@ -322,7 +322,14 @@ class Inputs:
         """Note that a daemon starts: it knows no input."""
         self.estop, self.bumpers, self.driver = _Input(), _Input(), _Input()
         self._driver_faulted = False
-        """Whether a line of this step certainly reports a fault of a motor driver."""
+        """Whether a line of this step certainly reports a fault of a motor driver that counts."""
+        self._powered = True
+        """Whether the motor drivers certainly have had power since they were last reported sound.
+
+        After a press of the emergency stop, their power may come back later than the release.
+        """
+        self._cut_ns: int | None = None
+        """True time of a press that certainly has cut this power, or None."""
         self.battery = _Mean(self._witness.config.get("battery", {}))
         self._mode = ""
         self._looked_ns = self._stepped_ns = 0
@@ -342,6 +349,7 @@ class Inputs:
     def replaced(self) -> None:
         """Note that another board was plugged in, which does not report what this one did."""
         self.estop, self.driver = _Input(), _Input()
+        self._powered, self._cut_ns = False, None
         self._doubt()
 
     def asked(self, asked_ns: int, name: str) -> None:
@@ -422,6 +430,10 @@ class Inputs:
         known.reported_ns, known.awaited = at_ns, False
         before, was_sure, was_silent = known.marks, known.sure, known.silent
         known.marks, known.sure, known.silent = marks, certain, ""
+        if known is self.estop and marks != b".":
+            self._powered = False
+            if certain and self._cut_ns is None:
+                self._cut_ns = true_ns
         if not certain:
             known.pressed_ns = None
             self._doubt()
@@ -452,7 +464,10 @@ class Inputs:
             driver.pressed_ns = true_ns
         self._witness.driver_fault |= faulty and not (estop.sure and estop.marks == b"X")
         free = not estop.marks or (estop.known and estop.marks == b".")
-        self._driver_faulted |= faulty and certain and free
+        self._powered |= free and certain and not faulty
+        if not faulty:
+            self._cut_ns = None
+        self._driver_faulted |= faulty and certain and free and self._powered
 
     def _silence(self, known: _Input, decided_ns: int, offset: int, calm_ns: int) -> None:
         """Take a silence: it counts as a press, at the latest when the host has had time."""
@@ -461,9 +476,11 @@ class Inputs:
         early = decided_ns < latest_ns + 2 * witness.period_ns + MARGIN_NS
         if early or not known.counted_ns:  # an input that never was reported is not silent
             known.silent = "maybe"
+            self._powered &= known is not self.estop
             self._doubt()
         elif known.silent != "surely":
             known.silent = "surely"
+            self._powered &= known is not self.estop
             # A pressed emergency stop that falls silent is no new press.
             if known is self.bumpers or b"X" not in known.marks:
                 self._press(known, reported_ns + SILENT_NS + offset, False)
@@ -569,8 +586,11 @@ class Inputs:
             if began:
                 self._witness.counts["driver fault"] += 1
                 self._ramps(true_ns, "a fault of a motor driver")
+        pressed |= self._cut_ns is not None and self._cut_ns < self._stepped_ns
+        if seen.mode in ("ready", "driving"):  # a clear ends the excuse
+            self._powered, self._cut_ns = True, None
         if began and pressed and self._mode:
-            text = f"{seen.reason}, the emergency stop is pressed since {estop.pressed_ns} ns"
+            text = f"{seen.reason}, the emergency stop was pressed at {self._cut_ns} ns"
             raise BrokenError("drivers without power are no fault", true_ns, text)
 
     def _stopping(self) -> Iterator[tuple[str, int]]:

@@ -175,8 +175,10 @@ class Witness:
         """When the board last reported that the wheel with a dead motor turned."""
         self._driven: list[tuple[int, float]] = [(0, 0.0)] * 4
         """Since when each wheel has been commanded to turn clearly and in one direction."""
-        self.rested_ns = 0
-        """When the robot stood last, with zeros on the wire."""
+        self.rested = True
+        """Whether the robot has stood for a second since the last line that was no zero."""
+        self._turns_ns = 0
+        """When a wheel turned last, or a line was no zero."""
         self.blocked_ns: int | None = None
         """Since when the kernel takes no line."""
         self.braking: tuple[int, tuple[float, ...]] | None = None
@@ -440,7 +442,7 @@ class Witness:
         if mode == "fault" != self.mode:
             self.counts["fault"] += 1
             recent = [k for k, last_ns in self.troubles.items() if at_ns - last_ns < 4 * NS]
-            if "pushed" in recent and self.last == ZERO and self.rested_ns >= self.last_ns:
+            if "pushed" in recent and self.last == ZERO and self.rested:
                 recent.remove("pushed")  # a hand turns wheels that were at rest: never a fault
             # Echoes pass the lines that a stalled adapter holds, and contradict them.
             caused = not set(recent) <= HARMLESS or {"echo", "stalls"} <= set(recent)
@@ -548,7 +550,7 @@ class Witness:
             self._held(at_ns, held, grows, line, wheels)
         self._wished(at_ns, wheels, before, grows, line)
         self.obeyed(at_ns, wheels)
-        self.last, self.last_ns, self.cut = wheels, made_ns, False
+        self.last, self.last_ns, self.cut, self.rested = wheels, made_ns, False, False
 
     def obeyed(self, at_ns: int, wheels: tuple[float, ...]) -> None:
         """Judge that a wheel which clearly does not obey is a fault of the robot."""
@@ -737,8 +739,9 @@ class Witness:
 
     def wheels(self, at_ns: int, fastest: float) -> None:
         """Judge the true wheels: those of a robot that is held must stand in the end."""
-        if self.last == ZERO and fastest < 1.0:
-            self.rested_ns = at_ns
+        if self.last != ZERO or fastest > 0.1:
+            self._turns_ns = at_ns
+        self.rested |= at_ns - self._turns_ns > NS
         if fastest < 0.5:
             return
         held = self._surely_held

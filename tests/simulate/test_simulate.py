@@ -421,8 +421,10 @@ GOOD, FAULTY = b"!status driver=ok\r\n", b"!status driver=fault\r\n"
         (PRESSED, FAULTY, "fault", "drivers without power are no fault"),
         (PRESSED, FAULTY + OK, "stopped", ""),
         (PRESSED, FAULTY + OK, "fault", "drivers without power are no fault"),
-        (PRESSED, OK + FAULTY, "fault", ""),
-        (PRESSED, OK + FAULTY, "stopped", "a fault of a motor driver stops the robot"),
+        (PRESSED, OK + FAULTY, "stopped", ""),
+        (PRESSED, OK + FAULTY, "fault", "drivers without power are no fault"),
+        (PRESSED, OK + GOOD + FAULTY, "fault", ""),
+        (PRESSED, OK + GOOD + FAULTY, "stopped", "a fault of a motor driver stops the robot"),
         (OK, PRESSED + FAULTY + OK, "fault", "drivers without power are no fault"),
     ],
 )
@@ -673,6 +675,7 @@ def test_a_hand_that_turns_wheels_at_rest_causes_no_fault() -> None:
     witness = witnessed()
     witness.line(NS, b"ap00.00,bp00.00,cp00.00,dp00.00\r\n", NS, NS)
     witness.wheels(2 * NS, 0.0)
+    witness.wheels(5 * NS // 2, 0.0)
     witness.troubles["pushed"] = 3 * NS
     witness.wheels(3 * NS, 9.0)
     with pytest.raises(BrokenError, match="no fault without a cause"):

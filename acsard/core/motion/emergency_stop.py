@@ -180,9 +180,11 @@ class EmergencyStop(BoardInput):
         self.driver_fault = False
         """Whether a line of the last `look` reports a fault of a motor driver that counts.
 
-        A fault does not count while the emergency stop is pressed: the emergency stop cuts the
-        power of the driver, and a driver without power reports a fault.
+        The emergency stop cuts the power of the drivers, and a driver without power reports a
+        fault. The power may come back later than the release. Therefore no fault counts from a
+        press until a line reports sound drivers after the release, or until `powered`.
         """
+        self._unpowered = False
 
     def look(self, reports: Sequence[tuple[int, BoardStatus]], now_ns: int) -> list[Event]:
         """Process the status lines since the last step, and return the events of the changes.
@@ -193,10 +195,19 @@ class EmergencyStop(BoardInput):
         for _, status in reports:
             if self.use != "off" and status.estop is not None:
                 pressed = status.estop
-            self.driver_fault |= bool(status.driver_fault) and not pressed
+            if pressed:
+                self._unpowered = True
+            elif status.driver_fault is False:
+                self._unpowered = False
+            self.driver_fault |= bool(status.driver_fault) and not self._unpowered
         events = super().look(reports, now_ns)
-        self.driver_fault &= not self.why
+        if self.why:
+            self.driver_fault, self._unpowered = False, True
         return events
+
+    def powered(self) -> None:
+        """Record that the stop was released. From now on, each fault of a driver counts."""
+        self._unpowered = False
 
     def read(self, status: BoardStatus) -> tuple[bool, ...] | None:
         """Return `(status.estop,)`, or None if the status line does not report `estop`."""

@@ -35,6 +35,8 @@ class Sender:
         """
         self._proven_zero_ns: int | None = None
         self.name = ""
+        self._stamp_ns: int | None = None
+        """Stamp of the last accepted command, ns, or None."""
         self.twist = REST
         self.arrived_ns: int | None = None
         """Arrival of the last accepted command since `require_neutral`, monotonic ns."""
@@ -131,8 +133,14 @@ class Sender:
             self.zeros_ns = now_ns
         self.ros, self.name = command.ros, command.sender
         self.twist, self.arrived_ns, self._doubted_ns = command.twist, now_ns, None
+        self._stamp_ns = command.stamp_ns
 
     def _doubt(self, command: Command, why: Verdict) -> None:
+        stamp_ns, last_ns = command.stamp_ns, self._stamp_ns
+        if is_zero(command) and stamp_ns and last_ns and stamp_ns > last_ns:
+            # The sender stopped wishing for its last speed, however late this zero may be. The zero
+            # does not keep the robot for the sender.
+            self.twist = REST
         self._doubted_ns, self.doubt, self.ros = command.arrived_ns, why, command.ros
 
     def _settle(self, now_ns: int) -> None:

@@ -311,7 +311,11 @@ class WheelFaults:
         """
         self.pushed = ""
         if commanded is None:
-            self.forget()
+            for side in self._sides:
+                side.forget()
+                for witness in side.witnesses:
+                    # A wheel that turns without power is pushed.
+                    witness.driven = False
             return ""
         limit, lag = self._settings.fault_time, self._settings.response_time
         left, right, speeds = self._left, self._right, seen.as_tuple()

@@ -613,13 +613,16 @@ def test_a_driver_without_power_behind_the_emergency_stop_is_no_fault() -> None:
         (True, (DRIVER_FAULT, OK_LINE, DRIVER_OK), "stopped"),
         (True, (b"!status driver=fault estop=pressed\r\n", OK_LINE, DRIVER_OK), "stopped"),
         (False, (DRIVER_FAULT, PRESSED_LINE), "stopped"),
-        (False, (PRESSED_LINE, OK_LINE, DRIVER_FAULT, DRIVER_OK), "fault"),
-        (True, (OK_LINE, DRIVER_FAULT, DRIVER_OK), "fault"),
-        (True, (b"!status estop=ok driver=fault\r\n", DRIVER_OK), "fault"),
+        (False, (PRESSED_LINE, OK_LINE, DRIVER_FAULT, DRIVER_OK), "stopped"),
+        (True, (OK_LINE, DRIVER_FAULT, DRIVER_OK), "stopped"),
+        (True, (b"!status estop=ok driver=fault\r\n", DRIVER_OK), "stopped"),
+        (False, (PRESSED_LINE, OK_LINE, DRIVER_OK, DRIVER_FAULT), "fault"),
+        (True, (OK_LINE, DRIVER_OK, DRIVER_FAULT), "fault"),
+        (True, (b"!status estop=ok driver=ok\r\n", DRIVER_FAULT), "fault"),
         (False, (DRIVER_FAULT, PRESSED_LINE, OK_LINE, DRIVER_OK), "fault"),
     ],
 )  # fmt: skip
-def test_a_driver_fault_counts_if_the_button_was_released_at_its_line(
+def test_a_driver_fault_counts_if_no_press_was_before_the_last_report_of_sound_drivers(
     pressed_before: bool, lines: tuple[bytes, ...], mode: str
 ) -> None:
     bench = Button(OK_LINE + DRIVER_OK)
@@ -627,6 +630,30 @@ def test_a_driver_fault_counts_if_the_button_was_released_at_its_line(
     if pressed_before:
         bench.status(PRESSED_LINE + DRIVER_OK).step()
     assert bench.status(b"".join(lines)).step().mode == mode
+
+
+def test_drivers_that_lack_power_after_a_press_hold_the_stop_until_they_are_sound() -> None:
+    bench = Button(OK_LINE + DRIVER_OK)
+    bench.linked()
+    bench.status(PRESSED_LINE).step()
+    bench.status(OK_LINE + DRIVER_FAULT).step()
+    refused = bench.answer("clear")
+    assert not refused.success
+    assert "motor driver" in refused.message
+    bench.status(OK_LINE + DRIVER_OK).step()
+    assert bench.answer("clear").success
+    assert bench.status(OK_LINE + DRIVER_FAULT).step().mode == "fault"
+
+
+def test_after_a_clear_a_driver_fault_counts_though_the_board_never_reported_sound_drivers() -> (
+    None
+):
+    bench = Button(OK_LINE)
+    bench.linked()
+    bench.status(PRESSED_LINE).step()
+    bench.status(OK_LINE).step()
+    assert bench.answer("clear").success
+    assert bench.status(OK_LINE + DRIVER_FAULT).step().mode == "fault"
 
 
 def test_with_an_ignored_button_a_driver_fault_always_counts() -> None:

@@ -7,11 +7,14 @@ import math
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from acsard.core.config.settings import CommandsConfig, Source
 from acsard.core.motion.arbiter import Arbiter
+from acsard.core.motion.freshness import Verdict
 from acsard.core.motion.neutral import Sender
 from acsard.core.values import REST, Command, Twist, Wait
+from tests.each import each
 from tests.unit.core.motion.commanders import GO, HIGH, HOUR_NS, LEFT, LOW, MS, RIGHT, Bench
 
 # one sender
@@ -204,13 +207,22 @@ def test_an_unproven_zero_leaves_an_unarmed_shared_identity_live_so_its_source_k
     assert not one.armed(20 * MS)
 
 
-def test_an_unproven_zero_of_an_armed_sender_leaves_its_last_command_in_force() -> None:
+@each("way", ["unproven", "stale"])
+@each(("stamp", "twist"), [(25, REST), (15, GO), (None, GO)])
+def test_a_zero_whose_stamp_is_in_doubt_ends_an_earlier_speed_and_holds_no_robot(
+    way: Verdict, stamp: int | None, twist: Twist
+) -> None:
     one = sender()
     one.take(sent(REST, 0), 0)
-    one.take(sent(GO, 10), 0)
-    one.take(sent(REST, 20), 0, "unproven")
-    assert one.live(20 * MS)
-    assert one.twist == GO
+    one.take(replace(sent(GO, 10), stamp_ns=15), 0)
+    zero = replace(sent(REST, 20), stamp_ns=stamp)
+    if way == "stale":
+        one.refuse(zero, way)
+    else:
+        one.take(zero, 0, way)
+    assert one.twist == twist
+    assert one.arrived_ns == 10 * MS
+    assert one.armed(20 * MS)
 
 
 def test_a_shared_zero_that_armed_unproven_is_forgotten_when_its_clock_proves_wrong() -> None:
