@@ -9,7 +9,7 @@ interfaces `Wire` (the serial line) and `Operator` (the person at the robot).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from math import ceil
 from typing import Protocol
 
@@ -68,6 +68,13 @@ class Operator(Protocol):
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
         """Return one of the answers, or None if no person watches the robot."""
 
+    def keys(self, wait_s: float) -> str:
+        """Return the keys that were typed; wait up to `wait_s` s for the first key."""
+
+
+def _nothing() -> None:
+    """Do nothing."""
+
 
 LEAST_S = 0.001
 """Time, s. `Board.drive` sends no further line if less than this is left of its duration."""
@@ -99,6 +106,9 @@ class Board:
         self.armed = False
         """Whether all motors have stood still once. From then on, a runaway motor ends the
         check."""
+        self.between: Callable[[], object] = _nothing
+        """Function that is called every `BEAT_NS` while the board listens. It may raise an
+        exception that ends the check. It is not called while the last zeros are sent."""
         # Results of the steps
         self.baud_rate: int = mcu.baud_rate
         self.comma = mcu.trailing_comma
@@ -175,7 +185,7 @@ class Board:
         With a reversed encoder, the firmware's speed control makes the motor run away even on
         zeros. Each further line would keep the watchdog from stopping it.
         """
-        self.armed, self.restarts.watched = False, False
+        self.armed, self.restarts.watched, self.between = False, False, _nothing
         try:
             for _ in range(FAREWELL):
                 if self.fled:
@@ -314,6 +324,7 @@ class Board:
             self.wire.late_ns()  # discard this lateness: nothing was measured at that time
         got: list[Reply] = []
         while True:
+            self.between()
             until_ns = min(end_ns, self.wire.now_ns() + BEAT_NS)
             got += self._hear(until_ns)
             now_ns = self.wire.now_ns()

@@ -29,7 +29,7 @@ from acsard.core.config.motion_rules import longest_reply
 from acsard.core.config.settings import Config, SafetyConfig
 from acsard.core.formatting import many
 
-LIFTED = "lifted"
+LIFTED, QUITS = "lifted", "q"
 
 CONFIRM = (
     "The wheels will turn one by one, then together. The tool commands 3 rad/s at most, but a "
@@ -73,7 +73,8 @@ def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
     """Check one microcontroller, and call `tell` with each finding as soon as it is known.
 
     Before the operator confirms that the wheels are lifted, only zeros are sent. The last lines are
-    always zeros, unless the serial port is lost.
+    always zeros, unless the serial port is lost. Raises `KeyboardInterrupt` if the operator types
+    `QUITS`, also while a motor turns.
     """
     told: set[str] = set()
     unjudged: set[str] = set()
@@ -91,6 +92,10 @@ def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
             told.update((finding.name, "motors") if "motor " in finding.name else (finding.name,))
             tell(outcomes.plain(finding))
 
+    def quit_if_typed() -> None:
+        if QUITS in operator.keys(0.0).lower():
+            raise KeyboardInterrupt
+
     why = ""
     seen: list[Restart] = []
     try:
@@ -99,6 +104,7 @@ def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
             board.zeros()
             if operator.ask(CONFIRM, (LIFTED,)) != LIFTED:
                 raise StoppedError(outcomes.find("wheels: not lifted"))
+            board.between = quit_if_typed
             _Steps(board, operator, once, seen).all(config.safety)
     except StoppedError as end:
         once(end.finding)

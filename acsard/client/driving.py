@@ -2,13 +2,13 @@
 
 The daemon does not answer commands. It reports in `state` why the robot does not follow a command.
 A drive therefore subscribes to `state`. If the robot does not follow, the drive ends with an error
-that gives the daemon's reason.
+that gives the daemon's reason. A drive also ends with an error if this program stood still, because
+the operator may no longer want it.
 """
 
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Generator, Iterator
 from contextlib import suppress
 from numbers import Real
@@ -27,6 +27,7 @@ from acsard.client.commander import (
     objection,
 )
 from acsard.client.follower import QUIET_S, Followed, Watch
+from acsard.host import clock
 from acsard.host.errors import NoAnswerError, NotDrivenError, UsageError
 
 SETTLED_S = 0.2
@@ -68,7 +69,8 @@ def drive(
     generator. `linear` is in m/s and `angular` in rad/s (left is +).
 
     Raises:
-        NotDrivenError: The robot does not follow; the text is the daemon's reason.
+        NotDrivenError: The robot does not follow, and the text is the daemon's reason; or this
+            program stood still for more than `GRACE_S` before it sent the last speed.
         NoAnswerError: The daemon is silent.
         UsageError: An argument is not a finite number, or `seconds` is not above 0.
     """
@@ -83,10 +85,11 @@ def drive(
         # Send zeros before each drive, not only before the first one. Since the last drive, the
         # robot may have been stopped and cleared, or its daemon restarted.
         yield from _opening(checks)
-        end, grace = time.monotonic() + seconds, min(GRACE_S, seconds / 2)
-        while (left := end - time.monotonic()) > 0:
+        end, grace = clock.steady_s() + seconds, min(GRACE_S, seconds / 2)
+        while (left := end - clock.steady_s()) > 0:
             checks.send(linear, angular)
             yield min(SEND_PERIOD_S, left)
+            checks.require_no_stall()
             checks.require(grace)
         yield from _stopping(checks)
     finally:
@@ -108,10 +111,11 @@ def _require(**numbers: object) -> None:
 
 
 def _opening(checks: _Drive) -> Iterator[float]:
-    begun = time.monotonic()
-    while (passed := time.monotonic() - begun) < OPENING_S or checks.objection != "":
+    begun = clock.steady_s()
+    while (passed := clock.steady_s() - begun) < OPENING_S or checks.objection != "":
         checks.send(0.0, 0.0)
         yield OPENING_PERIOD_S
+        checks.require_no_stall()
         checks.look()
         if passed >= OPENED_S or (passed >= SETTLED_S and checks.hopeless):
             checks.require(0.0)
@@ -119,9 +123,9 @@ def _opening(checks: _Drive) -> Iterator[float]:
 
 def _stopping(checks: _Drive) -> Iterator[float]:
     """Send zeros until the robot stands, or something else moves it. Yield the pauses, s."""
-    begun = since = time.monotonic()
+    begun = since = clock.steady_s()
     watch, slowest = checks.watch, math.inf
-    while since + SLOWS_S > (now := time.monotonic()) or watch.age(now) > QUIET_S:
+    while since + SLOWS_S > (now := clock.steady_s()) or watch.age(now) > QUIET_S:
         checks.send(0.0, 0.0)
         yield SEND_PERIOD_S
         checks.look()
@@ -145,7 +149,7 @@ class _Drive:
 
     def __init__(self, robot: Driven) -> None:
         self._robot = robot
-        now = self._fine = time.monotonic()
+        now = self._fine = self._stepped = clock.steady_s()
         self.watch = Watch(robot, now)
         self.objection: str | None = None
         """Why the robot does not follow; "" if it follows, None before the first state."""
@@ -163,9 +167,24 @@ class _Drive:
         except zenoh.ZError:
             raise NoAnswerError(CLOSED) from None
 
+    def require_no_stall(self) -> None:
+        """Raise `NotDrivenError` if this program stood still since the last call.
+
+        The process may have been stopped, or its computer may have been suspended. The states that
+        it received before the stall seem to arrive now, so they cannot show that time has passed.
+        """
+        now = clock.steady_s()
+        stalled, self._stepped = now - self._stepped, now
+        if stalled > GRACE_S:
+            raise NotDrivenError(
+                f"this program stood still for {stalled:.1f} s, so the robot was stopped and the "
+                "drive was not finished: was the computer suspended, or did something keep the "
+                "program from running?"
+            )
+
     def look(self) -> None:
         """Process the states that have arrived. Raises `NoAnswerError` after a long silence."""
-        now, watch = time.monotonic(), self.watch
+        now, watch = clock.steady_s(), self.watch
         try:
             news = watch.look(now)
         except zenoh.ZError:
@@ -192,7 +211,7 @@ class _Drive:
         self.look()
         if not self.objection:
             return
-        if self.hopeless or time.monotonic() - self._fine >= grace:
+        if self.hopeless or clock.steady_s() - self._fine >= grace:
             state = self.watch.state
             arrives = state is None or heard(state, self._robot.source)
             raise (NotDrivenError if arrives else UnheardError)(self.objection)

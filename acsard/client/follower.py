@@ -48,7 +48,10 @@ STEADY = ("lines", "lines_sent", "commands")
 
 
 class Follower:
-    """The newest state of one robot. All times are in s on the same monotonic clock."""
+    """The newest state of one robot. All times are in s on the same monotonic clock.
+
+    A program that drives the robot uses `clock.steady_s`, which also advances during a suspend.
+    """
 
     def __init__(self, now: float, ask_s: float = ASK_S) -> None:
         self.state: RobotState | None = None

@@ -196,7 +196,7 @@ class Client:
         First send a zero to each robot that may still follow a client of this connection. Otherwise
         the robot would drive on until the timeout of the source, which may be 10 s.
         """
-        begun_s = time.monotonic()
+        begun_s = clock.steady_s()
         # After the longest timeout a zero would only stop the next sender that drives.
         moving = [one for one, at_s in self._puts.moving.items() if begun_s - at_s < LONGEST_S]
         try:
@@ -214,7 +214,8 @@ class Client:
         `linear` is in m/s and `angular` in rad/s (left is +). Speeds above the robot's `[limits]`
         are not an error: the robot drives at its limits. `get("config")` returns the limits, and
         `get("cmd_vel_out")` the applied speed. Raises `NotDrivenError` with the daemon's reason as
-        soon as the robot does not follow.
+        soon as the robot does not follow, and also if this program stood still for more than 0.5 s
+        during the drive.
         """
         try:
             with closing(drive(self, linear, angular, seconds)) as steps:
@@ -361,7 +362,7 @@ class Client:
         )
         self._publish(message, self._sender.sign(stamp_ns, steady=steady), self.source)
         if linear or angular:
-            self._puts.moving[self] = time.monotonic()
+            self._puts.moving[self] = clock.steady_s()
         else:
             self._puts.moving.pop(self, None)
 

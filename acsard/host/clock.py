@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 
-from acsard.core.values import Instant
+from acsard.core.values import NS_PER_S, Instant
 
 mono_ns: Callable[[], int] = partial(time.clock_gettime_ns, time.CLOCK_MONOTONIC_RAW)
 """Read the monotonic clock, ns. A Python function would be slower."""
@@ -29,6 +29,14 @@ def asleep_ns() -> int:
 def steady_ns() -> int:
     """Return a time, ns, that is never adjusted and that also advances during a suspend."""
     return mono_ns() + asleep_ns()
+
+
+def steady_s() -> float:
+    """Return the time of `steady_ns`, s. Programs that drive the robot use this clock.
+
+    On a clock that stands still in a suspend, a command from before the suspend would seem fresh.
+    """
+    return steady_ns() / NS_PER_S
 
 
 NS_PER_US = 1000

@@ -70,7 +70,10 @@ class ReplyError(MendableError, RuntimeError):
 
 
 class NotDrivenError(MendableError, RuntimeError):
-    """The robot does not follow this client's commands; the text is the daemon's reason."""
+    """The robot does not follow this client's commands, or this program stood still during a drive.
+
+    The text is the reason.
+    """
 
 
 class InUseError(MendableError, OSError):

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from collections import deque
 
 from acsard.client import Client
 from acsard.client.follower import Watch, restarted
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.schema import Info, RobotState
+from acsard.host import clock
 from acsard.host.errors import MendableError, ReplyError
 from acsard.top.text import ScreenData
 
@@ -20,7 +20,7 @@ class Feed:
         self._robot = robot
         # If no daemon answers, this first query fails with the usual message.
         self._info = self._ask_info()
-        self._watch = Watch(robot, time.monotonic())
+        self._watch = Watch(robot, clock.steady_s())
         self._past: deque[tuple[float, RobotState]] = deque()
 
     def ask(self) -> None:
@@ -38,14 +38,14 @@ class Feed:
             ) from None
         # A state that arrived before the answer is usually older than the answer, but not always.
         self.poll()
-        held, now = self._watch.state, time.monotonic()
+        held, now = self._watch.state, clock.steady_s()
         if held is None or state.stamp.to_ns() > held.stamp.to_ns():
             self._watch.answered(state, now)
             self._take(state, now)
 
     def poll(self) -> None:
         """Store the newest of the states that arrived since the last call, if one arrived."""
-        now = time.monotonic()
+        now = clock.steady_s()
         for state in self._watch.look(now)[-1:]:
             self._take(state, now)
 
@@ -60,7 +60,7 @@ class Feed:
 
     def seen(self, hint: str = "") -> ScreenData:
         """Return the data for the screen; `hint` is shown in the header."""
-        now, watch, past = time.monotonic(), self._watch, self._past
+        now, watch, past = clock.steady_s(), self._watch, self._past
         return ScreenData(
             self._robot.where.robot_id,
             self._robot.where.endpoint,

@@ -8,12 +8,11 @@ nothing.
 
 from __future__ import annotations
 
-import time
-
 from acsard.client import Client
 from acsard.client.commander import GRACE_S, ZEROS, Commander, Wish, objection
 from acsard.client.follower import Watch
 from acsard.core.values import NS_PER_S, REST, Twist
+from acsard.host import clock
 from acsard.top.drive_screen import Teleop
 
 HOLD_S = 0.6
@@ -109,12 +108,12 @@ class Ride:
         # After a silence the robot may require a return to neutral, for example because it was
         # stopped and cleared during the silence.
         self._commander = Commander(leads=True)
-        self._fine = time.monotonic()
+        self._fine = clock.steady_s()
         self._watch = Watch(robot, self._fine)
 
     def step(self, typed: str) -> None:
         """Process the typed keys, send the command that is due, and process received states."""
-        now = time.monotonic()
+        now = clock.steady_s()
         now_ns = round(now * NS_PER_S)
         self._keyboard.take(typed, now)
         wish = self._keyboard.wish(now)
@@ -130,7 +129,7 @@ class Ride:
 
     def take(self) -> None:
         """Process the states that have arrived, and query the state if it is late."""
-        self._watch.look(time.monotonic())
+        self._watch.look(clock.steady_s())
 
     def end(self) -> None:
         """Send the final zero commands, which stop the robot."""
@@ -138,7 +137,7 @@ class Ride:
             self._robot.send(0.0, 0.0)
 
     def seen(self) -> Teleop:
-        now, robot, watch = time.monotonic(), self._robot, self._watch
+        now, robot, watch = clock.steady_s(), self._robot, self._watch
         why = ""
         if watch.state is not None and now - self._fine > GRACE_S:
             why = objection(watch.state, robot.source, robot.sender)

@@ -23,6 +23,7 @@ from rich.text import Text
 
 from acsard.core.messages.state_warnings import WARNING
 from acsard.core.values import AcsardError
+from acsard.host import clock
 from acsard.host.terminal_modes import one_by_one
 from acsard.terminal.output import has_screen, plain
 from acsard.top.drive_screen import HELP, Teleop, lines, moves, news, parting
@@ -86,10 +87,10 @@ def part(ride: Ride) -> None:
 
     Without the wait, the report would say that the robot still moves.
     """
-    left = time.monotonic()
+    left = clock.steady_s()
     while os.isatty(0) and os.isatty(1):
         ride.take()
-        seen, took = ride.seen(), time.monotonic() - left
+        seen, took = ride.seen(), clock.steady_s() - left
         rests = seen.state is not None and seen.age < took and not moves(seen.state)
         # A robot usually stops within 2 s, by its own deceleration ramp.
         if rests or took > 2.0:

@@ -143,13 +143,15 @@ def test_a_release_brakes_at_once_while_the_delay_of_its_sender_is_in_doubt(way:
         world.run(0.06)
         speaker.deliver(message)
         world.run(0.04)
-    assert world.loop.outputs.applied.linear == 1.0
+    assert (outputs := world.loop.outputs) is not None
+    assert outputs.applied.linear == 1.0
     # The delay falls by 60 ms, so the daemon does not know any more whether these are prompt.
     speaker.send(1.0)
     world.run(0.1)
     speaker.send(0.0)
     world.run(0.05)
-    assert world.loop.outputs.applied.linear < 1.0
+    assert (outputs := world.loop.outputs) is not None
+    assert outputs.applied.linear < 1.0
 
 
 def test_what_is_forgiven_to_a_foreign_clock_is_counted_in_state() -> None:

@@ -18,6 +18,7 @@ import pytest
 import zenoh
 
 from acsard.client import Client, connect, connect_async, synchronous
+from acsard.client.commander import GRACE_S
 from acsard.core.incoming.queries import BUSY
 from acsard.core.messages import schema
 from acsard.daemon.bus.subscription import Subscription
@@ -524,6 +525,28 @@ async def test_cancelling_an_async_drive_sends_the_zero_at_once(shared: Daemon, 
         for seen in commands.seen
         if seen.at > zero.at and seen.value["twist"]["linear"]["x"] != 0.0
     ]
+
+
+@pytest.mark.slow
+async def test_an_async_drive_does_not_go_on_after_its_event_loop_was_blocked(
+    shared: Daemon, fresh: Bus
+) -> None:
+    with fresh.follow("cmd/app") as commands:
+        async with connect_async(shared.endpoint) as robot:
+            driving = asyncio.create_task(robot.drive(0.3, seconds=60.0))
+            async for odom in robot.messages("odom"):
+                if odom.twist.twist.linear.x > 0.2:
+                    break
+            asyncio.get_running_loop().call_soon(time.sleep, 2 * GRACE_S)
+            await asyncio.sleep(0.0)
+            awake = time.monotonic()
+            with pytest.raises(NotDrivenError, match="stood still"):
+                await driving
+        commands.find(
+            lambda value: value["twist"]["linear"]["x"] == 0.0, 2.0, "a zero", after=awake
+        )
+    speeds = [seen.value["twist"]["linear"]["x"] for seen in commands.seen if seen.at > awake]
+    assert set(speeds) == {0.0}
 
 
 async def test_a_zero_right_behind_a_command_is_heard(shared: Daemon, fresh: Bus) -> None:

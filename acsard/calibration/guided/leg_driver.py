@@ -17,7 +17,10 @@ from acsard.core.messages.schema import RobotState
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import REST, Twist, WheelSpeeds
 
-HELD_UP = "this computer was too busy for the calibration: end the other programs on it"
+HELD_UP = (
+    "this computer was suspended, or it was too busy for the calibration: end the other programs "
+    "on it"
+)
 
 OBEYED_S = 1.5
 """Time allowed for the robot to follow a changed command, including the ramp, s."""
@@ -57,7 +60,10 @@ class Phase(StrEnum):
 
 
 class LegDriver:
-    """Decides the commands of one leg. Every `now` is in s of the same monotonic clock."""
+    """Decides the commands of one leg.
+
+    Every `now` is in s of the same monotonic clock, which also advances during a suspend.
+    """
 
     def __init__(self, leg: Leg, source: str, drive: DriveConfig, now: float, sender: str) -> None:
         """Start a leg. The daemon identifies the commands of this leg by `source` and `sender`."""
@@ -143,8 +149,9 @@ class LegDriver:
         held_up, self._stepped = now - self._stepped, now
         # During a pause of this process the robot has braked, and the time of the move may have run
         # out. The next move would then begin at the wrong place. The pause also hides whether the
-        # daemon was silent.
-        if held_up > QUIET_S / 2 and self.phase is Phase.MOVING:
+        # daemon was silent. After a pause before the first move, the person who started the leg may
+        # have left.
+        if held_up > QUIET_S / 2 and self.phase in (Phase.OPENING, Phase.MOVING):
             self._halt(HELD_UP, disturbed=True)
         elif now - self._received > QUIET_S:
             late = held_up > QUIET_S / 2

@@ -29,6 +29,7 @@ from acsard.core.messages.keys_and_roles import by_key
 from acsard.core.messages.schema import Imu, JointState, Odometry, PoseStamped, Time, TwistStamped
 from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.subscription import Subscription, encoded, queue_on
+from acsard.host import clock
 from acsard.terminal.prompt import Prompt
 
 SOURCE = "app"
@@ -76,9 +77,9 @@ class Sensor:
 
         Raises `GuideError`, which names the message as `what`, if none arrives within `FIRST_S`.
         """
-        end = time.monotonic() + FIRST_S
+        end = clock.steady_s() + FIRST_S
         while not self.receive(lambda message, now: None, 0.0):
-            if time.monotonic() > end:
+            if clock.steady_s() > end:
                 raise GuideError(
                     f"{what} does not arrive on the Zenoh key {self.key}: does the sender run, and "
                     "does it publish on this key?"
@@ -184,7 +185,7 @@ class RobotOnBus:
         commands = Sensor(client.session, client.key("cmd_vel_out"), (TwistStamped,))
         self._sensors: list[tuple[Sensor, str]] = [(commands, "command")]
         self._wheels = Sensor(client.session, client.key("wheel_states"), (JointState,))
-        self._watch = Watch(client, time.monotonic())
+        self._watch = Watch(client, clock.steady_s())
 
     def gyro(self, key: str) -> None:
         """Record the turn rates on `key` in each leg. Raises `GuideError` if none arrive."""
@@ -213,7 +214,7 @@ class RobotOnBus:
         recorder = Recorder(self._joints)
         self._drain()
         sender = self._client.sender
-        driver = LegDriver(leg, SOURCE, self._geometry, time.monotonic(), sender)
+        driver = LegDriver(leg, SOURCE, self._geometry, clock.steady_s(), sender)
         try:
             self._drive(driver, recorder)
         finally:
@@ -236,20 +237,20 @@ class RobotOnBus:
         return log.runs[0]
 
     def _returns(self) -> bool:
-        end = time.monotonic() + RETURNS_S
-        while time.monotonic() < end:
-            if self._watch.look(time.monotonic()):
+        end = clock.steady_s() + RETURNS_S
+        while clock.steady_s() < end:
+            if self._watch.look(clock.steady_s()):
                 return True
             time.sleep(LOOK_S)
         return False
 
     def _drive(self, driver: LegDriver, recorder: Recorder) -> None:
-        begun = sent = shown = time.monotonic()
+        begun = sent = shown = clock.steady_s()
         last = None
         while not driver.over:
             for key in self._prompt.keys(LOOK_S):
-                driver.key(key, time.monotonic())
-            now = time.monotonic()
+                driver.key(key, clock.steady_s())
+            now = clock.steady_s()
             self._receive(driver, recorder, now)
             command = driver.step(now)
             period = OPENING_PERIOD_S if now - begun < OPENING_S else SEND_PERIOD_S
@@ -275,7 +276,7 @@ class RobotOnBus:
     def _drain(self) -> None:
         for sensor in (self._wheels, *(sensor for sensor, _ in self._sensors)):
             sensor.receive(lambda message, now: None, 0.0)
-        self._watch.look(time.monotonic())
+        self._watch.look(clock.steady_s())
 
     def _full(self, key: str) -> str:
         """Return the Zenoh key, with this robot's id in front if `acsard topics` lists the key."""

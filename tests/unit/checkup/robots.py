@@ -146,6 +146,9 @@ class Nobody:
 
     def doing(self, text: str) -> None: ...
 
+    def keys(self, wait_s: float) -> str:
+        return ""
+
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
         return answers[0] if len(answers) == 1 else None
 

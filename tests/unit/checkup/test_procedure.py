@@ -325,6 +325,36 @@ def test_nothing_but_zeros_goes_out_before_the_wheels_are_confirmed_to_be_lifted
     assert not robot.is_open
 
 
+@pytest.mark.parametrize("typed", ["q\n", "Q\n"])
+def test_a_q_that_is_typed_while_a_motor_turns_ends_the_check(typed: str) -> None:
+    """The operator holds the key, so further keys arrive during the last zeros."""
+    robot = Robot("no_watchdog")
+    questions: list[str] = []
+
+    class Quits(Person):
+        def keys(self, wait_s: float) -> str:
+            return typed if any(robot.mcu.vehicle.set_points) else ""
+
+        def ask(self, question: str, answers: Sequence[str]) -> str | None:
+            questions.append(question)
+            return super().ask(question, answers)
+
+    with robot.faulty(), pytest.raises(KeyboardInterrupt):
+        procedure.run(robot, Quits(robot), robot.config, lambda finding: None)
+    assert questions == [procedure.CONFIRM]
+    assert b"".join(robot.sent[-5:]).count(Codec(WheelMap()).stop) == FAREWELL
+    assert robot.later() == [0.0] * 4
+
+
+def test_another_word_that_is_typed_while_a_motor_turns_ends_nothing() -> None:
+    class Types(Person):
+        def keys(self, wait_s: float) -> str:
+            return "none\n"
+
+    robot = Robot()
+    assert Checked(robot, Types(robot)).failed == []
+
+
 class Trouble(Robot):
     """A robot that raises an error at the n-th line."""
 

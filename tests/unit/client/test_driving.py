@@ -13,12 +13,12 @@ import pytest
 import zenoh
 from msgspec.structs import replace
 
-from acsard.client import driving
 from acsard.client.commander import GRACE_S, OPENED_S, objection
 from acsard.client.driving import SETTLED_S, UnheardError, drive
 from acsard.client.follower import FIRST_S, SILENT_S
 from acsard.core.messages.schema import RobotState, SourceState, Time
 from acsard.core.values import NS_PER_S
+from acsard.host import clock
 from acsard.host.errors import NoAnswerError, NotDrivenError, UsageError
 from tests.each import each
 from tests.unit.top.screens import raw_sample, sample_of
@@ -65,6 +65,9 @@ class World:
         self.dies = math.inf
         """Time after which only a router's storage answers, with the last state, s."""
         self.stored: Any = None
+        self.stalls: tuple[float, float] = math.inf, 0.0
+        """Time at which this program stops running, and for how long, s. The states of this time
+        are lost, except for one that waits in the queue."""
         self._says, self._told = says, 100.0
 
     def send(self, linear: float, angular: float = 0.0) -> None:
@@ -96,14 +99,25 @@ class World:
             return None
         return sample_of(replace(state, stamp=Time.from_ns(int(self.now * NS_PER_S))))
 
+    def set_clock(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Let the clock of this computer that also advances during a suspend show `now`."""
+        monkeypatch.setattr(clock, "steady_s", lambda: self.now)
+
     def drive(self, monkeypatch: pytest.MonkeyPatch, seconds: float = 1.0) -> float:
         """Drive at 0.5 m/s and return how long it took, s."""
-        monkeypatch.setattr(driving, "time", SimpleNamespace(monotonic=lambda: self.now))
+        self.set_clock(monkeypatch)
         robot: Any = self
         with closing(drive(robot, 0.5, 0.0, seconds)) as steps:
             for pause in steps:
                 self.now += pause
+                self._stall()
         return self.now - 100.0
+
+    def _stall(self) -> None:
+        begin, stalled = self.stalls
+        if self.now - 100.0 >= begin:
+            self.now += stalled
+            self.stalls = math.inf, 0.0
 
 
 def followed(t: float, last: float, sent: list[float]) -> RobotState:
@@ -256,6 +270,45 @@ def test_a_moment_without_the_robot_does_not_end_a_drive(monkeypatch: pytest.Mon
     assert world.sent.count(0.5) in (20, 21)
 
 
+@pytest.mark.parametrize("begins", [0.1, 0.9], ids=["opening", "driving"])
+def test_a_drive_does_not_go_on_after_this_program_stood_still(
+    monkeypatch: pytest.MonkeyPatch, begins: float
+) -> None:
+    """The daemon publishes its state as always, and one state waits in the queue."""
+    world = World(followed)
+    world.stalls = begins, 4.0
+    with pytest.raises(NotDrivenError, match=r"stood still for 4\.[01] s.*not finished"):
+        world.drive(monkeypatch, 60.0)
+    assert begins + 4.0 <= world.now - 100.0 < begins + 4.1
+    assert (0.5 in world.sent) == (begins == 0.9)
+    assert world.sent[-1] == 0.0
+    assert not world.subscribed
+
+
+def test_a_drive_whose_end_passed_while_this_program_stood_still_was_not_finished(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    world = World(followed)
+    world.stalls = 0.9, 4.0
+    with pytest.raises(NotDrivenError, match="stood still"):
+        world.drive(monkeypatch, 1.0)
+
+
+def test_a_drive_goes_on_after_a_short_stall(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World(followed)
+    world.stalls = 0.9, 0.8 * GRACE_S
+    assert world.drive(monkeypatch) < 2.1
+    assert world.sent.count(0.5) > 10
+
+
+def test_a_drive_that_only_waits_for_the_robot_to_stand_may_stand_still(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    world = World(followed)
+    world.stalls = 1.5, 4.0
+    world.drive(monkeypatch)
+
+
 @pytest.mark.parametrize("seconds", [0.4, 1.0, 60.0])
 @pytest.mark.parametrize("dies", [0.35, 0.7, 1.0])
 def test_a_robot_that_died_does_not_drive_because_a_storage_still_has_its_state(
@@ -293,7 +346,7 @@ def test_a_daemon_of_another_version_is_distinguished_from_a_dead_one(
 
 def test_a_connection_that_is_closed_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
     world = World(followed)
-    monkeypatch.setattr(driving, "time", SimpleNamespace(monotonic=lambda: world.now))
+    world.set_clock(monkeypatch)
     robot: Any = world
     steps = drive(robot, 0.5, 0.0, 1.0)
     next(steps)
@@ -310,7 +363,7 @@ def test_a_drive_on_a_connection_that_is_closed_ends_with_an_error_that_the_docs
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     world = World(followed)
-    monkeypatch.setattr(driving, "time", SimpleNamespace(monotonic=lambda: world.now))
+    world.set_clock(monkeypatch)
     robot: Any = world
     steps = drive(robot, 0.5, 0.0, 1.0)
     next(steps)

@@ -15,8 +15,9 @@ from acsard.client.driving import UnheardError
 from acsard.core.config.settings import DriveConfig, JointsConfig
 from acsard.core.incoming.commands import Arrival, Receiver
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.values import REST, Command
+from acsard.core.values import NS_PER_S, REST, Command
 from acsard.daemon.bus.identity import Identity
+from acsard.host import clock
 
 RECEIVER = Receiver(JointsConfig(), Kinematics(DriveConfig()))
 
@@ -133,8 +134,8 @@ def test_after_the_longest_timeout_the_end_of_a_connection_stops_no_other_sender
     robot = client_of(session)
     robot.send(0.0)
     robot.send(0.3)
-    sent, now = len(session.heard), time.monotonic()
-    monkeypatch.setattr(time, "monotonic", lambda: now + LONGEST_S)
+    sent, asleep_ns = len(session.heard), clock.asleep_ns()
+    monkeypatch.setattr(clock, "asleep_ns", lambda: asleep_ns + int(LONGEST_S * NS_PER_S))
     robot.end()
     assert len(session.heard) == sent
 

@@ -6,6 +6,7 @@ import time
 
 import pytest
 
+from acsard.core.values import NS_PER_S
 from acsard.host import clock
 from acsard.host.clock import MOMENT_NS, Asleep, asleep_ns
 
@@ -75,3 +76,10 @@ def test_who_loses_the_processor_between_the_two_clocks_has_not_slept() -> None:
 def test_this_machine_is_awake() -> None:
     asleep = Asleep(asleep_ns)
     assert not any(asleep.was() for _ in range(1000))
+
+
+def test_the_steady_clock_advances_during_a_suspend(monkeypatch: pytest.MonkeyPatch) -> None:
+    asleep_ns = clock.asleep_ns()
+    before_s = clock.steady_s()
+    monkeypatch.setattr(clock, "asleep_ns", lambda: asleep_ns + 60 * NS_PER_S)
+    assert 60.0 <= clock.steady_s() - before_s < 70.0

@@ -59,7 +59,7 @@ class Robot:
 @pytest.fixture
 def robot(monkeypatch: pytest.MonkeyPatch) -> Robot:
     robot = Robot()
-    monkeypatch.setattr(top_feed, "time", SimpleNamespace(monotonic=lambda: robot.now))
+    monkeypatch.setattr(top_feed, "clock", SimpleNamespace(steady_s=lambda: robot.now))
     return robot
 
 

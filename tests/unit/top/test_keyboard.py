@@ -14,9 +14,9 @@ from msgspec.structs import replace
 from acsard.client.commander import GRACE_S, ZEROS
 from acsard.client.follower import SILENT_S
 from acsard.core.messages.schema import RobotState
-from acsard.core.values import REST, Twist
+from acsard.core.values import NS_PER_S, REST, Twist
 from acsard.daemon.bus.address import Address
-from acsard.top import keyboard
+from acsard.host import clock
 from acsard.top.keyboard import HOLD_S, REPEAT_S, Keyboard, Ride, split
 from tests.each import each
 from tests.unit.top.screens import STATE, sample_of
@@ -196,8 +196,9 @@ class Drive:
     """A ride with a clock that the test sets."""
 
     def __init__(self, robot: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.now = 100.0
-        monkeypatch.setattr(keyboard, "time", SimpleNamespace(monotonic=lambda: self.now))
+        self.now, self.asleep = 100.0, 0.0
+        monkeypatch.setattr(clock, "mono_ns", lambda: round((self.now - self.asleep) * NS_PER_S))
+        monkeypatch.setattr(clock, "asleep_ns", lambda: round(self.asleep * NS_PER_S))
         self.ride = Ride(robot, Keyboard(0.5, 2.0))
 
     def step(self, typed: str = "", times: int = 1) -> None:
@@ -250,6 +251,19 @@ def test_keys_that_a_stalled_connection_held_back_do_not_drive(
     assert set(robot.sent[sent:]) == {0.0}
     drive.step(key, times=3)
     assert robot.sent[-1] == 0.5
+
+
+def test_a_key_that_was_pressed_before_a_suspend_does_not_drive_after_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    robot = Robot()
+    drive = Drive(robot, monkeypatch)
+    drive.step("i", times=5)
+    sent = len(robot.sent)
+    drive.now += 60.0
+    drive.asleep += 60.0
+    drive.step(times=10)
+    assert robot.sent[sent:] == [0.0] * ZEROS
 
 
 def test_a_space_stops_at_the_next_step(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -224,6 +224,14 @@ def test_one_that_stood_still_drives_on_by_nothing_that_has_waited_for_it() -> N
     assert set(world.run(3.0).said[-100:]) == {REST}
 
 
+def test_one_that_stood_still_before_its_first_move_does_not_begin_it() -> None:
+    world = World(LEG).run(0.1)
+    world.now += 1.5
+    assert set(world.run(3.0).said) == {REST}
+    assert world.driver.halted == HELD_UP
+    assert world.driver.disturbed
+
+
 def test_a_key_pressed_while_it_stood_still_is_no_end_of_a_turn() -> None:
     world = World(TURN).until_moving()
     world.now += 1.5

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
-from acsard.calibration.guided.robot_on_bus import Recorder, Sample, times
+from acsard.calibration.guided import robot_on_bus
+from acsard.calibration.guided.drive_plan import DisturbedError, Leg, Move
+from acsard.calibration.guided.leg_driver import HELD_UP
+from acsard.calibration.guided.robot_on_bus import Recorder, RobotOnBus, Sample, times
 from acsard.calibration.log_table import LogError
-from acsard.core.config.settings import JointsConfig
+from acsard.core.config.settings import Config, JointsConfig
 from acsard.core.messages.schema import (
     Header,
     Imu,
@@ -23,6 +28,12 @@ from acsard.core.messages.schema import (
     TwistWithCovariance,
     Vector3,
 )  # fmt: skip
+from acsard.core.values import NS_PER_S
+from acsard.core.values import Twist as Command
+from acsard.host import clock
+from acsard.terminal.terminal_prompt import NoPrompt
+from tests.unit.calibration.guided.test_leg_driver import US, telling
+from tests.unit.top.screens import sample_of
 
 JOINTS = JointsConfig().as_tuple()
 
@@ -112,3 +123,61 @@ def test_a_wheel_that_contradicts_the_other_of_its_side_is_noted_or_refused() ->
     assert "fl and rl differ by 25%" in with_rear_left(4.5).log().notes[0]
     with pytest.raises(LogError, match="rl hardly turns while fl does"):
         with_rear_left(0.0).log()
+
+
+class Laptop(NoPrompt):
+    """A computer that is suspended 2 s after the begin of a leg, and the robot that it drives."""
+
+    sender, session, unreadable = US, None, 0
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        super().__init__()
+        self.now, self.asleep = 100.0, 0.0
+        self.sent: list[float] = []
+        self.told = 0.0
+        monkeypatch.setattr(clock, "mono_ns", lambda: round((self.now - self.asleep) * NS_PER_S))
+        monkeypatch.setattr(clock, "asleep_ns", lambda: round(self.asleep * NS_PER_S))
+        monkeypatch.setattr(robot_on_bus, "queue_on", lambda *_, **__: self)
+
+    def keys(self, wait_s: float) -> str:
+        """Wait for a key. Nobody presses one."""
+        self.now += wait_s
+        if self.now > 102.0 and not self.asleep:
+            self.now, self.asleep = self.now + 60.0, 60.0
+            self.sent.clear()
+        return ""
+
+    def key(self, name: str) -> str:
+        return name
+
+    def subscribe(self, name: str) -> Any:
+        return States(self)
+
+    def send(self, linear: float, angular: float) -> None:
+        self.sent.append(linear)
+
+    def try_recv(self) -> None:
+        """Return that no message of a sensor waits."""
+
+
+class States:
+    """The states that the daemon publishes ten times a second while it follows this client."""
+
+    def __init__(self, laptop: Laptop) -> None:
+        self._laptop = laptop
+
+    def try_recv(self) -> Any:
+        laptop = self._laptop
+        if laptop.now < laptop.told + 0.1:
+            return None
+        laptop.told = laptop.now
+        return sample_of(telling(Command(laptop.sent[-1] if laptop.sent else 0.0, 0.0)))
+
+
+def test_a_leg_does_not_go_on_after_a_suspend(monkeypatch: pytest.MonkeyPatch) -> None:
+    laptop: Any = Laptop(monkeypatch)
+    robot = RobotOnBus(laptop, Config(), laptop)
+    with pytest.raises(DisturbedError, match=HELD_UP):
+        robot.ride(Leg("ahead", "", (Move(20.0, 0.3),)))
+    assert laptop.asleep
+    assert set(laptop.sent) == {0.0}
