@@ -43,6 +43,10 @@ OPTIONS = (
 
 PHONE, SIDEWAYS, DESKTOP = (390, 844), (844, 390), (1280, 800)
 
+SETTLED_S = 1.1
+"""Time for which a test shows the button that ends the page's mode before it presses the button.
+The page ignores a press in the first second."""
+
 FINGER_PX = 44
 """Minimum width and height of an element that a finger presses."""
 
@@ -241,6 +245,11 @@ class Browser:
         else:
             self.touch("Start", self.middle(name))
             self.touch("End")
+
+    def release(self) -> None:
+        """Tap the button that ends the page's mode, when a press of that button counts."""
+        time.sleep(SETTLED_S)
+        self.tap("clear")
 
     def lift(self) -> None:
         """Lift all fingers, if there are any. A page that has gone has taken them along."""

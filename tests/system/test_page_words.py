@@ -12,7 +12,7 @@ import pytest
 from acsard.machine.authority import Authority
 from tests.system.browser import NAME, TRUSTING, Page
 from tests.system.camera_stream import Stream
-from tests.system.chromium import CHROMIUM, PHONE, SIDEWAYS, Browser, browsing
+from tests.system.chromium import CHROMIUM, PHONE, SETTLED_S, SIDEWAYS, Browser, browsing
 from tests.system.harness import PLAIN, Bus, Daemon, Peer, Tables, running, until
 
 pytestmark = [
@@ -60,6 +60,7 @@ def test_a_page_that_has_shown_no_stop_releases_none(tmp_path: Path, browser: Br
                 daemon.signal(signal.SIGCONT)
                 shows(browser, "mode", "STOPPED")
                 assert browser.js(HIDDEN) is False
+                time.sleep(SETTLED_S)
                 browser.js("document.getElementById('clear').click()")
                 shows(browser, "mode", "READY")
         finally:
@@ -119,22 +120,47 @@ def page(robot: tuple[Daemon, Bus, Peer, Page], browser: Browser) -> Page:
     return robot[3]
 
 
-STOPPING = """(() => {
-    const said = [];
-    const one = new stopping.constructor(SEND, words => said.push(words));
-    DO;
-    return said;
-})()"""
-
-
-def test_a_stop_that_the_robot_reports_at_last_is_no_longer_called_unconfirmed(
-    page: Page, browser: Browser
+@pytest.mark.parametrize("first", ["the other stop", "this stop"])
+def test_a_stop_without_an_answer_is_sent_again_although_another_client_stopped_the_robot(
+    page: Page, browser: Browser, robot: tuple[Daemon, Bus, Peer, Page], first: str
 ) -> None:
-    story = STOPPING.replace("SEND", "() => new Promise(() => {})")
-    did = "one.complete(); one.press(); one.over(); one.heard(performance.now() + 1)"
-    _, unsure, *after = browser.js(story.replace("DO", did))
-    assert "was not confirmed" in unsure
-    assert after == [""]
+    """The person who released the other stop would release the robot although STOP was pressed."""
+    bus = robot[1]
+    if first == "the other stop":
+        bus.get("srv/stop")
+        shows(browser, "mode", "STOPPED")
+    browser.js(
+        "window.sent = 0;"
+        "stopping.send = async () => (sent++, {ok: false, lost: true, text: 'no answer'});"
+        "stopping.press(); 0"
+    )
+    if first == "this stop":
+        bus.get("srv/stop")
+        shows(browser, "mode", "STOPPED")
+    before = browser.js("sent")
+    until(lambda: browser.js("sent") > before + 2, 5.0, "the page sends STOP again")
+    assert "STOP is not confirmed" in browser.text("alarm")
+    browser.release()
+    shows(browser, "mode", "READY")
+
+
+def test_the_alarm_calls_a_stop_unconfirmed_until_the_robot_has_answered_one(
+    page: Page, browser: Browser, robot: tuple[Daemon, Bus, Peer, Page]
+) -> None:
+    browser.js("document.getElementById('clear').click(), document.getElementById('clear').click()")
+    shows(browser, "alarm", "pressed twice")
+    browser.js("window.send = stopping.send; stopping.send = () => new Promise(() => {}); 0")
+    browser.js("stopping.press(); stopping.over()")
+    shows(browser, "alarm", "STOP was not confirmed")
+    robot[1].get("srv/stop")
+    shows(browser, "mode", "STOPPED")
+    time.sleep(0.5)
+    shows(browser, "alarm", "STOP was not confirmed")
+    browser.js("stopping.send = send; 0")
+    browser.tap("stop")
+    until(lambda: browser.text("alarm") == "", 5.0, "the robot has answered")
+    browser.release()
+    shows(browser, "mode", "READY")
 
 
 def test_a_program_that_drives_is_named_and_a_push_takes_over(
@@ -156,9 +182,77 @@ def test_switch_on_is_beside_stop_and_only_offered_while_the_robot_is_off(
     shows(browser, "clear", "Switch on")
     assert (off("activate"), off("deactivate")) == (False, True)
     shows(browser, "reason", "press Switch on")
-    browser.tap("clear")
+    browser.release()
     shows(browser, "mode", "READY")
     until(lambda: off("activate"), 5.0, "the robot is on")
+
+
+def twice(browser: Browser, name: str, pause_s: float) -> None:
+    """Double-click the middle of the element, with a pause between the clicks."""
+    x, y = browser.middle(name)
+    for count in (1, 2):
+        for kind, buttons in (("mousePressed", 1), ("mouseReleased", 0)):
+            where = {"x": x, "y": y, "button": "left", "buttons": buttons, "clickCount": count}
+            browser.ask("Input.dispatchMouseEvent", type=kind, **where)
+        time.sleep(pause_s if count == 1 else 0.0)
+
+
+@pytest.mark.parametrize("pause_s", [0.0, 0.25, 0.8])
+def test_a_double_click_releases_only_what_the_button_said_before(
+    page: Page, browser: Browser, robot: tuple[Daemon, Bus, Peer, Page], pause_s: float
+) -> None:
+    bus = robot[1]
+    bus.get("srv/deactivate")
+    bus.get("srv/stop")
+    shows(browser, "clear", "Release STOP")
+    time.sleep(SETTLED_S)
+    twice(browser, "clear", pause_s)
+    shows(browser, "clear", "Switch on")
+    time.sleep(0.5)
+    assert bus.state()["mode"] == "inactive"
+    browser.release()
+    shows(browser, "mode", "READY")
+
+
+def test_taps_at_the_place_of_stop_do_not_release_it(
+    page: Page, browser: Browser, robot: tuple[Daemon, Bus, Peer, Page]
+) -> None:
+    """The button that releases STOP appears at the place of a part of STOP."""
+    corner = browser.js(
+        "(b => [b.x + 40, b.y + b.height / 2])"
+        "(document.getElementById('stop').getBoundingClientRect())"
+    )
+    for _ in range(4):
+        browser.touch("Start", corner)
+        browser.touch("End")
+        time.sleep(0.4)
+    assert robot[1].state()["mode"] == "stopped"
+    shows(browser, "alarm", "this button has just changed, or was pressed twice")
+    browser.release()
+    shows(browser, "mode", "READY")
+    assert browser.text("alarm") == ""
+
+
+def test_a_held_enter_key_releases_only_what_the_button_said_before(
+    page: Page, browser: Browser, robot: tuple[Daemon, Bus, Peer, Page]
+) -> None:
+    bus = robot[1]
+    bus.get("srv/deactivate")
+    bus.get("srv/stop")
+    shows(browser, "clear", "Release STOP")
+    time.sleep(SETTLED_S)
+    browser.js("document.getElementById('clear').focus()")
+    enter = {"code": "Enter", "key": "Enter", "text": "\r", "windowsVirtualKeyCode": 13}
+    for n in range(8):
+        browser.ask("Input.dispatchKeyEvent", type="keyDown", autoRepeat=n > 0, **enter)
+        time.sleep(0.2)
+    browser.ask("Input.dispatchKeyEvent", type="keyUp", **enter)
+    shows(browser, "clear", "Switch on")
+    assert bus.state()["mode"] == "inactive"
+    time.sleep(SETTLED_S)
+    browser.ask("Input.dispatchKeyEvent", type="keyDown", **enter)
+    browser.ask("Input.dispatchKeyEvent", type="keyUp", **enter)
+    shows(browser, "mode", "READY")
 
 
 def test_a_pulled_cable_is_in_the_mode_and_in_the_title_whatever_the_mode(
@@ -175,7 +269,7 @@ def test_a_pulled_cable_is_in_the_mode_and_in_the_title_whatever_the_mode(
     finally:
         board.plug()
     until(lambda: browser.text("mode") == "STOPPED", 8.0, "the board is back")
-    browser.tap("clear")
+    browser.release()
     shows(browser, "mode", "READY")
 
 
@@ -191,10 +285,10 @@ def test_a_stop_in_a_fault_says_that_it_is_latched_behind_it(
     finally:
         board.reply = usual
     shows(browser, "hint", "Press Release fault first")
-    browser.tap("clear")
+    browser.release()
     shows(browser, "mode", "STOPPED")
     assert browser.text("alarm") == ""
-    browser.tap("clear")
+    browser.release()
     shows(browser, "mode", "READY")
     assert bus.state()["mode"] == "ready"
 
@@ -299,12 +393,12 @@ def test_a_pressed_emergency_stop_or_bumper_and_a_low_battery_have_signs_with_th
         assert browser.js(shown)
         assert browser.text("estop") == "⬢ E-STOP"
         shows(browser, "hint", "Emergency stop: release it at the robot first.")
-        browser.tap("clear")
+        browser.release()
         shows(browser, "alarm", "release it at the robot, then")
         says(b"estop=ok")
         until(lambda: not browser.js(shown), 5.0, "the button is released")
         shows(browser, "hint", "Stopped. Press Release STOP first.")
-        browser.tap("clear")
+        browser.release()
         shows(browser, "mode", "READY")
         says(b"estop=ok bumpers=.X")
         shows(browser, "mode", "STOPPED")

@@ -26,7 +26,8 @@ export class Drive {
   #pressed = new Set();
   #pointer = null;
   #stamp = 0; // stamp of the last command, ms since 1970
-  #padHeld = false;
+  #padFree = null; // index of the gamepad whose shoulder buttons were up at the last look, or null
+  #padDrives = null; // index of the gamepad that drives
   #padStrange = false; // the hint about an unknown gamepad was shown
   state = null;
   heard = -Infinity; // time at which `state` was true, by performance.now()
@@ -204,13 +205,17 @@ export class Drive {
     if (!strange && this.#padStrange) this.#told("");
     this.#padStrange = strange && this.allowed;
     const held = pad ? SHOULDERS.some((n) => pad.buttons[n]?.pressed) : false;
-    if (held && this.#by === "pad") this.#show(farther(pad.axes[0], pad.axes[2]), -farther(pad.axes[1], 0));
-    if (held && !this.#padHeld && !this.#by && document.hasFocus()) {
+    if (this.#by === "pad") {
+      if (held && pad.index === this.#padDrives) this.#show(farther(pad.axes[0], pad.axes[2]), -farther(pad.axes[1], 0));
+      else this.release();
+    } else if (held && pad.index === this.#padFree && !this.#by && document.hasFocus()) {
+      this.#padDrives = pad.index;
       this.#show(0, 0);
       this.#press("pad");
     }
-    if (!held && this.#by === "pad") this.release();
-    this.#padHeld = held;
+    // Only a press that begins while the gamepad is connected drives. A gamepad that comes back with its button held
+    // has not been pressed again.
+    this.#padFree = pad && !held ? pad.index : null;
   }
 }
 

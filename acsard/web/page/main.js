@@ -30,6 +30,10 @@ const LATCHED = ["stopped", "fault"];
 const ON = { activate: "the robot is already on" };
 /** The switch that changes nothing in a mode, with the reason. */
 const NEEDLESS = { waiting: ON, driving: ON, ready: ON, inactive: { deactivate: "the robot is already off" } };
+/** ms for which the release button shows what it does before a press of it counts. A double click may take 900 ms, and
+ *  a held Enter key may click again after 1000 ms. */
+const SETTLED = 1000;
+const HASTY = "this button has just changed, or was pressed twice: read it, wait a second, then press it once";
 const SOON = 300; // ms in which the WebSocket answers a STOP, unless it is dead but still open
 
 const link = new Link(refused);
@@ -52,6 +56,9 @@ let uninvited = ""; // why the invitation was rejected
 let degrees = false; // turn rates are shown in degrees per second
 let note = { why: "", at: 0 }; // the message at the stick and its time, by performance.now()
 let complains = false; // the alarm says why a button failed
+let offer = ""; // the mode and the latch that the release button ends, "" while it is hidden
+let settling = 0; // time at which `offer` changed or the release button was last clicked, by performance.now()
+let down = null; // time at which a finger came down on the release button
 let period = 0; // seconds between two states of another robot
 
 /** Whether this page has a view of settings: another robot has it on its own page, and a viewer may do nothing there. */
@@ -199,7 +206,22 @@ function readied() {
 /** Show the button that ends the mode, only while this page shows the mode. */
 function releasable() {
   const fresh = state && performance.now() - heard <= lasts();
-  $("clear").hidden = Boolean(OTHER) || !fresh || !(state.mode in RELEASE);
+  const shown = !OTHER && fresh && state.mode in RELEASE;
+  $("clear").hidden = !shown;
+  const before = offer;
+  offer = shown ? `${state.mode} ${state.latch}` : "";
+  if (offer !== before) settling = performance.now();
+}
+
+/** Release what the button showed when the person's finger came down on it. The button follows the mode in place, and it
+ *  appears at the place of STOP, so the second click of a double click would release a cause that nobody has read. */
+function pressed(event) {
+  const since = (down ?? event.timeStamp) - settling;
+  down = null;
+  settling = performance.now();
+  if (since < SETTLED) return answered({ ok: false, text: HASTY });
+  stopping.over();
+  released(state?.mode === "inactive" ? "activate" : "clear");
 }
 
 function stated({ detail }) {
@@ -214,9 +236,6 @@ function stated({ detail }) {
   if (other) permitted();
   heard = drive.heard = performance.now() - detail.age;
   silent = "";
-  // The mode `fault` hides whether a stop is latched too. The daemon's stop does not end a running check, so it confirms
-  // STOP only if none is running.
-  if (state.mode === "stopped" && !guide.going) stopping.heard(heard - link.lag);
   views.banner(state, Boolean(hello?.barred.clear), OTHER, hello?.sender);
   releasable();
   readied();
@@ -370,10 +389,8 @@ document.querySelector("nav").addEventListener("keydown", (event) => {
   $(`tab-${view}`).focus();
 });
 // The daemon refuses if a stop or a "deactivate" came after the state that this person sees.
-$("clear").addEventListener("click", () => {
-  stopping.over();
-  released(state?.mode === "inactive" ? "activate" : "clear");
-});
+$("clear").addEventListener("pointerdown", (event) => (down = event.timeStamp));
+$("clear").addEventListener("click", pressed);
 $("activate").addEventListener("click", () => released("activate"));
 $("deactivate").addEventListener("click", () => asked("deactivate"));
 $("reset").addEventListener("click", () => asked("reset_odometry"));
@@ -407,6 +424,7 @@ stopping.after = (told) => {
   if (state?.mode === "fault") answered({ ok: false, text: "STOP is latched behind the fault: Release fault leads to STOPPED" });
 };
 stopping.before = () => {
+  complains = false; // the alarm is now about STOP
   drive.release();
   guide.leave();
 };

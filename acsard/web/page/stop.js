@@ -18,17 +18,15 @@ class Stopping {
   #tell;
   #press = 0;
   #waits = false; // waiting for the robot's confirmation
-  #since = Infinity; // time of the press, by performance.now()
-  #arrived = false;
   #whole = false; // the modules of the page run
-  #unsure = false; // the alarm says that a STOP was not confirmed
   /** Called at each press before the stop is sent. */
   before = () => {};
   /** Called with the answer that confirms a stop. */
   after = () => {};
 
-  /** `send()` sends one request and resolves to {ok, text, lost}; `lost` means that there was no answer.
-   *  `tell(words)` shows a message to the operator. */
+  /** `send()` sends one request and resolves to {ok, text}. Only its answer confirms a stop: a robot that reports that it
+   *  is stopped may have been stopped by another person, who will release it. `tell(words)` shows a message to the
+   *  operator. */
   constructor(send, tell) {
     this.send = send;
     this.#tell = tell;
@@ -37,9 +35,8 @@ class Stopping {
   async press() {
     const press = ++this.#press;
     const last = Date.now() + URGENT;
-    this.#since = performance.now();
+    const since = performance.now();
     this.#waits = true;
-    this.#arrived = this.#unsure = false;
     try {
       this.before();
     } catch (error) {
@@ -51,25 +48,15 @@ class Stopping {
       if (this.#ends(told)) return;
       this.#tell(`STOP is not confirmed. This page sends it again; the robot's own switch stops it too. (${told.text})`);
       await new Promise((done) => setTimeout(done, PAUSE));
-      if (press !== this.#press || this.#ends(told)) return;
-      if (Date.now() > last || performance.now() > this.#since + URGENT) return this.over();
+      if (press !== this.#press) return;
+      if (Date.now() > last || performance.now() > since + URGENT) return this.over();
     }
-  }
-
-  /** Note that the robot reported itself as stopped at the time `at`. This counts as the answer if the answer
-   *  was lost. */
-  heard(at) {
-    if (at <= this.#since) return;
-    this.#arrived = true;
-    if (this.#unsure) this.#tell("");
-    this.#unsure = false;
   }
 
   /** Give up the pending STOP, because the operator releases it or leaves the page. */
   over() {
     ++this.#press;
     if (this.#waits) this.#tell(UNSURE);
-    this.#unsure ||= this.#waits;
     this.#waits = false;
   }
 
@@ -99,7 +86,7 @@ class Stopping {
       this.uninvited();
       return true;
     }
-    if (!told.ok && !(told.lost && this.#arrived)) return false;
+    if (!told.ok) return false;
     this.#waits = false;
     document.documentElement.classList.add("stops"); // this browser was invited again in another tab
     this.#tell(this.#whole ? "" : "STOP: the robot has confirmed it. This page is not complete: reload it.");
