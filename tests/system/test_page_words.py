@@ -187,6 +187,14 @@ def test_switch_on_is_beside_stop_and_only_offered_while_the_robot_is_off(
     until(lambda: off("activate"), 5.0, "the robot is on")
 
 
+def stopped_while_off(bus: Bus, browser: Browser) -> None:
+    """Stop a robot that is switched off, and wait until its release may be pressed."""
+    bus.get("srv/deactivate")
+    bus.get("srv/stop")
+    shows(browser, "clear", "Release STOP")
+    time.sleep(SETTLED_S)
+
+
 def twice(browser: Browser, name: str, pause_s: float) -> None:
     """Double-click the middle of the element, with a pause between the clicks."""
     x, y = browser.middle(name)
@@ -202,10 +210,7 @@ def test_a_double_click_releases_only_what_the_button_said_before(
     page: Page, browser: Browser, robot: tuple[Daemon, Bus, Peer, Page], pause_s: float
 ) -> None:
     bus = robot[1]
-    bus.get("srv/deactivate")
-    bus.get("srv/stop")
-    shows(browser, "clear", "Release STOP")
-    time.sleep(SETTLED_S)
+    stopped_while_off(bus, browser)
     twice(browser, "clear", pause_s)
     shows(browser, "clear", "Switch on")
     time.sleep(0.5)
@@ -237,10 +242,7 @@ def test_a_held_enter_key_releases_only_what_the_button_said_before(
     page: Page, browser: Browser, robot: tuple[Daemon, Bus, Peer, Page]
 ) -> None:
     bus = robot[1]
-    bus.get("srv/deactivate")
-    bus.get("srv/stop")
-    shows(browser, "clear", "Release STOP")
-    time.sleep(SETTLED_S)
+    stopped_while_off(bus, browser)
     browser.js("document.getElementById('clear').focus()")
     enter = {"code": "Enter", "key": "Enter", "text": "\r", "windowsVirtualKeyCode": 13}
     for n in range(8):

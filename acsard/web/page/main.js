@@ -216,7 +216,8 @@ function releasable() {
 /** Release what the button showed when the person's finger came down on it. The button follows the mode in place, and it
  *  appears at the place of STOP, so the second click of a double click would release a cause that nobody has read. */
 function pressed(event) {
-  const since = (down ?? event.timeStamp) - settling;
+  // A click by a key has no finger, and a finger that left the button has made no click.
+  const since = ((event.detail && down) || event.timeStamp) - settling;
   down = null;
   settling = performance.now();
   if (since < SETTLED) return answered({ ok: false, text: HASTY });
