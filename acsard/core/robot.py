@@ -196,6 +196,7 @@ class Robot:
         self._settle(inputs)
         estimates = self._fold(inputs, events)
         answers = self._serve(inputs, events)
+        self._arbiter.begin(inputs.now.mono_ns)
         if inputs.commands or inputs.refusals:
             self._hear(inputs, events)
         self._choice = self._arbiter.choose(inputs.now.mono_ns)

@@ -8,6 +8,7 @@ from typing import get_args
 import msgspec
 import pytest
 
+from acsard.core.config.settings import CommandsConfig, Config
 from acsard.core.incoming.commands import Arrival
 from acsard.core.incoming.queries import Query
 from tests.each import each, more
@@ -272,3 +273,23 @@ def test_a_zero_from_before_a_restart_of_the_board_arms_nobody(stall: float) -> 
         world.run(0.05)
     assert not moved(world, since_ns)
     assert world.state.reason.startswith("send a zero first")
+
+
+@each("pause", [0.5, 1.0])
+@each("way", ["plain", "bridge"])
+def test_a_stall_of_the_daemon_is_no_pause_between_the_zero_of_one_and_the_speeds_of_another(
+    way: Way, pause: float
+) -> None:
+    """The first step after the stall begins before the bus has delivered what waited."""
+    config = Config(commands=CommandsConfig(neutral_pause=pause))
+    world = World(config)
+    world.run(1.0)
+    one, other = Speaker(world, way), Speaker(world, way)
+    other.hold(0.4, 1.0)
+    one.send(0.0)
+    world.run(0.02)
+    world.stall(pause)
+    world.run(0.0005)
+    other.hold(0.4, 2.0)
+    assert world.state.mode == "ready"
+    assert world.odom.pose.pose.position.x == 0.0

@@ -316,3 +316,23 @@ def test_a_clock_that_is_set_back_while_a_command_is_lost_or_repeated_heals(
             assert world.state.reason.startswith("send a zero first"), world.state.reason
             assert not moved(world, since_ns + NS_PER_S)
     assert world.state.mode == "driving", world.state.reason
+
+
+@each("way", ["signed", "rmw", "zenoh"])
+def test_a_source_that_holds_the_robot_still_keeps_it_when_its_clock_is_set(way: Way) -> None:
+    world = quiet()
+    still, moving = Speaker(world, way, "still"), Speaker(world, "client", "moving")
+    still.key, moving.key = "cmd/teleop", "cmd/nav"
+    moving.open()
+    followed = set()
+    world.watch = lambda outputs: followed.add(outputs.source)
+    for at in range(200):
+        if at == 40:
+            still.ahead -= 0.3
+        still.send(0.0)
+        moving.send(0.4)
+        world.run(0.05)
+        if at < 10:
+            followed.clear()
+    assert followed == {"teleop"}
+    assert world.state.mode == "driving"

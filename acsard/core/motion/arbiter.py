@@ -1,7 +1,8 @@
 """Chooses the one command that the robot follows: first the source, then the sender of that source.
 
 A sender is live while its last command is not older than the timeout of its source, and a source is
-live while one of its senders is.
+live while one of its senders is. A sender whose stamps come into doubt is treated as live for a
+short time (`Sender.present`), but the robot stands still meanwhile.
 
 - The robot follows the live source of the highest priority. Among sources of equal priority, the
   robot follows the one that began to send first, until that source falls silent. The same rule
@@ -31,6 +32,9 @@ MAX_SENDERS = 16
 
 Objection = Literal["", "unknown_source", "not_finite", "too_many_senders", "unproven", "stale"]
 """The reason to refuse a command, or "" if the arbiter accepts it."""
+
+STALL_NS = 150_000_000
+"""The daemon stood still if a step begins later than this after the step before it, ns."""
 
 LASTING_S = (3.0, 10.0, 60.0, 600.0, 3600.0)
 """`state` reports for how long a sender has sent only zeros, or has sent commands although it is
@@ -88,33 +92,43 @@ class _Source:
         """Return the rank of a sender. `add` replaces the sender with the lowest rank."""
         sender = self.senders[name]
         armed = sender.armed(now_ns)
-        return armed and sender.live(now_ns), armed, sender.noticed_ns
+        return armed and sender.present(now_ns), armed, sender.noticed_ns
 
     def cancel_zeros(self, at_ns: int) -> None:
         """Record a message that may be a speed of any sender with a shared identity."""
         for sender in self.senders.values():
             sender.cancel_zero(at_ns)
 
-    def doubt(self, name: str, was_set: bool) -> None:
-        """React to doubt about the sender's clock.
+    def doubt(self, command: Command, was_set: bool) -> None:
+        """React to doubt about the clock that stamped `command`, if its sender uses this source.
+
+        Behind a bridge, several programs with clocks of their own share one identity. Therefore,
+        if the command came to another source, nothing happens unless the same clock stamped the
+        last command to this source.
 
         If the clock was set, the sender must send a zero again. Otherwise the clock is unproven:
         undo the effect of the zeros that it has stamped so far. Later zeros arm as usual.
         """
-        sender = self.senders.get(name)
-        if sender is None:
+        sender = self.senders.get(command.sender)
+        if sender is None or (command.source != self.name and command.clock != sender.clock):
             return
         if was_set:
             sender.require_neutral()
         else:
             sender.unlearn()
 
-    def live(self, now_ns: int) -> list[Sender]:
-        """Return the live senders: first the armed ones, each group in the order of `came_ns`."""
-        live = [sender for sender in self.senders.values() if sender.live(now_ns)]
-        if len(live) < 2:
-            return live
-        return sorted(live, key=lambda sender: (not sender.armed(now_ns), sender.came_ns))
+    def present(self, now_ns: int) -> list[Sender]:
+        """Return the senders that keep their place, in the order in which they get the robot.
+
+        Armed senders come first, then those that are live, then those that came first.
+        """
+        present = [sender for sender in self.senders.values() if sender.present(now_ns)]
+        if len(present) < 2:
+            return present
+        return sorted(
+            present,
+            key=lambda sender: (not sender.armed(now_ns), *sender.rank(now_ns)),
+        )
 
     def latest_ns(self) -> int | None:
         """Return the monotonic time, ns, of the last accepted command, or None without one."""
@@ -135,10 +149,13 @@ class _Source:
         doubtful = [sender for sender in self.senders.values() if sender.doubtful(now_ns)]
         if not doubtful:
             return None
-        latest = max(doubtful, key=lambda sender: sender.noticed_ns)
-        if latest.doubt == "stale":
+        return self.why(max(doubtful, key=lambda sender: sender.noticed_ns), now_ns)
+
+    def why(self, sender: Sender, now_ns: int) -> Wait:
+        """Return why the robot does not follow this sender, whose last stamp is in doubt."""
+        if sender.doubt == "stale":
             return self.late
-        return self.proof if latest.armed(now_ns) else self.neutral(latest)
+        return self.proof if sender.armed(now_ns) else self.neutral(sender)
 
 
 class Arbiter:
@@ -153,6 +170,7 @@ class Arbiter:
         self._holder: _Source | None = None
         self._followed: Sender | None = None
         self._since_ns = 0
+        self._begun_ns = self._watched_ns = 0
         self._freshness = Freshness()
 
     def use(self, commands: CommandsConfig) -> None:
@@ -175,6 +193,19 @@ class Arbiter:
             source.require_neutral()
         self._holder = self._followed = None
 
+    def begin(self, now_ns: int) -> None:
+        """Begin a step at this monotonic time, before its commands.
+
+        If the daemon stood still since the last step, `commands.neutral_pause` begins again: the
+        bus may not have delivered yet what arrived meanwhile.
+        """
+        before_ns, self._begun_ns = self._begun_ns, now_ns
+        if now_ns - before_ns > STALL_NS:
+            self._watched_ns = now_ns
+            for source in self._ranking:
+                for sender in source.senders.values():
+                    sender.restart_pause(before_ns, now_ns)
+
     def accept(self, command: Command) -> Objection:
         """Accept a command and return "", or return the reason to refuse it."""
         source = self._sources.get(command.source)
@@ -195,11 +226,10 @@ class Arbiter:
         if sender is None:
             return "too_many_senders"
         if verdict in ("set", "first"):
-            # A sender uses one clock for all its sources, so the doubt about this clock concerns
-            # its zeros on every source.
+            # The doubt about a clock concerns the zeros that it stamped on every source.
             for other in self._ranking:
-                other.doubt(command.sender, verdict == "set")
-        sender.take(command, self._since_ns, verdict)
+                other.doubt(command, verdict == "set")
+        sender.take(command, self._since_ns, verdict, self._watched_ns)
         return "" if verdict in ("fresh", "set") else "unproven"
 
     def notice(self, source: str, sender: str, arrived_ns: int, shared: bool = False) -> None:
@@ -224,15 +254,16 @@ class Arbiter:
         first: tuple[_Source, Sender] | None = None
         kept = self._followed
         for source in self._ranking:
-            if not source.senders or not (live := source.live(now_ns)):
+            if not source.senders or not (present := source.present(now_ns)):
                 continue
             if first is None or (
-                source.priority == first[0].priority and live[0].came_ns < first[1].came_ns
+                source.priority == first[0].priority
+                and present[0].rank(now_ns) < first[1].rank(now_ns)
             ):
-                first = source, live[0]
+                first = source, present[0]
             if (
                 kept is not None
-                and kept in live
+                and kept in present
                 and source.priority == first[0].priority
                 and kept.armed(now_ns)
             ):
@@ -252,6 +283,8 @@ class Arbiter:
             wait = source.neutral(sender, _lasts(now_ns - sender.came_ns))
             return Choice(source.name, None, wait, sender=sender.name)
         self._followed = sender
+        if not sender.live(now_ns):
+            return Choice(source.name, None, source.why(sender, now_ns), sender=sender.name)
         wait = NOTHING
         if sender.zeros_ns is not None and (lasts := _lasts(now_ns - sender.zeros_ns)):
             wait = Wait("zeros", source.name, lasts=lasts, kept=self._kept(source, now_ns))
@@ -260,7 +293,7 @@ class Arbiter:
     def _kept(self, holder: _Source, now_ns: int) -> str:
         """Return words for the source or sender that must wait because `holder` sends zeros."""
         for source in self._ranking:
-            senders = (each for each in source.live(now_ns) if each is not self._followed)
+            senders = (each for each in source.present(now_ns) if each is not self._followed)
             if any(sender.twist != REST for sender in senders):
                 return f"another sender of {source.name}" if source is holder else source.name
         return ""
@@ -284,13 +317,16 @@ class Arbiter:
         return SourceStatus(source.name, source.priority, age_s, self._waits_for(source, now_ns))
 
     def _waits_for(self, source: _Source, now_ns: int) -> Wait:
-        holder, live = self._holder, source.live(now_ns)
-        if not live:
+        holder, present = self._holder, source.present(now_ns)
+        if not present:
             return source.doubted(now_ns) or COMMAND
-        if not live[0].armed(now_ns):
-            return source.neutral(live[0])
+        first = self._followed if source is holder and self._followed else present[0]
+        if not first.armed(now_ns):
+            return source.neutral(first)
+        if not first.live(now_ns):
+            return source.why(first, now_ns)
         if holder is None or source is holder:
-            return Wait("senders", senders=len(live) - 1) if len(live) > 1 else NOTHING
+            return Wait("senders", senders=len(present) - 1) if len(present) > 1 else NOTHING
         return Wait("equal" if holder.priority == source.priority else "higher", holder.name)
 
 

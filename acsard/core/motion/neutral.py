@@ -9,15 +9,25 @@ does not. The sender stays armed until `require_neutral` or `unlearn` is called.
   no speed of any shared identity of the source follows for `commands.neutral_pause`. Further zeros
   and silence do not restart this time. Without the pause, the zero of one program would arm another
   program that never stopped.
+- While the daemon stands still, it sees no speed. Therefore a stall begins the pause again.
 - One program without a sender id may have several shared identities in turn, because its identity
   depends on the Zenoh session that stamps its commands. Therefore a speed of one identity cancels
   the zeros of all.
+
+A sender keeps its place before other senders while it is live. If the stamps of its commands come
+into doubt, for example because its clock was set, it keeps the place for at most `PLACE_NS` longer.
+Without this rule, a sender that holds the robot still would lose it to a moving one.
 """
 
 from __future__ import annotations
 
-from acsard.core.motion.freshness import Verdict
+from acsard.core.motion.freshness import LONGEST_PROOF_NS, Verdict
 from acsard.core.values import REST, Command
+
+PLACE_NS = LONGEST_PROOF_NS * 3 // 2
+"""Longest time for which a sender keeps its place without an accepted command, ns, if its commands
+go on but their stamps are in doubt. A longest proof that restarts with its second half ends within
+this time."""
 
 
 class Sender:
@@ -37,9 +47,13 @@ class Sender:
         self.name = ""
         self._stamp_ns: int | None = None
         """Stamp of the last accepted command, ns, or None."""
+        self.clock = ""
+        """Name of the clock that stamped the last command that was not refused."""
         self.twist = REST
         self.arrived_ns: int | None = None
         """Arrival of the last accepted command since `require_neutral`, monotonic ns."""
+        self._present_ns = 0
+        """Arrival of the last command that kept the sender's place, monotonic ns."""
         self.came_ns = 0
         """Arrival of the command that ended the sender's last silence, monotonic ns."""
         self.zeros_ns: int | None = None
@@ -62,6 +76,22 @@ class Sender:
         """Return whether the last command is not older than the timeout of its source."""
         return self.arrived_ns is not None and now_ns - self.arrived_ns <= self._timeout_ns
 
+    def present(self, now_ns: int) -> bool:
+        """Return whether the sender keeps its place before others.
+
+        That is so while it is live, and for at most `PLACE_NS` after its last accepted command
+        while commands in doubt follow without a silence longer than the timeout.
+        """
+        return self.live(now_ns) or (
+            self.arrived_ns is not None
+            and now_ns - self._present_ns <= self._timeout_ns
+            and now_ns - self.arrived_ns <= PLACE_NS
+        )
+
+    def rank(self, now_ns: int) -> tuple[bool, int]:
+        """Return the order among armed senders of one priority: live ones first, then by time."""
+        return not self.live(now_ns), self.came_ns
+
     def doubtful(self, now_ns: int) -> bool:
         """Return whether a recent command was not accepted because of its stamp."""
         return self._doubted_ns is not None and now_ns - self._doubted_ns <= self._timeout_ns
@@ -80,6 +110,17 @@ class Sender:
         """Undo the effect of zeros with unproven stamps, which the network may have delayed."""
         self._armed, self._zero_ns = self._proven_armed, self._proven_zero_ns
 
+    def restart_pause(self, before_ns: int, now_ns: int) -> None:
+        """Let `commands.neutral_pause` run again from `now_ns` if it was not over at `before_ns`.
+
+        The daemon stood still between these monotonic times, and has not processed the commands
+        that arrived meanwhile.
+        """
+        self._settle(before_ns)
+        if not self._armed and self._zero_ns is not None:
+            proven = self._proven_zero_ns is not None
+            self._zero_ns, self._proven_zero_ns = now_ns, now_ns if proven else None
+
     def cancel_zero(self, at_ns: int) -> None:
         """Record that a program with a shared identity may have sent a speed at `at_ns`.
 
@@ -94,53 +135,54 @@ class Sender:
         self.noticed_ns = command.arrived_ns
         self._doubt(command, why)
 
-    def take(self, command: Command, since_ns: int, verdict: Verdict = "fresh") -> None:
+    def take(
+        self, command: Command, since_ns: int, verdict: Verdict = "fresh", watched_ns: int = 0
+    ) -> None:
         """Process a command that was not refused. `verdict` is the verdict on its stamp.
 
         Before a speed of a shared identity, call `cancel_zero` of each sender of the source.
 
         A command from an unproven clock ("first", "unproven") does not drive the robot yet, but a
         zero with such a verdict arms the sender until `unlearn`. A zero that arrived before the
-        monotonic time `since_ns` does not arm the sender (see `Arbiter.require_neutral`).
+        monotonic time `since_ns` does not arm the sender (see `Arbiter.require_neutral`). The
+        daemon has not stood still since the monotonic time `watched_ns`, so
+        `commands.neutral_pause` does not begin earlier.
         """
         now_ns, zero = command.arrived_ns, is_zero(command)
         self._settle(now_ns)
-        self.noticed_ns, self.shared = now_ns, command.shared
+        self.noticed_ns, self.shared, self.clock = now_ns, command.shared, command.clock
         unarmed = not self._armed
         if zero and now_ns >= since_ns:
             if not command.shared:
                 self._armed = True
             elif self._zero_ns is None:
-                self._zero_ns = now_ns
+                self._zero_ns = max(now_ns, watched_ns)
         if verdict in ("first", "unproven"):
             if zero and unarmed:
-                # When this zero arms the sender, an earlier speed must not drive the robot. With a
-                # shared identity, another program may have sent that speed, and the source keeps
-                # its priority.
-                if command.shared:
-                    self.twist = REST
-                else:
-                    self.arrived_ns = None
+                # When this zero arms the sender, an earlier speed must not drive the robot.
+                self.twist = REST
             self._doubt(command, verdict)
             return
         self._proven_armed, self._proven_zero_ns = self._armed, self._zero_ns
-        live = self.live(now_ns)
-        if not live:
+        present = self.present(now_ns)
+        if not present:
             self.came_ns = now_ns
         if not zero:
             self.zeros_ns = None
-        elif self.zeros_ns is None or not live:
+        elif self.zeros_ns is None or not present:
             self.zeros_ns = now_ns
         self.ros, self.name = command.ros, command.sender
-        self.twist, self.arrived_ns, self._doubted_ns = command.twist, now_ns, None
+        self.twist, self._doubted_ns = command.twist, None
+        self.arrived_ns = self._present_ns = now_ns
         self._stamp_ns = command.stamp_ns
 
     def _doubt(self, command: Command, why: Verdict) -> None:
         stamp_ns, last_ns = command.stamp_ns, self._stamp_ns
         if is_zero(command) and stamp_ns and last_ns and stamp_ns > last_ns:
-            # The sender stopped wishing for its last speed, however late this zero may be. The zero
-            # does not keep the robot for the sender.
+            # The sender stopped wishing for its last speed, however late this zero may be.
             self.twist = REST
+        if self.present(command.arrived_ns):
+            self._present_ns = command.arrived_ns
         self._doubted_ns, self.doubt, self.ros = command.arrived_ns, why, command.ros
 
     def _settle(self, now_ns: int) -> None:

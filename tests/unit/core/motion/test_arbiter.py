@@ -9,6 +9,7 @@ import pytest
 from acsard.core.config.settings import CommandsConfig, Source
 from acsard.core.motion.arbiter import Choice
 from acsard.core.values import REST, Command, SourceStatus, Twist, Wait
+from tests.each import each
 from tests.unit.core.motion.commanders import BACK, GO, HIGH, LEFT, LOW, MS, RIGHT, SLOW, Bench
 
 # one source
@@ -281,6 +282,82 @@ def test_a_source_s_age_is_that_of_the_last_command_of_any_sender() -> None:
     assert bench.wait(20).status(HIGH).age_s == 0.02
     bench.send(HIGH, REST, "a")
     assert bench.wait(10).status(HIGH).age_s == 0.01
+
+
+# senders whose stamps are in doubt
+
+
+@each(("seconds", "driver"), [(2.5, ""), (3.5, "low")])
+def test_a_source_whose_stamps_are_in_doubt_keeps_its_priority_for_three_seconds(
+    seconds: float, driver: str
+) -> None:
+    bench = Bench(HIGH, LOW).known(HIGH, "clock", "a")
+    for at in range(round(seconds * 20)):
+        bench.wait(50).send(LOW)
+        assert bench.stamped(HIGH, 9000.0 + 20.0 * at, "clock", REST, "a") == "stale"
+        choice = bench.choice()
+    assert (choice.source if choice.twist else "") == driver
+    assert bench.status(HIGH).waits_for.what == "late"
+    if not driver:
+        assert (choice.source, choice.wait.what) == ("high", "late")
+        assert bench.status(LOW).waits_for == Wait("higher", "high")
+
+
+def test_a_source_that_fell_silent_gets_no_priority_by_late_commands() -> None:
+    bench = Bench(HIGH, LOW).known(HIGH, "clock", "a")
+    bench.wait(300)
+    for _ in range(20):
+        bench.wait(50).send(LOW)
+        bench.stamped(HIGH, 9000.0, "clock", REST, "a")
+        assert bench.driver() == "low"
+
+
+@each("other", [HIGH, SLOW])
+def test_the_sender_that_the_robot_follows_keeps_it_while_its_stamps_are_in_doubt(
+    other: Source,
+) -> None:
+    bench = Bench(HIGH, SLOW, armed=False)
+    bench.send(other, REST, "b")
+    bench.wait(2000).known(HIGH, "clock", "a")
+    assert bench.choice().sender == "a"
+    for _ in range(20):
+        bench.wait(50).send(other, GO, "b")
+        bench.stamped(HIGH, 9000.0, "clock", GO, "a")
+        choice = bench.choice()
+    assert (choice.sender, choice.twist) == ("a", None)
+    assert bench.status(HIGH).waits_for.what == "late"
+    assert bench.stamped(HIGH, 0.0, "clock", GO, "a") == ""
+    assert (bench.choice().sender, bench.choice().twist) == ("a", GO)
+
+
+@each("other", [HIGH, LEFT, RIGHT])
+def test_a_sender_in_doubt_that_waits_does_not_keep_the_robot_from_another(other: Source) -> None:
+    """The senders c, a and b came in this order, and c falls silent."""
+    own = LEFT if other is RIGHT else other
+    bench = Bench(HIGH, LEFT, RIGHT, armed=False).known(own, "clock", "a")
+    bench.wait(300).send(own, REST, "c")
+    bench.wait(10).stamped(own, 0.0, "clock", REST, "a")
+    bench.wait(10).send(other, REST, "b")
+    for at in range(20):
+        bench.wait(50).stamped(own, 9000.0, "clock", GO, "a")
+        bench.send(other, BACK, "b")
+        if at < 10:
+            bench.send(own, GO, "c")
+        assert bench.choice().sender == ("c" if at < 15 else "b")
+
+
+def test_behind_a_bridge_doubt_about_one_clock_disarms_no_program_with_another_clock() -> None:
+    bench = Bench(HIGH, LOW, armed=False).known(HIGH, "one", "bridge")
+    for _ in range(60):
+        bench.wait(50).stamped(LOW, 0.0, "two", REST, "bridge")
+        bench.stamped(HIGH, 0.0, "one", REST, "bridge")
+    for _ in range(60):
+        bench.wait(50).stamped(LOW, 0.0, "two", GO, "bridge")
+        bench.stamped(HIGH, 400.0, "one", GO, "bridge")
+    bench.wait(50).stamped(LOW, 0.0, "two", GO, "bridge")
+    assert bench.status(HIGH).waits_for.what == "neutral"
+    bench.wait(201)
+    assert bench.choice().twist == GO
 
 
 # how many senders are remembered

@@ -192,19 +192,63 @@ def test_a_speed_before_an_unproven_zero_that_arms_never_counts_by_it(shared: bo
     one = Sender(5000 * MS, 1000 * MS, neutral_first=True)
     one.take(sent(GO, 0, shared), 0)
     one.take(sent(REST, 10, shared), 0, "unproven")
-    at_ns = 1010 * MS if shared else 10 * MS
-    assert one.armed(at_ns)
-    assert one.twist == REST if shared else not one.live(at_ns)
+    assert one.armed(1010 * MS if shared else 10 * MS)
+    assert one.twist == REST
 
 
-def test_an_unproven_zero_leaves_an_unarmed_shared_identity_live_so_its_source_keeps_priority() -> (
-    None
-):
+@pytest.mark.parametrize("shared", [False, True])
+def test_an_unproven_zero_leaves_an_unarmed_sender_live_so_its_source_keeps_priority(
+    shared: bool,
+) -> None:
     one = sender()
-    one.take(sent(GO, 0, shared=True), 0)
-    one.take(sent(REST, 10, shared=True), 0, "unproven")
+    one.take(sent(GO, 0, shared), 0)
+    one.take(sent(REST, 10, shared), 0, "unproven")
     assert one.live(20 * MS)
-    assert not one.armed(20 * MS)
+    assert one.armed(20 * MS) is not shared
+
+
+@each("proven", [True, False])
+def test_the_pause_after_a_shared_zero_begins_again_behind_a_stall(proven: bool) -> None:
+    one = sender()
+    one.take(sent(REST, 0, shared=True), 0, "fresh" if proven else "unproven")
+    one.restart_pause(900 * MS, 1700 * MS)
+    assert not one.armed(2600 * MS)
+    assert one.armed(2700 * MS)
+    one.unlearn()
+    assert one.armed(2700 * MS) is proven
+
+
+def test_a_pause_that_was_over_before_a_stall_stays_over() -> None:
+    one = sender()
+    one.take(sent(REST, 0, shared=True), 0)
+    one.restart_pause(1000 * MS, 1700 * MS)
+    assert one.armed(1700 * MS)
+
+
+def test_a_shared_zero_that_arrived_before_a_stall_ended_begins_its_pause_then() -> None:
+    one = sender()
+    one.take(sent(REST, 0, shared=True), 0, watched_ns=800 * MS)
+    one.take(sent(REST, 5, shared=True), 0)
+    assert not one.armed(1700 * MS)
+    assert one.armed(1800 * MS)
+
+
+def test_a_sender_whose_stamps_are_in_doubt_keeps_its_place_for_three_seconds() -> None:
+    one = sender()
+    one.take(sent(GO, 0), 0)
+    for at_ms in range(200, 4000, 200):
+        one.refuse(sent(GO, at_ms), "stale")
+        assert one.present(at_ms * MS) is (at_ms <= 3000)
+        assert one.live(at_ms * MS) is (at_ms <= 250)
+
+
+def test_a_sender_that_was_silent_gets_no_place_by_a_command_in_doubt() -> None:
+    one = sender()
+    one.take(sent(GO, 0), 0)
+    one.refuse(sent(GO, 200), "stale")
+    assert one.present(450 * MS)
+    one.refuse(sent(GO, 451), "stale")
+    assert not one.present(451 * MS)
 
 
 @each("way", ["unproven", "stale"])
