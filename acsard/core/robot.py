@@ -29,7 +29,13 @@ from acsard.core.motion.arbiter import Arbiter, Choice
 from acsard.core.motion.arbiter_text import REFUSED, CommandEvents, chosen, missed, refused
 from acsard.core.motion.battery import Battery
 from acsard.core.motion.bumpers import Bumpers, missing
-from acsard.core.motion.emergency_stop import DRIVER_FAULT, DRIVER_MEND, MISSING, EmergencyStop
+from acsard.core.motion.emergency_stop import (
+    DRIVER_FAULT,
+    DRIVER_MEND,
+    MISSING,
+    PRESSED,
+    EmergencyStop,
+)
 from acsard.core.motion.event_throttle import EventThrottle
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.lifecycle import Lifecycle
@@ -129,7 +135,8 @@ class Robot:
         self._refused = ""
         self._refused_ns: int | None = None
         self._sanity = Sanity(config.feedback)
-        self._estop = EmergencyStop(config.safety.estop)
+        pressed = latches.stop is not None and any(c.why == PRESSED for c in latches.stop.causes)
+        self._estop = EmergencyStop(config.safety.estop, pressed)
         self._bumpers = Bumpers(config.safety)
         self._battery = Battery(config.battery)
         self._answered = UnansweredLines(config.mcu.reply_period)
@@ -408,8 +415,8 @@ class Robot:
         """Update the odometry with a plausible line, and return the estimate."""
         checks = self._odometry.checks
         wheels = checks.wheels
-        # A pressed emergency stop cuts the motors' power, so wheels that ignore the speeds are no
-        # sign of a fault.
+        # While the emergency stop counts as pressed, the motors may have no power, so wheels that
+        # ignore the speeds are no sign of a fault.
         commanded = None if self._estop.why or self._estop.pressed_now else self._written
         fault = wheels.watch(commanded, line.speeds, line.since)
         if fault:
@@ -462,7 +469,8 @@ class Robot:
                 if not released:
                     return "nothing to clear: the robot is neither stopped nor in fault"
                 self._forget()
-                self._estop.powered()
+                if life.latches.stop is None:
+                    self._estop.powered()
                 self._arbiter.require_neutral(asked_ns)
                 return released
             case "activate":

@@ -18,6 +18,7 @@ from acsard.core.config.settings import (
 from acsard.core.incoming.queries import Query
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.values import NS_PER_S, Latches, Outputs, Received
+from tests.each import each
 from tests.scenarios.taped import Tape, replayed
 from tests.scenarios.world import SIGNED, World
 
@@ -204,7 +205,6 @@ def test_a_press_is_as_fast_in_a_flood_on_a_bad_wire_and_on_a_slow_one(
     )
 
 
-@pytest.mark.slow
 def test_a_robot_that_is_rolled_by_hand_after_a_press_latches_no_fault() -> None:
     # The robot drove at the press, so its wheels turned by command before they had no power.
     world = World()
@@ -220,6 +220,24 @@ def test_a_robot_that_is_rolled_by_hand_after_a_press_latches_no_fault() -> None
     assert world.state.counters["uncommanded_motion"] > 0
 
 
+@each("silent", [True, False])
+def test_wheels_that_run_away_through_a_press_without_a_rest_are_a_fault(silent: bool) -> None:
+    world = World()
+    with world.mcu.estop():
+        world.run(0.5)
+        world.drive(0.8, seconds=1.5)
+        with world.mcu.pushed(0.8):
+            if silent:
+                with world.mcu.estop_silent(0.0, 0.7):
+                    world.run(2.0)
+            else:
+                with world.mcu.estop_pressed(0.0, 0.06):
+                    world.run(2.0)
+            assert world.state.mode == "fault"
+            assert "turns faster than commanded" in world.state.reason
+
+
+@pytest.mark.slow
 def test_a_board_that_falls_silent_about_its_button_stops_the_robot() -> None:
     world = World(Config(sim=SimConfig(faults=("estop_silent=2:3",))))
     world.run(0.2)

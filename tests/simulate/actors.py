@@ -128,6 +128,9 @@ class Run:
         self._linked = False
         """This daemon has heard the board: before that, no event disarms a sender."""
         self._stalled_ns = -NS
+        self._bus_ns = 0
+        """Until then the bus delivers no command, because the whole process stood still. The
+        commands that came meanwhile arrive together at this time."""
         self._full_ns = self._blocked_ns = -NS
         """When the disk was last seen full, and the output was last seen blocked."""
         self._whole = False
@@ -221,6 +224,9 @@ class Run:
         message = queue.pop()
 
         def arrive() -> None:
+            if self.true_ns < self._bus_ns:
+                self.at(self._bus_ns, arrive)
+                return
             self.deliver(sender, message)
             if queue:
                 self._next(sender, queue)
@@ -231,7 +237,8 @@ class Run:
         """Hand a message to the daemon, if there is one."""
         if not self.product.alive:
             return
-        at_ns = self._arrival(message.arrives_ns)
+        waited_ns = self._bus_ns if self._bus_ns <= self.true_ns else 0
+        at_ns = self._arrival(max(message.arrives_ns, waited_ns))
         one = sample(sender, message, self.plan["config"], self.product.wall_ns)
         true_ns = at_ns - START_NS + self.slept_ns
         wish = self.witness.command(sender, message, one, true_ns)
@@ -407,6 +414,8 @@ class Run:
                 self.damage.forget()
             case "stall" | "stall in step":
                 self._stalled_ns = after_ns
+                if "deaf" in event:
+                    self._bus_ns = after_ns + int(event["deaf"] * NS)
                 self.liveness.stalls(after_ns)
                 self.witness.stalls(self.true_ns, after_ns)
                 if self.true_ns > event["at"] * NS + NS // 1000:

@@ -50,8 +50,9 @@ class Sender:
     """Zeros and speeds of one identity on one source."""
 
     def __init__(self) -> None:
-        self.zeros: list[int] = []
-        """Arrivals of the zeros that no speed of a shared identity of the source has followed."""
+        self.zeros: list[tuple[int, int]] = []
+        """Zeros that no speed of a shared identity of the source has followed: when the pause of
+        each begins, at the earliest, and its arrival."""
         self.armed_ns = -1
 
 

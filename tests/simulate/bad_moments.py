@@ -467,6 +467,75 @@ def _later_and_later(plan: Plan, dice: random.Random) -> None:
     driver |= {"way": way, "phases": phases, "congestion": congestion}
 
 
+def _stall_behind_a_zero(plan: Plan, dice: random.Random) -> None:
+    """Let the whole process stand still between the zero of one program and the speeds of another.
+
+    The two share their identity. What arrived meanwhile reaches the daemon behind its first step.
+    """
+    commands, source = plan["config"]["commands"], _best(plan)
+    pause_s = dice.choice((0.5, 0.7, 1.0))
+    commands |= {"neutral_first": True, "neutral_pause": pause_s}
+    source["timeout"] = dice.choice((0.25, 0.5))
+    first = _alone(plan, dice, [])
+    hz = dice.choice((5.0, 10.0))
+    first |= {"way": dice.choice(("plain", "bridge")), "hz": 20.0}
+    second = first | {"name": "s1", "id": f"s1/{dice.getrandbits(64):016x}", "hz": hz}
+    second["phases"] = [[0.0, *_speed(dice)]]
+    phases: list[list[Any]] = [[0.0, None, None]]
+    at = 3.0
+    while at < plan["seconds"] - 4.0:
+        at = round(at * 20.0) / 20.0
+        phases += [[round(at - 0.01, 3), 0.0, 0.0], [round(at + 0.01, 3), None, None]]
+        plan["events"].append({
+            "at": round(at + dice.uniform(0.01, 0.5 / hz), 4), "do": "stall",
+            "for": round(min(0.95, pause_s * dice.uniform(0.8, 1.2)), 3),
+            "deaf": dice.choice((0.001, 0.004, 0.05)),
+        })  # fmt: skip
+        at += dice.uniform(4.0, 6.0)
+    first["phases"] = phases
+    plan["senders"] = [first, second]
+
+
+def _doubtful_holder(plan: Plan, dice: random.Random) -> None:
+    """Bring the stamps of a sender that holds the robot into doubt, while another one may move it.
+
+    The clock of the first sender is set, its delay falls, or the daemon stands still.
+    """
+    commands, best = plan["config"]["commands"], _best(plan)
+    best["timeout"] = dice.choice((0.25, 0.5))
+    first = _alone(plan, dice, [[0.0, 0.0, 0.0]])
+    first |= {
+        "way": dice.choice(("client", "signed", "rmw", "zenoh", "header")),
+        "hz": dice.choice((10.0, 20.0)), "delay": 0.001,
+    }  # fmt: skip
+    lower = dice.choice(commands["sources"])
+    second = _driver(plan, lower, way=dice.choice(("client", "plain", "signed")), hz=20.0)
+    second |= {"name": "s1", "id": f"s1/{dice.getrandbits(64):016x}", "from": 3.0}
+    rests_s = 3.5 + commands.get("neutral_pause", 1.0)
+    second["phases"] = [[3.0, 0.0, 0.0], [round(rests_s, 3), *_speed(dice)]]
+    at = rests_s + 3.0
+    while at < plan["seconds"] - 6.0:
+        at = round(at, 3)
+        match "fall" if first["way"] == "client" else dice.choice(("set", "set", "fall")):
+            case "set":
+                by_s = -dice.choice((0.3, 0.6, 3.0, 60.0)) * dice.uniform(0.9, 1.5)
+                first["clock"] = [*first["clock"], ["step", at, round(by_s, 3)]]
+            case _:
+                # A client that begins with this delay does not know the shorter one.
+                later = round(dice.uniform(0.06, 0.2), 3)
+                first["congestion"] = [
+                    *first["congestion"],
+                    [at, round(at + 4.0, 3), "jump", later],
+                ]
+        if dice.random() < 0.3:
+            lasts = round(dice.uniform(0.16, 0.6), 3)
+            plan["events"].append(
+                {"at": round(at + 6.0, 3), "do": "stall", "for": lasts, "deaf": 0.002}
+            )
+        at += dice.uniform(12.0, 18.0)
+    plan["senders"] = [first, second]
+
+
 MOMENTS: dict[str, tuple[float, Callable[[Plan], bool], Callable[[Plan, random.Random], None]]] = {
     "late step": (0.05, _any, _late_step),
     "half duplex": (0.12, _is_plain, _half_duplex),
@@ -481,6 +550,8 @@ MOMENTS: dict[str, tuple[float, Callable[[Plan], bool], Callable[[Plan, random.R
     "later and later": (0.02, _any, _later_and_later),
     "restart in a fault": (0.06, _without_check, _restart_in_fault),
     "behind a press": (0.04, _without_check, _behind_a_press),
+    "stall behind a zero": (0.03, _any, _stall_behind_a_zero),
+    "doubtful holder": (0.03, _any, _doubtful_holder),
 }
 """The share of the plans that have each moment, of those that can have it, whether a plan can have
 it, and what makes it."""

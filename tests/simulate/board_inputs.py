@@ -315,6 +315,9 @@ class Inputs:
         self._needed = ["bumpers"] * bool(self._places)
         self._needed += ["estop"] * (safety.get("estop") == "required")
         self._checked = "link_check" in config["mcu"]
+        self._powered = True
+        """Whether a fault of a motor driver certainly counts: no emergency stop was pressed since
+        the robot was last released. This outlasts a restart of the daemon."""
         self._field = b"volts" if config.get("battery", {}).get("measure") == "volts" else b"charge"
         self.new_life()
 
@@ -323,11 +326,6 @@ class Inputs:
         self.estop, self.bumpers, self.driver = _Input(), _Input(), _Input()
         self._driver_faulted = False
         """Whether a line of this step certainly reports a fault of a motor driver that counts."""
-        self._powered = True
-        """Whether the motor drivers certainly have had power since they were last reported sound.
-
-        After a press of the emergency stop, their power may come back later than the release.
-        """
         self._cut_ns: int | None = None
         """True time of a press that certainly has cut this power, or None."""
         self.battery = _Mean(self._witness.config.get("battery", {}))
@@ -464,9 +462,6 @@ class Inputs:
             driver.pressed_ns = true_ns
         self._witness.driver_fault |= faulty and not (estop.sure and estop.marks == b"X")
         free = not estop.marks or (estop.known and estop.marks == b".")
-        self._powered |= free and certain and not faulty
-        if not faulty:
-            self._cut_ns = None
         self._driver_faulted |= faulty and certain and free and self._powered
 
     def _silence(self, known: _Input, decided_ns: int, offset: int, calm_ns: int) -> None:
@@ -476,11 +471,9 @@ class Inputs:
         early = decided_ns < latest_ns + 2 * witness.period_ns + MARGIN_NS
         if early or not known.counted_ns:  # an input that never was reported is not silent
             known.silent = "maybe"
-            self._powered &= known is not self.estop
             self._doubt()
         elif known.silent != "surely":
             known.silent = "surely"
-            self._powered &= known is not self.estop
             # A pressed emergency stop that falls silent is no new press.
             if known is self.bumpers or b"X" not in known.marks:
                 self._press(known, reported_ns + SILENT_NS + offset, False)
@@ -587,8 +580,9 @@ class Inputs:
                 self._witness.counts["driver fault"] += 1
                 self._ramps(true_ns, "a fault of a motor driver")
         pressed |= self._cut_ns is not None and self._cut_ns < self._stepped_ns
-        if seen.mode in ("ready", "driving"):  # a clear ends the excuse
-            self._powered, self._cut_ns = True, None
+        if seen.mode not in STOPPED:  # a clear ends the excuse
+            self._cut_ns = None
+            self._powered |= seen.mode in ("ready", "driving")
         if began and pressed and self._mode:
             text = f"{seen.reason}, the emergency stop was pressed at {self._cut_ns} ns"
             raise BrokenError("drivers without power are no fault", true_ns, text)

@@ -33,6 +33,9 @@ FALL_NS = 5_000_000
 UNBROKEN_NS = NS
 """A longer silence begins a new run of even delays."""
 
+PLACE_NS = 5 * NS // 2
+"""A sender that goes on keeps the robot for this time, also while its stamps are in doubt."""
+
 KNOWN_NS = 240 * NS
 """The daemon knows a clock for this time at least."""
 
@@ -75,11 +78,6 @@ class Followed:
         """The lowest delay of each clock, and when the daemon last forgot all delays."""
         self._fell_ns: dict[str, int] = {}
         """When the lowest delay of each clock last fell clearly."""
-        self._learned: dict[str, tuple[int, int]] = {}
-        """The lowest delay of each clock that the daemon certainly believes, and when the daemon
-        last forgot all delays. A lower delay that did not last for a proof is not believed."""
-        self._below_ns: dict[str, int] = {}
-        """When a command of each clock last took clearly less time than the delay in `_learned`."""
         self._late_ns: dict[str, int] = {}
         """When a command of each adjusted clock last came later than its timeout allows. The daemon
         may have learned that delay, and a shorter one then looks like a clock that was set."""
@@ -93,14 +91,14 @@ class Followed:
         """The newest command of each sender that certainly counts."""
         self._holder: Command | None = None
         """The command that was followed in the last step."""
+        self._keeper: Command | None = None
+        """The last command that was followed of the sender that keeps the robot."""
+        self._going_ns = 0
+        """Arrival of the last command of that sender, followed or not. It was never silent."""
         self._zero_ns: dict[Who, int] = {}
         """When the newest zero of each sender was sent, of those that arrived."""
         self._before: dict[str, Command] = {}
         """The newest command of each adjusted clock that was followed."""
-        self._adjusted: set[Who] = set()
-        """Identities under which a sender with an adjusted clock has sent, or several programs, one
-        of which was delayed so that its clock seemed adjusted. Several programs may share an
-        identity, and each must send a zero when the clock of one was set."""
         self._armed_since_ns = witness.armed_since_ns
         self._mode = ""
         self._decided_ns = 0
@@ -125,13 +123,22 @@ class Followed:
         found = Command(at_ns, wish.arrived_ns, who, sender, message, sample.clock, wish.v, wish.w)
         if not (wish.v or wish.w or message.junk):
             self._zero_ns[who] = max(message.sent_ns, self._zero_ns.get(who, 0))
-        if found.clock and sender["way"] in FOREIGN and not stable(sender):
-            self._adjusted.add(who)
+        if self._keeper is not None and self._keeper.who == who:
+            self._go_on(at_ns)
         self._arrived[at_ns] = None if at_ns in self._arrived else found
         if len(self._arrived) > KEPT:
             del self._arrived[next(iter(self._arrived))]
         if self._certain(found, sample, wish):
             self._waiting[who] = found
+
+    def _go_on(self, at_ns: int) -> None:
+        """Note a command of the sender that keeps the robot, unless it was silent before."""
+        assert self._keeper is not None
+        timeout_ns = self._witness.timeout[self._keeper.who[0]]
+        if at_ns - self._going_ns < timeout_ns - self._witness.period_ns:
+            self._going_ns = max(self._going_ns, at_ns)
+        else:
+            self._keeper = None
 
     def _certain(self, found: Command, sample: Sample, wish: Wish) -> bool:
         """Return whether the daemon certainly accepts this command."""
@@ -174,26 +181,10 @@ class Followed:
         proof_ns = 3 * NS + 2 * min(timeout_ns, 2 * NS)
         if sender["way"] in FOREIGN and age - least > timeout_ns - FALL_NS:
             self._late_ns[sample.clock] = at_ns
-            if sample.shared:
-                self._adjusted.add(found.who)
-        if age < self._lowest_learned(sample.clock, age) - FALL_NS:
-            self._below_ns[sample.clock] = at_ns
         proven = run.followed or (not sender.get("jitter") and at_ns - run.begun_ns > proof_ns)
-        if proven:
-            self._learn(sample.clock, age)
         proven &= at_ns - self._fell_ns.get(sample.clock, -NS) >= NS
         proven &= at_ns - self._late_ns.get(sample.clock, -proof_ns) >= proof_ns
         return proven and age <= least + EVEN_NS and message.number > newest
-
-    def _lowest_learned(self, clock: str, default: int) -> int:
-        """Return the lowest delay of this clock that the daemon certainly believes."""
-        learned_ns, lowest = self._learned.get(clock, (0, default))
-        return lowest if learned_ns == self._witness.ages.learned_ns else default
-
-    def _learn(self, clock: str, age: int) -> None:
-        """Note that the daemon has accepted a command with this delay."""
-        lowest = min(age, self._lowest_learned(clock, age))
-        self._learned[clock] = self._witness.ages.learned_ns, lowest
 
     @property
     def wish(self) -> tuple[float, float] | None:
@@ -208,7 +199,7 @@ class Followed:
     def forget(self) -> None:
         """Note that the daemon may have forgotten all commands."""
         self._sure.clear()
-        self._holder = None
+        self._holder = self._keeper = None
 
     def step(
         self, true_ns: int, decided_ns: int, followed_ns: int | None, mode: str, link: str
@@ -236,27 +227,38 @@ class Followed:
             if found.clock in self._runs:
                 run = self._runs[found.clock]
                 run.followed |= found.true_ns >= run.begun_ns
-                if found.true_ns >= witness.ages.learned_ns:
-                    self._learn(found.clock, found.true_ns - found.message.sent_ns)
         # A step may follow a command and forget it: a call that releases the robot comes later.
         self._holder = None if disarmed else found
+        if disarmed:
+            self._keeper = None
 
     def _first_keeps(self, true_ns: int, decided_ns: int, found: Command) -> None:
-        """The robot leaves a sender that is not silent only for a source of higher priority."""
-        holder, witness = self._holder, self._witness
-        if holder is None or holder.who == found.who:
-            return
-        priority = witness.priority
-        left_ns = witness.timeout[holder.who[0]] - (decided_ns - holder.arrived_ns)
-        if priority[found.who[0]] <= priority[holder.who[0]] and left_ns > witness.period_ns:
-            fell_ns = max(times.get(holder.clock, -1) for times in (self._fell_ns, self._below_ns))
-            foreign = holder.sender["way"] in FOREIGN
-            if holder.who in self._adjusted or (foreign and fell_ns >= holder.true_ns):
-                return  # it was set, or looks so behind a congestion: it must send a zero again
-            raise BrokenError(
-                "the first of equal priority keeps the robot", true_ns,
-                f"{found.who} is followed, {holder.who} was, {left_ns / NS:.3f} s before its end",
-            )  # fmt: skip
+        """The robot leaves a sender that is not silent only for a source of higher priority.
+
+        The daemon may refuse that sender meanwhile, for example because its clock was set.
+        """
+        keeper, witness = self._keeper, self._witness
+        if keeper is None or keeper.who != found.who:
+            if keeper is not None and self._is_kept(keeper, decided_ns):
+                priority = witness.priority
+                if priority[found.who[0]] <= priority[keeper.who[0]]:
+                    raise BrokenError(
+                        "the first of equal priority keeps the robot", true_ns,
+                        f"{found.who} is followed, {keeper.who} goes on, and was followed "
+                        f"{(decided_ns - keeper.arrived_ns) / NS:.3f} s ago",
+                    )  # fmt: skip
+            self._going_ns = found.arrived_ns
+        self._keeper, self._going_ns = found, max(self._going_ns, found.arrived_ns)
+
+    def _is_kept(self, keeper: Command, decided_ns: int) -> bool:
+        """Return whether the sender that was followed certainly keeps the robot."""
+        witness, source = self._witness, keeper.who[0]
+        return (
+            decided_ns - self._going_ns < witness.timeout[source] - witness.period_ns
+            and decided_ns - keeper.arrived_ns < max(PLACE_NS, witness.timeout[source] // 2)
+            and keeper.true_ns > witness.disarmed_ns
+            and source not in witness.churned
+        )
 
     def _highest_wins(self, true_ns: int, decided_ns: int, found: Command) -> None:
         witness = self._witness

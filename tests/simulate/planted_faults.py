@@ -21,6 +21,9 @@ class Edit(NamedTuple):
 PLANS_OF_FAULT = {
     "estop": "estop", "away": "away", "battery": "battery", "driver": "driver_fault",
     "moment": "late step", "robot set": "late step",
+    "neutral stall": "stall behind a zero", "neutral place": "doubtful holder",
+    "neutral set": "doubtful holder", "driver release": "behind a press",
+    "wheel press": "behind a press",
     "freshness halves": "backlogs of newcomers", "freshness budget": "later and later",
 }  # fmt: skip
 """Kinds of plans by the name of a fault, or by the first word of its name."""
@@ -175,8 +178,8 @@ FAULTS = (
         "arbiter arming",
         "a sender drives without having sent a zero",
         ARBITER,
-        "        if not sender.armed(now_ns):\n            wait =",
-        "        if False:\n            wait =",
+        "        if not (armed and sender.live(now_ns)):\n",
+        "        if not sender.live(now_ns):\n",
     ),
     fault(
         "arbiter stale",
@@ -189,8 +192,8 @@ FAULTS = (
         "arbiter proof",
         "the commands of a sender that is new count at once",
         ARBITER,
-        "sender.take(command, self._since_ns, verdict)",
-        "sender.take(command, self._since_ns)",
+        "sender.take(command, self._since_ns, verdict, self._watched_ns)",
+        'sender.take(command, self._since_ns, "fresh", self._watched_ns)',
     ),
     fault(
         "arbiter senders",
@@ -202,9 +205,9 @@ FAULTS = (
     fault(
         "arbiter timeout",
         "a command never times out",
-        ARBITER,
-        "[sender for sender in self.senders.values() if sender.live(now_ns)]",
-        "[sender for sender in self.senders.values() if sender.arrived_ns is not None]",
+        NEUTRAL,
+        "return self.arrived_ns is not None and now_ns - self.arrived_ns <= self._timeout_ns",
+        "return self.arrived_ns is not None",
     ),
     fault(
         "arbiter notice",
@@ -217,9 +220,9 @@ FAULTS = (
         "arbiter equal",
         "of two sources of equal priority the last that came takes the robot",
         ARBITER,
-        "live[0].came_ns < first[1].came_ns",
-        "live[0].came_ns > first[1].came_ns",
-        Edit(ARBITER, "and kept in live\n", "and False\n"),
+        "present[0].rank(now_ns) < first[1].rank(now_ns)",
+        "present[0].rank(now_ns) > first[1].rank(now_ns)",
+        Edit(ARBITER, "and kept in present\n", "and False\n"),
     ),
     fault(
         "arbiter keeps",
@@ -247,8 +250,8 @@ FAULTS = (
         "neutral again",
         "a sender stays armed when arming is asked for",
         NEUTRAL,
-        "self._armed = self._proven_armed = not self._neutral_first\n\n    def unlearn",
-        "self._proven_armed = not self._neutral_first\n\n    def unlearn",
+        "self._armed = self._proven_armed = not self._neutral_first\n\n    def disarm",
+        "self._proven_armed = not self._neutral_first\n\n    def disarm",
     ),
     fault(
         "neutral timeout",
@@ -296,10 +299,31 @@ FAULTS = (
         "neutral newest",
         "a newer command counts only when half of the timeout is over",
         NEUTRAL,
-        "        self.twist, self.arrived_ns, self._doubted_ns",
-        "        if live and now_ns - (self.arrived_ns or 0) < self._timeout_ns // 2:\n"
+        "        self.twist, self._doubted_ns = command.twist, None\n",
+        "        if present and now_ns - (self.arrived_ns or 0) < self._timeout_ns // 2:\n"
         "            return\n"
-        "        self.twist, self.arrived_ns, self._doubted_ns",
+        "        self.twist, self._doubted_ns = command.twist, None\n",
+    ),
+    fault(
+        "neutral stall",
+        "a stall of the daemon counts as the pause after a zero",
+        ARBITER,
+        "                    sender.resume(before_ns, now_ns)",
+        "                    pass",
+    ),
+    fault(
+        "neutral place",
+        "a sender whose stamps are in doubt loses the robot",
+        NEUTRAL,
+        "            and now_ns - self._present_ns <= self._timeout_ns\n",
+        "            and False\n",
+    ),
+    fault(
+        "neutral set",
+        "a sender with a shared identity whose clock was set loses the robot to an equal one",
+        NEUTRAL,
+        "and (just_set or self.armed(now_ns))",
+        "and self.armed(now_ns)",
     ),
     fault(
         "neutral gap",
@@ -772,6 +796,20 @@ FAULTS = (
         ROBOT,
         "        if estop.driver_fault:\n",
         "        if any(status.driver_fault for _, status in statuses):\n",
+    ),
+    fault(
+        "driver release",
+        "drivers that get their power later than the release latch a fault",
+        EMERGENCY_STOP,
+        "not (pressed or self._unpowered)",
+        "not pressed",
+    ),
+    fault(
+        "wheel press",
+        "a wheel that rested during a press and is then turned by hand is a runaway",
+        WITNESS,
+        "self.driven = self.driven and abs(seen) > SLACK",
+        "self.driven = self.driven",
     ),
     fault(
         "driver cut",

@@ -10,6 +10,7 @@ Times are true ns from the start. A suspended robot's own clock stands, the true
 
 from __future__ import annotations
 
+import itertools
 import re
 from bisect import bisect_right
 from collections import Counter, deque
@@ -274,7 +275,9 @@ class Witness:
         if zero and not sample.shared:
             known.armed_ns = arrived_ns
         elif zero:
-            known.zeros.append(arrived_ns)
+            begun_ns, ended_ns = self._stalled
+            stalled = begun_ns <= arrived_ns < ended_ns and ended_ns - begun_ns > LATE_NS
+            known.zeros.append((ended_ns if stalled else arrived_ns, arrived_ns))
             del known.zeros[:-4000]
         elif sample.shared:
             self._cancel_zeros(source, arrived_ns)
@@ -309,9 +312,9 @@ class Witness:
 
     def _arm(self, known: Sender, now_ns: int) -> None:
         """Arm a shared identity by the latest zero that the pause has passed behind."""
-        place = bisect_right(known.zeros, now_ns - self.pause_ns)
+        place = bisect_right(known.zeros, (now_ns - self.pause_ns, now_ns))
         if place:
-            known.armed_ns = max(known.armed_ns, known.zeros[place - 1])
+            known.armed_ns = max(known.armed_ns, known.zeros[place - 1][1])
 
     def arming(self, at_ns: int) -> None:
         """Note an event after which every sender must send a zero."""
@@ -584,7 +587,15 @@ class Witness:
             self._turned_ns = at_ns
 
     def stalls(self, begun_ns: int, ended_ns: int) -> None:
-        """Note a stall of the host. The steps behind it read the bytes that came meanwhile."""
+        """Note a stall of the host. The steps behind it read the bytes that came meanwhile.
+
+        The daemon sees no speed while it stands still, so that time is no part of a pause.
+        """
+        lasts_ns = ended_ns - begun_ns
+        if lasts_ns > LATE_NS:
+            for known in itertools.chain.from_iterable(self._sharing.values()):
+                self._arm(known, begun_ns)
+                known.zeros = [(ns + lasts_ns, arrived_ns) for ns, arrived_ns in known.zeros]
         before = self._stalled
         if begun_ns <= before[1]:
             begun_ns, ended_ns = before[0], max(before[1], ended_ns)

@@ -113,7 +113,7 @@ class _Source:
         if sender is None or (command.source != self.name and command.clock != sender.clock):
             return
         if was_set:
-            sender.require_neutral()
+            sender.disarm(command.arrived_ns)
         else:
             sender.unlearn()
 
@@ -152,10 +152,22 @@ class _Source:
         return self.why(max(doubtful, key=lambda sender: sender.noticed_ns), now_ns)
 
     def why(self, sender: Sender, now_ns: int) -> Wait:
-        """Return why the robot does not follow this sender, whose last stamp is in doubt."""
+        """Return why the robot does not follow this sender, which is not live."""
+        if not sender.doubtful(now_ns):
+            return COMMAND
         if sender.doubt == "stale":
             return self.late
         return self.proof if sender.armed(now_ns) else self.neutral(sender)
+
+    def obstacle(self, sender: Sender, now_ns: int, lasting: bool = True) -> Wait:
+        """Return why this sender, which keeps its place, cannot drive the robot.
+
+        If `lasting`, a sender that must send a zero is told for how long it has sent speeds.
+        """
+        if not sender.live(now_ns):
+            return self.why(sender, now_ns)
+        since_ns = sender.speeds_ns if lasting else None
+        return self.neutral(sender, 0.0 if since_ns is None else _lasts(now_ns - since_ns))
 
 
 class Arbiter:
@@ -196,15 +208,15 @@ class Arbiter:
     def begin(self, now_ns: int) -> None:
         """Begin a step at this monotonic time, before its commands.
 
-        If the daemon stood still since the last step, `commands.neutral_pause` begins again: the
-        bus may not have delivered yet what arrived meanwhile.
+        If the daemon stood still since the last step, the bus may not have delivered yet what
+        arrived meanwhile. Each sender keeps its place, and `commands.neutral_pause` takes longer.
         """
         before_ns, self._begun_ns = self._begun_ns, now_ns
         if now_ns - before_ns > STALL_NS:
             self._watched_ns = now_ns
             for source in self._ranking:
                 for sender in source.senders.values():
-                    sender.restart_pause(before_ns, now_ns)
+                    sender.resume(before_ns, now_ns)
 
     def accept(self, command: Command) -> Objection:
         """Accept a command and return "", or return the reason to refuse it."""
@@ -265,7 +277,7 @@ class Arbiter:
                 kept is not None
                 and kept in present
                 and source.priority == first[0].priority
-                and kept.armed(now_ns)
+                and kept.holds(now_ns)
             ):
                 # A sender that came before `kept` may have become armed just now. The robot still
                 # follows `kept`.
@@ -278,13 +290,10 @@ class Arbiter:
                     return Choice(wait=wait)
             return IDLE
         source, sender = first
-        self._holder, self._followed = source, None
-        if not sender.armed(now_ns):
-            wait = source.neutral(sender, _lasts(now_ns - sender.came_ns))
-            return Choice(source.name, None, wait, sender=sender.name)
-        self._followed = sender
-        if not sender.live(now_ns):
-            return Choice(source.name, None, source.why(sender, now_ns), sender=sender.name)
+        armed = sender.armed(now_ns)
+        self._holder, self._followed = source, sender if armed or sender is kept else None
+        if not (armed and sender.live(now_ns)):
+            return Choice(source.name, None, source.obstacle(sender, now_ns), sender=sender.name)
         wait = NOTHING
         if sender.zeros_ns is not None and (lasts := _lasts(now_ns - sender.zeros_ns)):
             wait = Wait("zeros", source.name, lasts=lasts, kept=self._kept(source, now_ns))
@@ -321,10 +330,8 @@ class Arbiter:
         if not present:
             return source.doubted(now_ns) or COMMAND
         first = self._followed if source is holder and self._followed else present[0]
-        if not first.armed(now_ns):
-            return source.neutral(first)
-        if not first.live(now_ns):
-            return source.why(first, now_ns)
+        if not (first.armed(now_ns) and first.live(now_ns)):
+            return source.obstacle(first, now_ns, lasting=False)
         if holder is None or source is holder:
             return Wait("senders", senders=len(present) - 1) if len(present) > 1 else NOTHING
         return Wait("equal" if holder.priority == source.priority else "higher", holder.name)

@@ -175,16 +175,17 @@ class EmergencyStop(BoardInput):
 
     silent, events = SILENT, ("emergency_stop", "emergency_stop_released")
 
-    def __init__(self, use: EstopUse) -> None:
+    def __init__(self, use: EstopUse, unpowered: bool = False) -> None:
         super().__init__(use)
         self.driver_fault = False
-        """Whether a line of the last `look` reports a fault of a motor driver that counts.
+        """Whether a line of the last `look` reports a fault of a motor driver that counts."""
+        self._unpowered = unpowered
+        """Whether the emergency stop was pressed since the robot was last released.
 
         The emergency stop cuts the power of the drivers, and a driver without power reports a
-        fault. The power may come back later than the release. Therefore no fault counts from a
-        press until a line reports sound drivers after the release, or until `powered`.
+        fault. The power may come back later than the release. Therefore no fault of a driver counts
+        until the stop is released with `clear`, which is refused while a driver reports a fault.
         """
-        self._unpowered = False
 
     def look(self, reports: Sequence[tuple[int, BoardStatus]], now_ns: int) -> list[Event]:
         """Process the status lines since the last step, and return the events of the changes.
@@ -192,21 +193,19 @@ class EmergencyStop(BoardInput):
         Each item of `reports` is the monotonic time of arrival, ns, and the status line.
         """
         self.driver_fault, pressed = False, bool(self.why)
+        self._unpowered |= self.state == "pressed"
         for _, status in reports:
             if self.use != "off" and status.estop is not None:
                 pressed = status.estop
-            if pressed:
-                self._unpowered = True
-            elif status.driver_fault is False:
-                self._unpowered = False
-            self.driver_fault |= bool(status.driver_fault) and not self._unpowered
+                self._unpowered |= pressed
+            self.driver_fault |= bool(status.driver_fault) and not (pressed or self._unpowered)
         events = super().look(reports, now_ns)
         if self.why:
-            self.driver_fault, self._unpowered = False, True
+            self.driver_fault = False
         return events
 
     def powered(self) -> None:
-        """Record that the stop was released. From now on, each fault of a driver counts."""
+        """Record that no stop is latched any more. From now on, each fault of a driver counts."""
         self._unpowered = False
 
     def read(self, status: BoardStatus) -> tuple[bool, ...] | None:

@@ -182,6 +182,9 @@ class _Clock:
         self.gap_ns = GAP_NS
         """Longest silence that is not a pause, ns: `GAP_NS`, or the longest timeout of the sources
         that the sender has commanded."""
+        self._short_ns = KEEP_NS
+        """Shortest timeout, ns, of the sources that the clock's senders have commanded. A command
+        is on time if it is late by at most this."""
         self.forgiven_ns = 0
         """Part of the last trusted rise of the delay that no adjustment of stamps explains, ns."""
         self._stamp_ns = 0
@@ -221,6 +224,7 @@ class _Clock:
         silence, departed = at_ns - self.at_ns, stamp_ns - self._stamp_ns
         number = -1 if command.sequence is None else command.sequence
         self.gap_ns = max(self.gap_ns, timeout_ns)
+        self._short_ns = min(self._short_ns, timeout_ns)
         if self._repeats(stamp_ns, number, silence):
             return "stale"
         if silence > FORGET_NS and departed > FORGET_NS:
@@ -297,7 +301,8 @@ class _Clock:
         if proof is not None and silence <= self.gap_ns:
             sign = proof.add(delay, at_ns, timeout_ns)
             if sign == "proven":
-                return self._believe(proof, "fresh")
+                self._believe(proof)
+                return "fresh"
             if sign == "open":
                 return "unproven"
         needed_ns = min(timeout_ns, LONGEST_PROOF_NS)
@@ -309,30 +314,38 @@ class _Clock:
     ) -> Verdict:
         late = delay - self._least
         early = max(0, self._early - silence // CREEP) + max(0, -late)
-        if late <= timeout_ns and early <= EARLY_NS:
+        fresh = late <= timeout_ns and early <= EARLY_NS
+        if fresh and late <= self._short_ns:
             self._proof, self._early = None, early
             self._least = min(self._least, delay)
             self._forget_adjustments()
             return "fresh"
+        if fresh and (steady or self._proof is None):
+            return "fresh"
         if steady:  # the known minimum was that of a backlog
             self.state, self._proof = "new", None
             return self._prove(delay, at_ns, silence, timeout_ns)
+        # If the command is fresh for its own source, it only helps to prove the clock for another
+        # source, which has a shorter timeout.
+        otherwise: Verdict = "fresh" if fresh else "stale"
         proof, needed_ns, share = self._proof, min(timeout_ns, LONGEST_PROOF_NS), CREPT
         if proof is None:
             self._accrue(at_ns, FORGIVE_NS)
         elif silence <= self.gap_ns:
-            sign = proof.add(delay, at_ns, timeout_ns)
-            if sign == "open":
-                return "stale"
+            sign = proof.add(delay, at_ns, self._short_ns if fresh else timeout_ns)
+            if sign == "open" or (sign == "proven" and not self._forgive(proof, at_ns)):
+                return otherwise
             if sign == "proven":
-                return self._forgive(proof, at_ns)
-        if proof or abs(delay - self._delay) > silence // CREEP + JITTER_NS:
+                return "set"
+        jumped = abs(delay - self._delay) > silence // CREEP + JITTER_NS
+        # A command of another source, with a longer timeout, may have shown the jump before.
+        if proof or jumped or self._delay - self._least > timeout_ns:
             needed_ns, share = max(needed_ns, JUMP_PROOF_NS), EVEN
         self._proof = _Proof(delay, at_ns, needed_ns, share, again=True)
-        return "stale"
+        return otherwise
 
-    def _forgive(self, proof: _Proof, at_ns: int) -> Verdict:
-        """Trust the proven delay if that is allowed, and return the verdict.
+    def _forgive(self, proof: _Proof, at_ns: int) -> bool:
+        """Trust the proven delay if that is allowed, and return whether it is.
 
         A rise of the delay is allowed after a pause of the sender, after an adjustment that stamps
         have shown, or within the budget.
@@ -342,10 +355,11 @@ class _Clock:
         if self._before is not None:
             hidden = min(hidden, max(self._before - self._least, hidden - self._shown))
         if hidden > self._budget and not self._paused:
-            return "stale"
+            return False
         self.forgiven_ns = max(0, hidden)
         self._budget = max(0, min(self._budget, FORGIVE_NS) - self.forgiven_ns)
-        return self._believe(proof, "set")
+        self._believe(proof)
+        return True
 
     def _accrue(self, at_ns: int, most_ns: int) -> None:
         """Refill the budget for the time since the last call, up to `most_ns`."""
@@ -355,11 +369,10 @@ class _Clock:
     def _forget_adjustments(self) -> None:
         self._before, self._shown, self._doubted, self._paused = None, 0, None, False
 
-    def _believe(self, proof: _Proof, verdict: Verdict) -> Verdict:
+    def _believe(self, proof: _Proof) -> None:
         self.state, self._least, self._proof = "known", proof.least, None
         self._early = 0
         self._forget_adjustments()
-        return verdict
 
 
 class Freshness:

@@ -9,7 +9,7 @@ does not. The sender stays armed until `require_neutral` or `unlearn` is called.
   no speed of any shared identity of the source follows for `commands.neutral_pause`. Further zeros
   and silence do not restart this time. Without the pause, the zero of one program would arm another
   program that never stopped.
-- While the daemon stands still, it sees no speed. Therefore a stall begins the pause again.
+- While the daemon stands still, it sees no speed. Therefore a stall does not count as a pause.
 - One program without a sender id may have several shared identities in turn, because its identity
   depends on the Zenoh session that stamps its commands. Therefore a speed of one identity cancels
   the zeros of all.
@@ -26,8 +26,12 @@ from acsard.core.values import REST, Command
 
 PLACE_NS = LONGEST_PROOF_NS * 3 // 2
 """Longest time for which a sender keeps its place without an accepted command, ns, if its commands
-go on but their stamps are in doubt. A longest proof that restarts with its second half ends within
-this time."""
+go on but their stamps are in doubt, and then for which it keeps its place without being armed. A
+longest proof that restarts with its second half ends within this time."""
+
+GRACE_NS = 100_000_000
+"""Shortest rest of `commands.neutral_pause` after a stall of the daemon, ns. In this time the bus
+delivers what arrived during the stall."""
 
 
 class Sender:
@@ -47,6 +51,11 @@ class Sender:
         self.name = ""
         self._stamp_ns: int | None = None
         """Stamp of the last accepted command, ns, or None."""
+        self._number: int | None = None
+        """Sequence number of the last accepted command, or None."""
+        self._ended: Command | None = None
+        """The last zero in doubt that ended a speed, or None. A speed that this zero has overtaken
+        on its way must not begin again."""
         self.clock = ""
         """Name of the clock that stamped the last command that was not refused."""
         self.twist = REST
@@ -58,6 +67,10 @@ class Sender:
         """Arrival of the command that ended the sender's last silence, monotonic ns."""
         self.zeros_ns: int | None = None
         """Arrival of the first zero since the last speed or silence, monotonic ns, or None."""
+        self.speeds_ns: int | None = None
+        """Arrival of the first speed since the last zero or silence, monotonic ns, or None."""
+        self.disarmed_ns: int | None = None
+        """Monotonic time of the last `disarm`, ns, or None."""
         self.ros = False
         """Whether the last command came from ROS, whose tools send no zero by themselves."""
         self.shared = False
@@ -106,20 +119,35 @@ class Sender:
         self.arrived_ns = self._zero_ns = self._proven_zero_ns = None
         self._armed = self._proven_armed = not self._neutral_first
 
+    def disarm(self, now_ns: int) -> None:
+        """Require a zero again because the sender's clock was set. The sender keeps its place."""
+        self._zero_ns = self._proven_zero_ns = None
+        self._armed = self._proven_armed = not self._neutral_first
+        self.disarmed_ns = now_ns
+
+    def holds(self, now_ns: int) -> bool:
+        """Return whether the sender may keep a robot that it controls."""
+        just_set = self.disarmed_ns is not None and now_ns - self.disarmed_ns <= PLACE_NS
+        return self.present(now_ns) and (just_set or self.armed(now_ns))
+
     def unlearn(self) -> None:
         """Undo the effect of zeros with unproven stamps, which the network may have delayed."""
         self._armed, self._zero_ns = self._proven_armed, self._proven_zero_ns
 
-    def restart_pause(self, before_ns: int, now_ns: int) -> None:
-        """Let `commands.neutral_pause` run again from `now_ns` if it was not over at `before_ns`.
+    def resume(self, before_ns: int, now_ns: int) -> None:
+        """Continue after the daemon stood still between these monotonic times.
 
-        The daemon stood still between these monotonic times, and has not processed the commands
-        that arrived meanwhile.
+        The commands that arrived meanwhile may come after this step. Therefore the sender keeps its
+        place for one timeout more, and the stall does not count as `commands.neutral_pause`.
         """
+        if self.present(before_ns):
+            self._present_ns = now_ns
         self._settle(before_ns)
         if not self._armed and self._zero_ns is not None:
+            rest_ns = max(self._zero_ns + self._pause_ns - before_ns, GRACE_NS)
             proven = self._proven_zero_ns is not None
-            self._zero_ns, self._proven_zero_ns = now_ns, now_ns if proven else None
+            self._zero_ns = now_ns + rest_ns - self._pause_ns
+            self._proven_zero_ns = self._zero_ns if proven else None
 
     def cancel_zero(self, at_ns: int) -> None:
         """Record that a program with a shared identity may have sent a speed at `at_ns`.
@@ -167,22 +195,45 @@ class Sender:
         present = self.present(now_ns)
         if not present:
             self.came_ns = now_ns
-        if not zero:
-            self.zeros_ns = None
-        elif self.zeros_ns is None or not present:
-            self.zeros_ns = now_ns
+        self._tell_apart(zero, now_ns, present)
         self.ros, self.name = command.ros, command.sender
         self.twist, self._doubted_ns = command.twist, None
         self.arrived_ns = self._present_ns = now_ns
-        self._stamp_ns = command.stamp_ns
+        self._stamp_ns, self._number = command.stamp_ns, command.sequence
+        if self._ended is not None:
+            if self._overtaken(command, self._ended):
+                self.twist = REST
+            else:
+                self._ended = None
+
+    def _tell_apart(self, zero: bool, now_ns: int, present: bool) -> None:
+        """Record since when the sender has sent only zeros, or only speeds."""
+        since_ns = self.zeros_ns if zero else self.speeds_ns
+        if since_ns is None or not present:
+            since_ns = now_ns
+        self.zeros_ns, self.speeds_ns = (since_ns, None) if zero else (None, since_ns)
+
+    def _overtaken(self, command: Command, zero: Command) -> bool:
+        """Return whether this command was sent before `zero` but arrived after it."""
+        return (
+            command.stamp_ns is not None
+            and zero.stamp_ns is not None
+            and command.clock == zero.clock
+            and command.stamp_ns < zero.stamp_ns
+            # A clock that was set back meanwhile must not keep the robot at rest for longer.
+            and command.arrived_ns - zero.arrived_ns <= self._timeout_ns
+        )
 
     def _doubt(self, command: Command, why: Verdict) -> None:
-        stamp_ns, last_ns = command.stamp_ns, self._stamp_ns
-        if is_zero(command) and stamp_ns and last_ns and stamp_ns > last_ns:
+        if is_zero(command) and (
+            _later(command.stamp_ns, self._stamp_ns) or _later(command.sequence, self._number)
+        ):
             # The sender stopped wishing for its last speed, however late this zero may be.
-            self.twist = REST
-        if self.present(command.arrived_ns):
+            self.twist, self._ended = REST, command
+        present = self.present(command.arrived_ns)
+        if present:
             self._present_ns = command.arrived_ns
+        self._tell_apart(is_zero(command), command.arrived_ns, present)
         self._doubted_ns, self.doubt, self.ros = command.arrived_ns, why, command.ros
 
     def _settle(self, now_ns: int) -> None:
@@ -191,6 +242,11 @@ class Sender:
             self._armed = True
             if self._proven_zero_ns == self._zero_ns:
                 self._proven_armed = True
+
+
+def _later(mark: int | None, last: int | None) -> bool:
+    """Return whether a stamp or number is higher than the last one, if there are both."""
+    return mark is not None and last is not None and mark > last
 
 
 def is_zero(command: Command) -> bool:

@@ -114,6 +114,13 @@ class Witness:
         """Whether the wheel was too fast, stood, or turned against its command in the last line."""
         self._seconds = self._went = self._way = 0.0
 
+    def coast(self, seen: float) -> None:
+        """Look at the speed of a wheel, rad/s, whose motor may have no power.
+
+        If it comes to rest, nothing but a push can turn it until the next command.
+        """
+        self.driven = self.driven and abs(seen) > SLACK
+
     def look(
         self, seen: float, expected: Expected, dt: float, most: float, count: float, still: bool
     ) -> bool:

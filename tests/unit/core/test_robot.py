@@ -202,8 +202,13 @@ OK_LINE, PRESSED_LINE = b"!status estop=ok\r\n", b"!status estop=pressed\r\n"
 class Button(Bench):
     """A bench whose board also sends a status line in each step."""
 
-    def __init__(self, status: bytes = OK_LINE, config: Config | None = None) -> None:
-        super().__init__(config)
+    def __init__(
+        self,
+        status: bytes = OK_LINE,
+        config: Config | None = None,
+        latches: Latches = Latches(),  # noqa: B008
+    ) -> None:
+        super().__init__(config, latches=latches)
         self.status(status)
 
     def status(self, line: bytes) -> Button:
@@ -616,13 +621,14 @@ def test_a_driver_without_power_behind_the_emergency_stop_is_no_fault() -> None:
         (False, (PRESSED_LINE, OK_LINE, DRIVER_FAULT, DRIVER_OK), "stopped"),
         (True, (OK_LINE, DRIVER_FAULT, DRIVER_OK), "stopped"),
         (True, (b"!status estop=ok driver=fault\r\n", DRIVER_OK), "stopped"),
-        (False, (PRESSED_LINE, OK_LINE, DRIVER_OK, DRIVER_FAULT), "fault"),
-        (True, (OK_LINE, DRIVER_OK, DRIVER_FAULT), "fault"),
-        (True, (b"!status estop=ok driver=ok\r\n", DRIVER_FAULT), "fault"),
+        (False, (PRESSED_LINE, OK_LINE, DRIVER_OK, DRIVER_FAULT), "stopped"),
+        (True, (OK_LINE, DRIVER_OK, DRIVER_FAULT), "stopped"),
+        (True, (b"!status estop=ok driver=ok\r\n", DRIVER_FAULT), "stopped"),
         (False, (DRIVER_FAULT, PRESSED_LINE, OK_LINE, DRIVER_OK), "fault"),
+        (False, (DRIVER_FAULT, OK_LINE, DRIVER_OK), "fault"),
     ],
 )  # fmt: skip
-def test_a_driver_fault_counts_if_no_press_was_before_the_last_report_of_sound_drivers(
+def test_a_driver_fault_counts_if_it_was_reported_before_the_press(
     pressed_before: bool, lines: tuple[bytes, ...], mode: str
 ) -> None:
     bench = Button(OK_LINE + DRIVER_OK)
@@ -632,16 +638,35 @@ def test_a_driver_fault_counts_if_no_press_was_before_the_last_report_of_sound_d
     assert bench.status(b"".join(lines)).step().mode == mode
 
 
-def test_drivers_that_lack_power_after_a_press_hold_the_stop_until_they_are_sound() -> None:
+@each("restarted", [False, True])
+def test_drivers_that_lack_power_after_a_press_hold_the_stop_until_they_are_sound(
+    restarted: bool,
+) -> None:
     bench = Button(OK_LINE + DRIVER_OK)
     bench.linked()
     bench.status(PRESSED_LINE).step()
-    bench.status(OK_LINE + DRIVER_FAULT).step()
+    if restarted:
+        latches = bench.out.latches.after_restart()
+        bench = Button(OK_LINE + DRIVER_FAULT, latches=latches)
+        bench.linked()
+    bench.status(OK_LINE + DRIVER_OK).step()
+    assert bench.status(OK_LINE + DRIVER_FAULT).step().mode == "stopped"
     refused = bench.answer("clear")
     assert not refused.success
     assert "motor driver" in refused.message
     bench.status(OK_LINE + DRIVER_OK).step()
     assert bench.answer("clear").success
+    assert bench.status(OK_LINE + DRIVER_FAULT).step().mode == "fault"
+
+
+def test_a_driver_fault_after_a_silence_of_the_button_counts() -> None:
+    bench = Button(OK_LINE + DRIVER_OK)
+    bench.linked()
+    bench.status(b"")
+    for _ in range(60):
+        bench.step()
+    assert bench.mode() == "stopped"
+    bench.status(OK_LINE).step()
     assert bench.status(OK_LINE + DRIVER_FAULT).step().mode == "fault"
 
 

@@ -360,6 +360,65 @@ def test_behind_a_bridge_doubt_about_one_clock_disarms_no_program_with_another_c
     assert bench.choice().twist == GO
 
 
+@each("other", [LEFT, RIGHT])
+def test_a_shared_sender_whose_clock_was_set_keeps_the_robot_through_its_pause(
+    other: Source,
+) -> None:
+    bench = Bench(LEFT, RIGHT, armed=False)
+    bench.send(other, REST, "b")
+    for at in range(200):
+        bench.wait(50).stamped(LEFT, 300.0 * (at >= 80), "clock", REST, "a", shared=True)
+        if at >= 70:
+            bench.send(other, REST if at == 70 else GO, "b")
+        if at >= 60:
+            assert bench.choice().sender == "a"
+    assert bench.choice().twist == REST
+
+
+@each("other", [LEFT, RIGHT])
+def test_a_stall_of_the_daemon_takes_the_robot_from_no_sender(other: Source) -> None:
+    bench = Bench(LEFT, RIGHT, armed=False)
+    for at in range(100):
+        bench.arbiter.begin(bench.now_ns)
+        bench.send(LEFT, REST, "a")
+        if at > 5:
+            bench.send(other, REST if at == 6 else GO, "b")
+        assert bench.choice().sender == "a"
+        bench.wait(50)
+    bench.wait(400).arbiter.begin(bench.now_ns)
+    bench.send(other, GO, "b")
+    assert (bench.choice().sender, bench.choice().twist) == ("a", None)
+    bench.wait(5).send(LEFT, REST, "a")
+    assert (bench.choice().sender, bench.choice().twist) == ("a", REST)
+
+
+@each(("most_ms", "heals"), [(400.0, True), (1100.0, False)])
+def test_a_delay_that_rose_heals_although_another_source_of_the_clock_has_a_longer_timeout(
+    most_ms: float, heals: bool
+) -> None:
+    """A rise by 1.1 s exceeds the budget, so only the source with the long timeout goes on."""
+    long = Source("long", 10, timeout=2.0)
+    bench = Bench(HIGH, long, armed=False).known(HIGH, "clock", "a").known(long, "clock", "a")
+    for at in range(100):
+        # The delay rises slowly enough that no stamp goes back.
+        late_ms = min(12.0 * at, most_ms)
+        bench.wait(25)
+        assert bench.stamped(long, late_ms, "clock", GO, "a") == ""
+        bench.wait(25)
+        answer = bench.stamped(HIGH, late_ms, "clock", REST, "a")
+    assert answer == ("" if heals else "stale")
+    assert bench.choice().source == ("high" if heals else "long")
+
+
+def test_a_late_sender_that_is_not_armed_is_told_that_it_is_late() -> None:
+    bench = Bench(HIGH, armed=False).known(HIGH, "clock", "a")
+    bench.arbiter.require_neutral(bench.now_ns + 1)
+    for at in range(10):
+        bench.wait(50).stamped(HIGH, 20.0 * at + 9000.0 * (at > 0), "clock", GO, "a")
+        bench.choice()
+    assert bench.choice().wait.what == bench.status(HIGH).waits_for.what == "late"
+
+
 # how many senders are remembered
 
 

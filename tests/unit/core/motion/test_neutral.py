@@ -208,21 +208,66 @@ def test_an_unproven_zero_leaves_an_unarmed_sender_live_so_its_source_keeps_prio
 
 
 @each("proven", [True, False])
-def test_the_pause_after_a_shared_zero_begins_again_behind_a_stall(proven: bool) -> None:
+@each(("before_ms", "rest_ms"), [(400, 600), (950, 100)])
+def test_a_stall_does_not_count_as_pause_and_leaves_time_for_what_arrived_meanwhile(
+    before_ms: int, rest_ms: int, proven: bool
+) -> None:
     one = sender()
     one.take(sent(REST, 0, shared=True), 0, "fresh" if proven else "unproven")
-    one.restart_pause(900 * MS, 1700 * MS)
-    assert not one.armed(2600 * MS)
-    assert one.armed(2700 * MS)
+    one.resume(before_ms * MS, 5000 * MS)
+    end_ns = (5000 + rest_ms) * MS
+    assert not one.armed(end_ns - 1)
+    assert one.armed(end_ns)
     one.unlearn()
-    assert one.armed(2700 * MS) is proven
+    assert one.armed(end_ns) is proven
 
 
 def test_a_pause_that_was_over_before_a_stall_stays_over() -> None:
     one = sender()
     one.take(sent(REST, 0, shared=True), 0)
-    one.restart_pause(1000 * MS, 1700 * MS)
+    one.resume(1000 * MS, 1700 * MS)
     assert one.armed(1700 * MS)
+
+
+@each(("silent_ms", "stays"), [(250, True), (251, False)])
+def test_a_sender_that_was_not_silent_before_a_stall_keeps_its_place_behind_it(
+    silent_ms: int, stays: bool
+) -> None:
+    one = sender()
+    one.take(sent(GO, 0), 0)
+    one.resume(silent_ms * MS, 1000 * MS)
+    assert one.present(1250 * MS) is stays
+    assert not one.live(1000 * MS)
+    assert not one.present(1251 * MS)
+
+
+def test_a_sender_whose_clock_was_set_keeps_its_place_but_must_send_a_zero() -> None:
+    one = sender()
+    one.take(sent(REST, 0), 0)
+    one.disarm(100 * MS)
+    one.take(sent(GO, 100), 0)
+    assert not one.armed(100 * MS)
+    assert one.came_ns == 0
+    for at_ms in range(200, 4000, 100):
+        one.take(sent(GO, at_ms), 0)
+        assert one.holds(at_ms * MS) is (at_ms <= 3100)
+    assert not one.holds(9000 * MS)
+
+
+def test_commands_in_doubt_count_as_zeros_or_speeds_too() -> None:
+    one = sender()
+    marks = []
+    for at_ms, twist, late in ((0, GO, 0), (100, GO, 1), (200, REST, 1), (300, REST, 0),
+                               (400, GO, 1), (500, GO, 0)):  # fmt: skip
+        if late:
+            one.refuse(sent(twist, at_ms), "stale")
+        else:
+            one.take(sent(twist, at_ms), 0)
+        marks.append((one.speeds_ns, one.zeros_ns))
+    assert marks == [
+        (0, None), (0, None), (None, 200 * MS), (None, 200 * MS), (400 * MS, None),
+        (400 * MS, None),
+    ]  # fmt: skip
 
 
 def test_a_shared_zero_that_arrived_before_a_stall_ended_begins_its_pause_then() -> None:
@@ -267,6 +312,29 @@ def test_a_zero_whose_stamp_is_in_doubt_ends_an_earlier_speed_and_holds_no_robot
     assert one.twist == twist
     assert one.arrived_ns == 10 * MS
     assert one.armed(20 * MS)
+
+
+@each(("late_ms", "clock", "twist"), [(30, "a", REST), (251, "a", GO), (30, "b", GO)])
+def test_a_speed_that_a_zero_in_doubt_overtook_does_not_begin_again(
+    late_ms: int, clock: str, twist: Twist
+) -> None:
+    one = sender()
+    one.take(replace(sent(GO, 10), stamp_ns=10, clock="a"), 0)
+    one.refuse(replace(sent(REST, 20), stamp_ns=30, clock="a"), "stale")
+    one.take(replace(sent(GO, 20 + late_ms), stamp_ns=20, clock=clock), 0)
+    assert one.twist == twist
+    one.take(replace(sent(GO, 21 + late_ms), stamp_ns=31, clock="a"), 0)
+    assert one.twist == GO
+
+
+@each(("number", "twist"), [(8, REST), (7, GO), (None, GO)])
+def test_a_zero_in_doubt_whose_number_is_higher_ends_an_earlier_speed(
+    number: int | None, twist: Twist
+) -> None:
+    one = sender()
+    one.take(replace(sent(GO, 10), stamp_ns=15, sequence=7), 0)
+    one.refuse(replace(sent(REST, 20), stamp_ns=5, sequence=number), "stale")
+    assert one.twist == twist
 
 
 def test_a_shared_zero_that_armed_unproven_is_forgotten_when_its_clock_proves_wrong() -> None:
