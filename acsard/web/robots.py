@@ -121,7 +121,7 @@ class Robots:
         asking = asyncio.create_task(self._ask_again_and_again())
 
         def watch() -> Watch:
-            return Watch(_Asking(client), clock.mono_ns() / NS_PER_S)
+            return Watch(_Asking(client), clock.steady_s())
 
         try:
             await self._follow(await self._insisted(lambda: in_thread(watch, DECLARE_S, Watch.end)))
@@ -148,7 +148,7 @@ class Robots:
         }
 
     def minute(self) -> Plotted:
-        return self._minute.plotted(clock.mono_ns())
+        return self._minute.plotted(clock.steady_ns())
 
     async def _reached(self) -> Client:
         while True:
@@ -169,7 +169,7 @@ class Robots:
     async def _follow(self, watch: Watch) -> None:
         self._watch, truth = watch, None
         while True:
-            now_ns = clock.mono_ns()
+            now_ns = clock.steady_ns()
             before, unreadable, now = watch.state, watch.unreadable, now_ns / NS_PER_S
             with suppress(zenoh.ZError):  # the session is closed, so the robot is silent
                 for state in watch.look(now):

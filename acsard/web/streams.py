@@ -57,12 +57,12 @@ class Stream:
 
     @property
     def at_ns(self) -> int:
-        """Arrival time of the newest message, ns on the monotonic clock."""
+        """Arrival time of the newest message on the clock `steady_ns`, ns."""
         return self._newest[2]
 
     def take(self, sample: zenoh.Sample) -> None:
         with self._taking:
-            self._newest = (self._newest[0] + 1, sample, clock.mono_ns())
+            self._newest = (self._newest[0] + 1, sample, clock.steady_ns())
 
     def answered(self, sample: zenoh.Sample) -> None:
         """Store the answer to a query as the newest message.
@@ -71,14 +71,14 @@ class Stream:
         """
         with self._taking:
             if not self._newest[0]:
-                self._newest = (1, sample, clock.mono_ns())
+                self._newest = (1, sample, clock.steady_ns())
 
     def value(self) -> tuple[int, bytes, float]:
         """Return the number, the JSON text and the age in ms of the newest message."""
         number, sample, at_ns = self._newest
         if sample is not None and self._text[0] != number:
             self._text = number, as_json(*encoded(sample))
-        return number, self._text[1], (clock.mono_ns() - at_ns) / 1e6
+        return number, self._text[1], max(0.0, (clock.steady_ns() - at_ns) / 1e6)
 
     def raw(self) -> tuple[str, bytes] | None:
         """Return the encoding and the payload of the newest message, or None before the first."""

@@ -196,7 +196,7 @@ def test_what_a_button_could_not_is_reported_once(page: Phone) -> None:
     page.server.process.kill()
     page.shows("age", "no connection")
     page.browser.js("document.getElementById('reset').click()")
-    page.shows("alarm", "no connection to the robot")
+    page.shows("complaint", "no connection to the robot")
     assert page.browser.js("document.body.innerText").count("no connection to the robot") == 1
 
 
@@ -515,6 +515,15 @@ def test_a_gamepad_drives_only_after_a_press_that_begins_while_it_is_connected(
     assert page.browser.js(PADS.replace("PADS", pads).replace("HELD", HELD)) == holds
 
 
+def test_an_idle_gamepad_that_is_lost_and_comes_back_held_between_two_looks_drives_nothing(
+    page: Phone,
+) -> None:
+    pads = "[[0, false]], [[0, true]]"
+    script = PADS.replace("PADS", pads).replace("HELD", HELD)
+    lost = "dispatchEvent(new Event('gamepaddisconnected')); navigator.getGamepads ="
+    assert page.browser.js(script.replace("navigator.getGamepads =", lost)) == [False, False]
+
+
 def test_a_gamepad_that_is_gone_lets_go(page: Phone) -> None:
     browser, bus = page.browser, page.bus
     pad = PAD.replace("AXES", "[0, -1, 0, 0]")
@@ -827,10 +836,10 @@ def test_a_refusal_of_a_button_disappears_when_the_mode_changes(page: Phone) -> 
     page.bus.get("srv/stop")
     page.shows("mode", "STOPPED")
     page.browser.js("document.getElementById('activate').click()")
-    page.shows("alarm", "Release")
+    page.shows("complaint", "Release")
     page.bus.get("srv/clear")
     page.shows("mode", "READY")
-    until(lambda: page.browser.text("alarm") == "", 5.0, "the refusal is gone")
+    until(lambda: page.browser.text("complaint") == "", 5.0, "the refusal is gone")
 
 
 def test_somebody_else_who_drives_is_named(page: Phone) -> None:
@@ -1170,6 +1179,7 @@ FAILS = [
     [
         ("ok = true", ["sent", ""]),
         ("stopping.over()", ["STOP was not confirmed"]),
+        ("stopping.over(); stopping.complete(); stopping.lacks()", ["STOP was not confirmed"]),
         ("Date.now = () => now() + 31000", ["STOP was not confirmed"]),
         (
             "const then = performance.now(); Date.now = () => now() - 3600000;"
@@ -1185,6 +1195,7 @@ FAILS = [
     ids=[
         "answered",
         "cleared",
+        "cleared before the page is complete",
         "asleep",
         "a clock set back",
         "pressed again",

@@ -56,7 +56,7 @@ def test_a_page_that_has_shown_no_stop_releases_none(tmp_path: Path, browser: Br
                 assert browser.js(HIDDEN) is True
                 for button in ("clear", "activate"):
                     browser.js(f"document.getElementById({button!r}).click()")
-                    shows(browser, "alarm", "does not know what it would release")
+                    shows(browser, "complaint", "does not know what it would release")
                 daemon.signal(signal.SIGCONT)
                 shows(browser, "mode", "STOPPED")
                 assert browser.js(HIDDEN) is False
@@ -113,7 +113,9 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Daemon, Bu
 
 @pytest.fixture
 def page(robot: tuple[Daemon, Bus, Peer, Page], browser: Browser) -> Page:
-    """Open the page of a robot that is ready."""
+    """Open the page of a robot that is ready, also after a test that failed."""
+    for service in ("srv/clear", "srv/activate"):
+        robot[1].ask(service)
     browser.size(*PHONE)
     browser.open(robot[3].here)
     shows(browser, "mode", "READY")
@@ -142,25 +144,114 @@ def test_a_stop_without_an_answer_is_sent_again_although_another_client_stopped_
     assert "STOP is not confirmed" in browser.text("alarm")
     browser.release()
     shows(browser, "mode", "READY")
+    until(lambda: browser.text("alarm") == "", 5.0, "the operator has released the stop")
+
+
+def clicked(browser: Browser, name: str, times: int = 1) -> None:
+    """Click the element by a script, which needs no visible view."""
+    browser.js("; ".join([f"document.getElementById({name!r}).click()"] * times))
 
 
 def test_the_alarm_calls_a_stop_unconfirmed_until_the_robot_has_answered_one(
     page: Page, browser: Browser, robot: tuple[Daemon, Bus, Peer, Page]
 ) -> None:
-    browser.js("document.getElementById('clear').click(), document.getElementById('clear').click()")
-    shows(browser, "alarm", "pressed twice")
+    bus = robot[1]
     browser.js("window.send = stopping.send; stopping.send = () => new Promise(() => {}); 0")
     browser.js("stopping.press(); stopping.over()")
     shows(browser, "alarm", "STOP was not confirmed")
-    robot[1].get("srv/stop")
+    clicked(browser, "reset")
+    shows(browser, "set-told", "pose is x 0")
+    clicked(browser, "deactivate")
+    shows(browser, "mode", "INACTIVE")
+    bus.get("srv/stop")
     shows(browser, "mode", "STOPPED")
-    time.sleep(0.5)
+    clicked(browser, "clear", times=2)
+    shows(browser, "complaint", "pressed twice")
+    shows(browser, "alarm", "STOP was not confirmed")
+    bus.get("srv/clear")
+    shows(browser, "mode", "INACTIVE")
+    until(lambda: browser.text("complaint") == "", 5.0, "the complaint is outdated")
     shows(browser, "alarm", "STOP was not confirmed")
     browser.js("stopping.send = send; 0")
     browser.tap("stop")
     until(lambda: browser.text("alarm") == "", 5.0, "the robot has answered")
-    browser.release()
+    for mode in ("INACTIVE", "READY"):
+        browser.release()
+        shows(browser, "mode", mode)
+
+
+CORNER = """(b => [b.x + 40, b.y + b.height / 2])(
+    document.getElementById('stop').getBoundingClientRect())"""
+"""The part of STOP at whose place the button that releases STOP appears."""
+
+
+def test_a_tap_at_the_place_of_stop_leaves_the_alarm_of_a_stop_that_still_waits(
+    page: Page, browser: Browser, robot: tuple[Daemon, Bus, Peer, Page]
+) -> None:
+    bus, corner = robot[1], browser.js(CORNER)
+    browser.js(
+        "window.sent = 0; window.send = stopping.send; stopping.send = () => sent++"
+        " ? new Promise(() => {})"
+        " : Promise.resolve({ok: false, lost: true, text: 'no answer'}); 0"
+    )
+    browser.touch("Start", corner)
+    browser.touch("End")
+    shows(browser, "alarm", "STOP is not confirmed")
+    bus.get("srv/stop")
+    shows(browser, "mode", "STOPPED")
+    browser.touch("Start", corner)
+    browser.touch("End")
+    shows(browser, "complaint", "this button has just appeared")
+    shows(browser, "alarm", "STOP is not confirmed")
+    bus.get("srv/clear")
     shows(browser, "mode", "READY")
+    until(lambda: browser.text("complaint") == "", 5.0, "the complaint is outdated")
+    shows(browser, "alarm", "STOP is not confirmed")
+
+
+MUTE = """(() => {
+    const dispatch = EventTarget.prototype.dispatchEvent;
+    EventTarget.prototype.dispatchEvent = function (event) {
+        return (window.mute && event.type === 'key:state') || dispatch.call(this, event);
+    };
+})(); 0"""
+"""Drops the states of the robot while `mute` is true."""
+
+GREYED = "document.getElementById('clear').ariaDisabled === 'true'"
+
+
+def test_a_gap_between_two_states_greys_the_release_button_and_does_not_restart_its_second(
+    page: Page, browser: Browser, robot: tuple[Daemon, Bus, Peer, Page]
+) -> None:
+    bus = robot[1]
+
+    def gap(*services: str) -> None:
+        """Keep the states from the page until it greys the button, while the services act."""
+        place = browser.middle("stop")
+        browser.js("window.mute = true")
+        for service in services:
+            bus.get(service)
+        until(lambda: browser.js(GREYED) or browser.js(HIDDEN), 5.0, "the state is old")
+        assert browser.js(HIDDEN) is False
+        assert browser.middle("stop") == place
+        browser.tap("clear")
+        shows(browser, "complaint", "nothing is received from the robot, so this press did nothing")
+        assert browser.text("clear") == "Release STOP"
+        browser.js("window.mute = false")
+        until(lambda: not browser.js(GREYED), 5.0, "a state arrives")
+        browser.tap("clear")
+
+    browser.js(MUTE)
+    bus.get("srv/stop")
+    shows(browser, "clear", "Release STOP")
+    time.sleep(SETTLED_S)
+    gap("srv/stop")
+    shows(browser, "complaint", "this button has just appeared or changed")
+    assert bus.state()["mode"] == "stopped"
+    time.sleep(SETTLED_S)
+    gap()
+    shows(browser, "mode", "READY")
+    assert browser.text("complaint") == ""
 
 
 def test_a_program_that_drives_is_named_and_a_push_takes_over(
@@ -222,20 +313,16 @@ def test_a_double_click_releases_only_what_the_button_said_before(
 def test_taps_at_the_place_of_stop_do_not_release_it(
     page: Page, browser: Browser, robot: tuple[Daemon, Bus, Peer, Page]
 ) -> None:
-    """The button that releases STOP appears at the place of a part of STOP."""
-    corner = browser.js(
-        "(b => [b.x + 40, b.y + b.height / 2])"
-        "(document.getElementById('stop').getBoundingClientRect())"
-    )
+    corner = browser.js(CORNER)
     for _ in range(4):
         browser.touch("Start", corner)
         browser.touch("End")
         time.sleep(0.4)
     assert robot[1].state()["mode"] == "stopped"
-    shows(browser, "alarm", "this button has just changed, or was pressed twice")
+    shows(browser, "complaint", "this button has just appeared or changed, or was pressed")
     browser.release()
     shows(browser, "mode", "READY")
-    assert browser.text("alarm") == ""
+    assert browser.text("complaint") == ""
 
 
 def test_a_held_enter_key_releases_only_what_the_button_said_before(
@@ -283,13 +370,13 @@ def test_a_stop_in_a_fault_says_that_it_is_latched_behind_it(
     try:
         shows(browser, "mode", "FAULT")
         browser.tap("stop")
-        shows(browser, "alarm", "Release fault leads to STOPPED")
+        shows(browser, "complaint", "Release fault leads to STOPPED")
     finally:
         board.reply = usual
     shows(browser, "hint", "Press Release fault first")
     browser.release()
     shows(browser, "mode", "STOPPED")
-    assert browser.text("alarm") == ""
+    assert browser.text("complaint") == ""
     browser.release()
     shows(browser, "mode", "READY")
     assert bus.state()["mode"] == "ready"
@@ -396,7 +483,7 @@ def test_a_pressed_emergency_stop_or_bumper_and_a_low_battery_have_signs_with_th
         assert browser.text("estop") == "⬢ E-STOP"
         shows(browser, "hint", "Emergency stop: release it at the robot first.")
         browser.release()
-        shows(browser, "alarm", "release it at the robot, then")
+        shows(browser, "complaint", "release it at the robot, then")
         says(b"estop=ok")
         until(lambda: not browser.js(shown), 5.0, "the button is released")
         shows(browser, "hint", "Stopped. Press Release STOP first.")

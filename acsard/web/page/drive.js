@@ -143,7 +143,10 @@ export class Drive {
     addEventListener("contextmenu", () => this.#by === "keys" && this.release("released: a menu is open"), true);
     // While something is dragged, no browser reports the release of a key.
     addEventListener("dragstart", () => this.#by === "keys" && this.release("released: something is dragged"), true);
-    addEventListener("gamepaddisconnected", () => this.#by === "pad" && this.release("released: the gamepad is disconnected"));
+    addEventListener("gamepaddisconnected", () => {
+      this.#padFree = null; // the gamepad may come back before the next look, with a button held
+      if (this.#by === "pad") this.release("released: the gamepad is disconnected");
+    });
     setInterval(() => this.#pad(), 50);
   }
 

@@ -14,7 +14,7 @@ import * as views from "./views.js";
 import { RELEASE, figure, milliseconds, named, person, said as clickable, spot, yaw } from "./words.js";
 
 const $ = (id) => document.getElementById(id);
-const { stopping, alarm } = window; // of stop.js, which has run before
+const { stopping } = window; // of stop.js, which has run before
 if (!stopping) {
   $("alarm").hidden = false;
   views.text("alarm", "STOP does not work here, because a part of this page did not run. Reload the page.");
@@ -33,7 +33,8 @@ const NEEDLESS = { waiting: ON, driving: ON, ready: ON, inactive: { deactivate: 
 /** ms for which the release button shows what it does before a press of it counts. A double click may take 900 ms, and
  *  a held Enter key may click again after 1000 ms. */
 const SETTLED = 1000;
-const HASTY = "this button has just changed, or was pressed twice: read it, wait a second, then press it once";
+const HASTY = "this button has just appeared or changed, or was pressed twice: read it, wait a second, then press it once";
+const DATED = "nothing is received from the robot, so this press did nothing: press again when this button is not grey";
 const SOON = 300; // ms in which the WebSocket answers a STOP, unless it is dead but still open
 
 const link = new Link(refused);
@@ -55,7 +56,6 @@ let silent = ""; // why the robot is silent, as reported by the page's server
 let uninvited = ""; // why the invitation was rejected
 let degrees = false; // turn rates are shown in degrees per second
 let note = { why: "", at: 0 }; // the message at the stick and its time, by performance.now()
-let complains = false; // the alarm says why a button failed
 let offer = ""; // the mode and the latch that the release button ends, "" while it is hidden
 let settling = 0; // time at which `offer` changed or the release button was last clicked, by performance.now()
 let down = null; // time at which a finger came down on the release button
@@ -92,20 +92,20 @@ function followed(key, rate, wanted) {
 }
 
 async function asked(verb, payload) {
-  const told = await link.call(verb, payload);
-  answered(told);
+  return answered(await link.call(verb, payload));
 }
 
+/** Show the answer to a button, and return it. */
 function answered(told) {
-  complains = !told.ok;
-  alarm(told.ok ? "" : words(told.text)); // the alarm is visible in every view
+  views.complain(told.ok ? "" : words(told.text));
   said(told.ok ? told : { ok: true, text: "" });
+  return told;
 }
 
 /** Release what this page shows. Without a state it has shown nothing, and the call would release anything. */
 function released(verb) {
   if (state) return asked(verb, { latch: state.latch });
-  answered({ ok: false, text: "nothing is received from the robot, so this page does not know what it would release" });
+  return answered({ ok: false, text: "nothing is received from the robot, so this page does not know what it would release" });
 }
 
 async function set(payload) {
@@ -163,11 +163,16 @@ function lasts() {
   return Math.max(500, OTHER ? 2500 * (period || 1) : 2500 / (hello?.state_rate || 10));
 }
 
+/** Whether the state that this page shows is old. */
+function dated() {
+  return Boolean(state) && performance.now() - heard > lasts();
+}
+
 function looked() {
   const old = link.open ? Math.max(performance.now() - heard, link.lag) : Infinity;
   const none = link.open ? "waiting" : tried ? "no connection" : "connecting";
   views.freshness(old, lasts(), link.way, none, seen, Boolean(state) && !boarded(state));
-  if (state && performance.now() - heard > lasts()) views.unheard(silent);
+  if (dated()) views.unheard(silent);
   releasable();
   readied();
   camera.look(performance.now());
@@ -179,8 +184,7 @@ function looked() {
 
 /** Drop what a button or a press of the stick was told in the mode before. */
 function outdated() {
-  if (complains) alarm("");
-  complains = false;
+  views.complain("");
   if (note.why && (note.why === state.reason || LATCHED.includes(state.mode))) told("");
 }
 
@@ -203,26 +207,30 @@ function readied() {
   views.text("hint", ((drive.allowed || !link.open) && (drive.barred || over)) || hint(hello, OTHER));
 }
 
-/** Show the button that ends the mode, only while this page shows the mode. */
+/** Show the button that ends the mode. While no new state confirms the mode, the button stays in place and does nothing: if
+ *  it disappeared, STOP would grow into its place under a finger. */
 function releasable() {
-  const fresh = state && performance.now() - heard <= lasts();
-  const shown = !OTHER && fresh && state.mode in RELEASE;
+  const shown = !OTHER && state && state.mode in RELEASE;
   $("clear").hidden = !shown;
   const before = offer;
   offer = shown ? `${state.mode} ${state.latch}` : "";
   if (offer !== before) settling = performance.now();
+  $("clear").setAttribute("aria-disabled", String(dated()));
 }
 
 /** Release what the button showed when the person's finger came down on it. The button follows the mode in place, and it
  *  appears at the place of STOP, so the second click of a double click would release a cause that nobody has read. */
-function pressed(event) {
-  // A click by a key has no finger, and a finger that left the button has made no click.
+async function pressed(event) {
+  // A click by a key has no pointerdown. If a finger slides off the button, its pointerdown stays in `down`.
   const since = ((event.detail && down) || event.timeStamp) - settling;
   down = null;
+  if (dated()) return answered({ ok: false, text: DATED });
   settling = performance.now();
   if (since < SETTLED) return answered({ ok: false, text: HASTY });
-  stopping.over();
-  released(state?.mode === "inactive" ? "activate" : "clear");
+  const ended = state?.mode;
+  const press = stopping.over();
+  const told = await released(ended === "inactive" ? "activate" : "clear");
+  if (ended === "stopped" && told.ok) stopping.released(press);
 }
 
 function stated({ detail }) {
@@ -365,8 +373,7 @@ link.addEventListener("gone", ({ detail }) => {
 });
 link.addEventListener("up", () => {
   tried = camera.connected = true;
-  if (complains) alarm("");
-  complains = false;
+  views.complain("");
   views.waiting();
 });
 link.addEventListener("down", ({ detail }) => {
@@ -425,7 +432,7 @@ stopping.after = (told) => {
   if (state?.mode === "fault") answered({ ok: false, text: "STOP is latched behind the fault: Release fault leads to STOPPED" });
 };
 stopping.before = () => {
-  complains = false; // the alarm is now about STOP
+  views.complain("");
   drive.release();
   guide.leave();
 };

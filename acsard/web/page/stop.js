@@ -17,7 +17,7 @@ const RELOAD = "A part of this page did not load, so only STOP works here. Reloa
 class Stopping {
   #tell;
   #press = 0;
-  #waits = false; // waiting for the robot's confirmation
+  #unconfirmed = false; // the robot has not answered the last STOP, which may be given up
   #whole = false; // the modules of the page run
   /** Called at each press before the stop is sent. */
   before = () => {};
@@ -36,7 +36,7 @@ class Stopping {
     const press = ++this.#press;
     const last = Date.now() + URGENT;
     const since = performance.now();
-    this.#waits = true;
+    this.#unconfirmed = true;
     try {
       this.before();
     } catch (error) {
@@ -53,17 +53,23 @@ class Stopping {
     }
   }
 
-  /** Give up the pending STOP, because the operator releases it or leaves the page. */
+  /** Give up the pending STOP, because the operator releases it or leaves the page. The message stays until the robot
+   *  answers a STOP or `released` is called. Returns the number that `released` takes. */
   over() {
-    ++this.#press;
-    if (this.#waits) this.#tell(UNSURE);
-    this.#waits = false;
+    if (this.#unconfirmed) this.#tell(UNSURE);
+    return ++this.#press;
+  }
+
+  /** Note that the robot has confirmed the release of STOP for which `over` returned `press`. The STOP before it then
+   *  needs no confirmation. */
+  released(press) {
+    if (press === this.#press) this.#settle("");
   }
 
   /** Note that the modules run and show the robot's state. */
   complete() {
     this.#whole = true;
-    if (!this.#waits) this.#tell("");
+    if (!this.#unconfirmed) this.#tell("");
   }
 
   /** Say that a part of the page is missing, unless the modules run. */
@@ -71,7 +77,7 @@ class Stopping {
     if (this.#whole) return;
     const mode = document.getElementById("mode");
     if (mode) mode.textContent = "NOT LOADED";
-    if (!this.#waits) this.#tell(RELOAD);
+    if (!this.#unconfirmed) this.#tell(RELOAD);
   }
 
   /** Grey STOP, because the robot has refused this browser. A press is still sent. */
@@ -81,17 +87,20 @@ class Stopping {
 
   #ends(told) {
     if (told.barred) {
-      this.#waits = false;
-      this.#tell(NOT_HERE);
+      this.#settle(NOT_HERE);
       this.uninvited();
       return true;
     }
     if (!told.ok) return false;
-    this.#waits = false;
     document.documentElement.classList.add("stops"); // this browser was invited again in another tab
-    this.#tell(this.#whole ? "" : "STOP: the robot has confirmed it. This page is not complete: reload it.");
+    this.#settle(this.#whole ? "" : "STOP: the robot has confirmed it. This page is not complete: reload it.");
     this.after(told);
     return true;
+  }
+
+  #settle(words) {
+    this.#unconfirmed = false;
+    this.#tell(words);
   }
 }
 
@@ -114,7 +123,8 @@ async function posted() {
   }
 }
 
-/** Show a message in every view until `words` is "". */
+/** Show a message about STOP in every view until `words` is "". `main.js` shows the messages of other buttons elsewhere, so
+ *  that none of them hides this one. */
 function alarm(words) {
   const place = document.getElementById("alarm");
   if (!place) return;

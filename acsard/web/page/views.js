@@ -153,6 +153,12 @@ function doubted(words) {
   text("doubt", words);
 }
 
+/** Show in every view why a button failed, until `words` is "". */
+export function complain(words) {
+  document.getElementById("complaint").hidden = !words;
+  text("complaint", words);
+}
+
 /** Show a mode in the banner and in the title, which a background tab shows. STOP and its
  *  release follow the mode. */
 function mode(name, words) {
