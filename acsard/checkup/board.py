@@ -107,8 +107,9 @@ class Board:
         """Whether all motors have stood still once. From then on, a runaway motor ends the
         check."""
         self.between: Callable[[], object] = _nothing
-        """Function that is called every `BEAT_NS` while the board listens. It may raise an
-        exception that ends the check. It is not called while the last zeros are sent."""
+        """Function that is called when the board begins to listen, and then after each wait of up
+        to `BEAT_NS`. It may raise an exception that ends the check. It is not called while the last
+        zeros are sent."""
         # Results of the steps
         self.baud_rate: int = mcu.baud_rate
         self.comma = mcu.trailing_comma
@@ -323,14 +324,15 @@ class Board:
         if self.now_s - self._listened_s > BEAT_NS / NS_PER_S:
             self.wire.late_ns()  # discard this lateness: nothing was measured at that time
         got: list[Reply] = []
+        self.between()
         while True:
-            self.between()
             until_ns = min(end_ns, self.wire.now_ns() + BEAT_NS)
             got += self._hear(until_ns)
             now_ns = self.wire.now_ns()
             self._listened_s = now_ns / NS_PER_S
             late_ns = max(now_ns - until_ns, self.wire.late_ns())
             self.lateness.look(late_ns / NS_PER_S, self._listened_s)
+            self.between()
             if now_ns >= end_ns:
                 return got
 

@@ -299,6 +299,11 @@ FAIL inputs: wrong | {figure}
 FAIL wheels: not lifted
     the operator did not confirm that the wheels are lifted
     -> lift the wheels, start the check again and confirm it
+FAIL stall: seen | stood still for {seconds:.1f} s
+    this program did not run for that time. The operator may have left the robot meanwhile, so the
+    check turns no motor any more
+    -> was the computer suspended, or did something keep this program from running (Ctrl-Z, a
+    stalled terminal)? Stay at the robot and start the check again
 FAIL runaway: along | {letter}: commanded {told:.1f}, measured {seen:.1f} rad/s
     the encoder of {motor} reports more than {most:g} rad/s
     -> are the counts per turn in the firmware too low, or is its control loop unstable?

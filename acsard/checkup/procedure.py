@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 from msgspec import structs
@@ -28,6 +28,7 @@ from acsard.checkup.wheels import Channel, encoder_finding, wheel_map
 from acsard.core.config.motion_rules import longest_reply
 from acsard.core.config.settings import Config, SafetyConfig
 from acsard.core.formatting import many
+from acsard.core.values import NS_PER_S
 
 LIFTED, QUITS = "lifted", "q"
 
@@ -64,17 +65,32 @@ LATE_AGAIN, LATE_MOST = 2, 8
 """Largest numbers of repetitions because this computer was late: of one step, and of all steps.
 Without the limit for all steps, a check could take four minutes."""
 
+STALL_S = 0.5
+"""Longest time for which the program may stand still, s. After a longer stall, the check ends,
+because the operator may have left the robot. After a shorter one, a step may be repeated (see
+`LATE_AGAIN`)."""
+
 AGAIN, MOST = 1, 5
 """After a restart of the board, the step is repeated up to `AGAIN` times. One more restart in the
 same step ends the check, and so do `MOST` restarts in all steps together."""
 
 
-def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
+def run(
+    wire: Wire,
+    operator: Operator,
+    config: Config,
+    tell: Tell,
+    asleep_ns: Callable[[], int] = lambda: 0,
+) -> None:
     """Check one microcontroller, and call `tell` with each finding as soon as it is known.
 
     Before the operator confirms that the wheels are lifted, only zeros are sent. The last lines are
-    always zeros, unless the serial port is lost. Raises `KeyboardInterrupt` if the operator types
-    `QUITS`, also while a motor turns.
+    always zeros, unless the serial port is lost. The check ends early if this program stands still
+    for more than `STALL_S` while it waits for no answer. Raises `KeyboardInterrupt` if the operator
+    types `QUITS`, also while a motor turns.
+
+    `asleep_ns` returns for how long this computer was suspended since its start, ns. The wire's
+    clock stands still in a suspend.
     """
     told: set[str] = set()
     unjudged: set[str] = set()
@@ -92,10 +108,6 @@ def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
             told.update((finding.name, "motors") if "motor " in finding.name else (finding.name,))
             tell(outcomes.plain(finding))
 
-    def quit_if_typed() -> None:
-        if QUITS in operator.keys(0.0).lower():
-            raise KeyboardInterrupt
-
     why = ""
     seen: list[Restart] = []
     try:
@@ -104,8 +116,9 @@ def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
             board.zeros()
             if operator.ask(CONFIRM, (LIFTED,)) != LIFTED:
                 raise StoppedError(outcomes.find("wheels: not lifted"))
-            board.between = quit_if_typed
-            _Steps(board, operator, once, seen).all(config.safety)
+            watched = _Watched(operator, lambda: (wire.now_ns() + asleep_ns()) / NS_PER_S)
+            board.between = watched.look
+            _Steps(board, watched, once, seen).all(config.safety)
     except StoppedError as end:
         once(end.finding)
         why = f"the check ended early: {end.finding.name}"
@@ -118,6 +131,32 @@ def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
     if why and rest:
         left = f"{why}; not tried: {', '.join(rest)}"
         tell(Finding(REST, "SKIPPED", many(len(rest), "step"), left))
+
+
+class _Watched:
+    """The operator during the steps. `look` ends the check if the operator cannot attend to it."""
+
+    def __init__(self, operator: Operator, now_s: Callable[[], float]) -> None:
+        """`now_s` returns a monotonic time, s, that also advances during a suspend."""
+        self.doing, self.keys = operator.doing, operator.keys
+        self._operator, self._now_s = operator, now_s
+        self._ran_s = now_s()
+        """Time of the last call of `look`, or of the last answer if that came later."""
+
+    def ask(self, question: str, answers: Sequence[str]) -> str | None:
+        """Ask the operator, who may take any time to answer."""
+        answer = self._operator.ask(question, answers)
+        self._ran_s = self._now_s()
+        return answer
+
+    def look(self) -> None:
+        """Raise `KeyboardInterrupt` if the operator quits; `StoppedError` after a stall."""
+        now_s = self._now_s()
+        stalled_s, self._ran_s = now_s - self._ran_s, now_s
+        if stalled_s > STALL_S:
+            raise StoppedError(outcomes.find("stall: seen", seconds=stalled_s))
+        if QUITS in self.keys(0.0).lower():
+            raise KeyboardInterrupt
 
 
 class _Steps:

@@ -18,6 +18,7 @@ from acsard.core.config.settings import SIMULATOR, Config
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.virtual_wire import VirtualWire
 from acsard.daemon.serial.blocking import BlockingPort
+from acsard.host import clock
 from acsard.host.config_file import change, writable
 from acsard.host.errors import Exit, MendableError, UsageError
 from acsard.host.processes import master_of
@@ -33,10 +34,11 @@ and the emergency stop and the bumpers that the board reports. It opens the port
 daemon first (exit code 75 if the daemon has the port). It asks you to type that the wheels are
 lifted. Then it turns the motors one by one, and then all together. It commands at most 3 rad/s, but
 a wheel whose encoder is dead or reversed can reach full speed. If the board restarts during a test,
-the tool reports that and repeats the test. Its last lines to the board are always zeros, then it is
-silent. The exit code is 0 if every test was judged and none failed. It is 1 if a test failed, if
-the tool ended early, or if this computer was too slow to judge a test; in that case try again when
-the computer is idle.
+the tool reports that and repeats the test. If the tool itself stands still for more than 0.5 s, for
+example because the computer is suspended, the check ends. Its last lines to the board are always
+zeros, then it is silent. The exit code is 0 if every test was judged and none failed. It is 1 if a
+test failed, if the tool ended early, or if this computer was too slow to judge a test; in that case
+try again when the computer is idle.
 """
 
 
@@ -97,7 +99,7 @@ def _checked(
         with ended_by_signals(
             "stopping: acsard sends zero speeds to the board, then closes the port", exits=True
         ):
-            procedure.run(_wire(config), prompt, config, tell)
+            procedure.run(_wire(config), prompt, config, tell, clock.asleep_ns)
     except MendableError as error:
         if not args.json:
             raise

@@ -26,8 +26,9 @@ to do:
     ReplyError         RuntimeError     the daemon reports a failure; a service that refuses says so
                                         in its reply instead
     NotDrivenError     RuntimeError     the robot does not follow your drive: it is stopped or in
-                                        fault, another client drives, or you may not; the text says
-                                        which
+                                        fault, another client drives, or you may not; or your
+                                        program sent no command for 0.5 s, because it stood still or
+                                        the network failed; the text says which
     NotPermittedError  PermissionError  your certificate does not allow this, or you may not read
                                         its files
     CertificateError   ValueError       the certificates do not exist or cannot be used

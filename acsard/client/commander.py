@@ -41,9 +41,9 @@ ZEROS = 3
 
 GRACE_S = 0.5
 """Longest time for which commands may have no effect, s, before the program informs the operator or
-ends the drive. If the program itself stands still for longer, the drive ends too. It exceeds the
-first 0.25 s of a new sender, whose commands have no effect yet, and a short delay of a known
-sender."""
+ends the drive. If the program itself sends no command for longer, the drive ends too. The time
+exceeds the first 0.25 s of a new sender, whose commands have no effect yet, and a short delay of a
+known sender."""
 
 SILENCE_NS = 3 * NS_PER_S // 10
 """Time without a command, ns, after which the robot is assumed to brake. It is a little longer than

@@ -2,8 +2,8 @@
 
 The daemon does not answer commands. It reports in `state` why the robot does not follow a command.
 A drive therefore subscribes to `state`. If the robot does not follow, the drive ends with an error
-that gives the daemon's reason. A drive also ends with an error if this program stood still, because
-the operator may no longer want it.
+that gives the daemon's reason. A drive also ends with an error if this program sent no command for
+some time, because the operator may no longer want the drive.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def drive(
 
     Raises:
         NotDrivenError: The robot does not follow, and the text is the daemon's reason; or this
-            program stood still for more than `GRACE_S` before it sent the last speed.
+            program sent no command for more than `GRACE_S` before it began to stop the robot.
         NoAnswerError: The daemon is silent.
         UsageError: An argument is not a finite number, or `seconds` is not above 0.
     """
@@ -89,7 +89,7 @@ def drive(
         while (left := end - clock.steady_s()) > 0:
             checks.send(linear, angular)
             yield min(SEND_PERIOD_S, left)
-            checks.require_no_stall()
+            checks.require_no_pause()
             checks.require(grace)
         yield from _stopping(checks)
     finally:
@@ -115,7 +115,7 @@ def _opening(checks: _Drive) -> Iterator[float]:
     while (passed := clock.steady_s() - begun) < OPENING_S or checks.objection != "":
         checks.send(0.0, 0.0)
         yield OPENING_PERIOD_S
-        checks.require_no_stall()
+        checks.require_no_pause()
         checks.look()
         if passed >= OPENED_S or (passed >= SETTLED_S and checks.hopeless):
             checks.require(0.0)
@@ -149,8 +149,9 @@ class _Drive:
 
     def __init__(self, robot: Driven) -> None:
         self._robot = robot
-        now = self._fine = self._stepped = clock.steady_s()
-        self.watch = Watch(robot, now)
+        self.watch = Watch(robot, clock.steady_s())
+        # To subscribe may take long, and no command is due before the subscription.
+        self._fine = self._stepped = clock.steady_s()
         self.objection: str | None = None
         """Why the robot does not follow; "" if it follows, None before the first state."""
 
@@ -167,19 +168,20 @@ class _Drive:
         except zenoh.ZError:
             raise NoAnswerError(CLOSED) from None
 
-    def require_no_stall(self) -> None:
-        """Raise `NotDrivenError` if this program stood still since the last call.
+    def require_no_pause(self) -> None:
+        """Raise `NotDrivenError` if more than `GRACE_S` has passed since the last call.
 
-        The process may have been stopped, or its computer may have been suspended. The states that
-        it received before the stall seem to arrive now, so they cannot show that time has passed.
+        The process may have been stopped, its computer may have been suspended, or the bus may not
+        have accepted the command. The states that arrived before the pause seem to arrive now, so
+        they cannot show that time has passed.
         """
         now = clock.steady_s()
-        stalled, self._stepped = now - self._stepped, now
-        if stalled > GRACE_S:
+        paused, self._stepped = now - self._stepped, now
+        if paused > GRACE_S:
             raise NotDrivenError(
-                f"this program stood still for {stalled:.1f} s, so the robot was stopped and the "
-                "drive was not finished: was the computer suspended, or did something keep the "
-                "program from running?"
+                f"this program sent no command for {paused:.1f} s, so the robot was stopped and "
+                "the drive was not finished: was the computer suspended, did something keep the "
+                "program from running, or did the network to the daemon fail?"
             )
 
     def look(self) -> None:

@@ -8,7 +8,6 @@ repeatedly, only `Fleet.ask()` may wait for the bus.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Sequence
 from threading import Lock
 from typing import Any
@@ -23,6 +22,7 @@ from acsard.core.messages.keys_and_roles import full_key
 from acsard.core.messages.schema import Info, RobotState
 from acsard.daemon.bus.robot_discovery import ALL, robot_of
 from acsard.daemon.bus.subscription import encoded
+from acsard.host import clock
 from acsard.host.mailbox import Mailbox
 
 MOST = 1000
@@ -53,7 +53,7 @@ class _Known:
 
     def begin(self) -> None:
         """Begin to follow the robot, or begin again when it reappears. Its queries are then due."""
-        self.since = self.info_due = time.monotonic()
+        self.since = self.info_due = clock.steady_s()
         self.follower = Follower(self.since, FLEET_ASK_S)
         self.follower.due = self.since
 
@@ -99,7 +99,7 @@ class Fleet:
 
         A robot that `ids` names, or whose liveliness token is present, is never dropped.
         """
-        now = time.monotonic()
+        now = clock.steady_s()
         with self._lock:
             for name, one in list(self._known.items()):
                 self._take(one)
@@ -110,7 +110,7 @@ class Fleet:
 
     def due(self) -> list[tuple[str, str]]:
         """Return the due queries for `ask()`: pairs of robot id and key. Plan the next queries."""
-        now, due = time.monotonic(), []
+        now, due = clock.steady_s(), []
         with self._lock:
             for name, one in self._known.items():
                 self._take(one)
@@ -177,14 +177,14 @@ class Fleet:
             appeared, one.here = not one.here, sample.kind == zenoh.SampleKind.PUT
             if not one.here:
                 # Query the version again later, because the daemon may restart with another one.
-                one.since, one.version = time.monotonic(), ""
+                one.since, one.version = clock.steady_s(), ""
             elif appeared:
                 one.begin()
 
     def _state(self, sample: zenoh.Sample) -> None:
         one = self._of(sample)
         if one is not None:
-            one.newest.put((sample, time.monotonic()))
+            one.newest.put((sample, clock.steady_s()))
 
     def _answer(self, sample: zenoh.Sample) -> None:
         one = self._of(sample)
@@ -196,7 +196,7 @@ class Fleet:
             return
         with self._lock:
             self._take(one)
-            one.follower.answered(state, time.monotonic())
+            one.follower.answered(state, clock.steady_s())
 
     def _info(self, sample: zenoh.Sample) -> None:
         one = self._of(sample)

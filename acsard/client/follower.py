@@ -50,7 +50,7 @@ STEADY = ("lines", "lines_sent", "commands")
 class Follower:
     """The newest state of one robot. All times are in s on the same monotonic clock.
 
-    A program that drives the robot uses `clock.steady_s`, which also advances during a suspend.
+    This clock must also advance during a suspend, as `clock.steady_s` does.
     """
 
     def __init__(self, now: float, ask_s: float = ASK_S) -> None:

@@ -42,7 +42,7 @@ class Outbox:
         Returns the time since the sender's previous command, ns, or None (see `Commander.take`).
         """
         with self._news:
-            silence = commander.take(wish, clock.mono_ns())
+            silence = commander.take(wish, clock.steady_ns())
             self._senders[commander] = put
             self._news.notify_all()
         return silence
@@ -54,7 +54,7 @@ class Outbox:
         """
         with self._news:
             put = self._senders.pop(commander, None)
-            zero = commander.end(clock.mono_ns(), timeout_s)
+            zero = commander.end(clock.steady_ns(), timeout_s)
             if put is not None and zero is not None:
                 self._zeros.append((put, zero))
             self._news.notify_all()
@@ -87,7 +87,7 @@ class Outbox:
             self._news.notify_all()
             while not ((due := self._due()) or self._zeros or self._ended):
                 times = self._times()
-                left_ns = min(times) - clock.mono_ns() if times else None
+                left_ns = min(times) - clock.steady_ns() if times else None
                 self._news.wait(None if left_ns is None else max(0, left_ns) / NS_PER_S)
             self._busy = True
             zeros, self._zeros = self._zeros, []
@@ -97,7 +97,7 @@ class Outbox:
             # The bus may have blocked the previous command, so read the clock again for the age.
             with self._news:
                 stale = commander.stale
-                wish = commander.send(clock.mono_ns())
+                wish = commander.send(clock.steady_ns())
             if wish is not None:
                 put(wish)
             elif commander.stale > stale:
@@ -109,6 +109,6 @@ class Outbox:
         return [due_ns for due_ns in times if due_ns is not None]
 
     def _due(self) -> list[tuple[Commander, Put]]:
-        now_ns = clock.mono_ns()
+        now_ns = clock.steady_ns()
         known = [(commander.due_ns(), commander, put) for commander, put in self._senders.items()]
         return [(one, put) for due_ns, one, put in known if due_ns is not None and due_ns <= now_ns]

@@ -214,8 +214,8 @@ class Client:
         `linear` is in m/s and `angular` in rad/s (left is +). Speeds above the robot's `[limits]`
         are not an error: the robot drives at its limits. `get("config")` returns the limits, and
         `get("cmd_vel_out")` the applied speed. Raises `NotDrivenError` with the daemon's reason as
-        soon as the robot does not follow, and also if this program stood still for more than 0.5 s
-        during the drive.
+        soon as the robot does not follow, and also if this program sent no command for more than
+        0.5 s during the drive, because it stood still or the network failed.
         """
         try:
             with closing(drive(self, linear, angular, seconds)) as steps:

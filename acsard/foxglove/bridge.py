@@ -151,7 +151,7 @@ class Bridge:
         return next((one.timeout for one in sources if one.name == self._robot.source), LONGEST_S)
 
     def _follow(self, driving: bool) -> None:
-        now = clock.mono_ns() / NS_PER_S
+        now = clock.steady_s()
         if self._watch is not None and not driving:
             self._watch.end()
             self._watch = None
@@ -163,7 +163,7 @@ class Bridge:
 
     def _object(self, driving: dict[int, Client]) -> None:
         """Tell all viewers why the robot does not follow a viewer that requests a speed."""
-        now_ns = clock.mono_ns()
+        now_ns = clock.steady_ns()
         for client in driving.keys() - self._objections.keys():
             self._objections[client] = Objections()
         for client, told in list(self._objections.items()):

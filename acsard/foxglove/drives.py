@@ -165,7 +165,7 @@ class Drives:
 
     def driving(self) -> dict[int, Client]:
         """Return the bus client of each viewer that requests a speed now, by the viewer's id."""
-        now_ns = clock.mono_ns()
+        now_ns = clock.steady_ns()
         with self._lock:
             viewers = self._viewers.items()
             return {one: it.robot for one, it in viewers if it.commander.drives(now_ns)}

@@ -32,9 +32,10 @@ def steady_ns() -> int:
 
 
 def steady_s() -> float:
-    """Return the time of `steady_ns`, s. Programs that drive the robot use this clock.
+    """Return the time of `steady_ns`, s.
 
-    On a clock that stands still in a suspend, a command from before the suspend would seem fresh.
+    Programs that send commands or show states take the ages of both from this clock. On a clock
+    that stands still in a suspend, a command or a state from before the suspend would seem fresh.
     """
     return steady_ns() / NS_PER_S
 

@@ -3,7 +3,7 @@
 A terminal reports a key press but never its release. Each press therefore drives the robot for
 `HOLD_S`. Once the keyboard repeats a held key, each repeat drives the robot for `REPEAT_S` only.
 When the time of the last press or repeat is over, `acsard drive` sends three zero commands and then
-nothing.
+nothing. Keys that the operator typed while this program stood still do not drive the robot.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ operator may have released the key long ago.
 """
 
 BURST_S = 0.2
-"""Time after a burst of keys for which further keys belong to the burst, s."""
+"""Time after old keys for which further keys are old too, s. One read does not return all keys that
+waited."""
 
 STOP = " "
 
@@ -61,18 +62,23 @@ class Keyboard:
         """Monotonic time of the last press of a driving key, s, and number of its repeats."""
         self._until = 0.0
         self._old_until = 0.0
-        """Monotonic time until which all keys belong to the last burst, s."""
+        """Monotonic time until which all keys count as old, s."""
         self._zeros = ZEROS
 
-    def take(self, text: str, now: float) -> None:
+    def take(self, text: str, now: float, waited: float = 0.0) -> None:
         """Process the keys of one read from the terminal at `now` (monotonic clock, s).
 
-        A burst of keys stops the robot, because old keys do not show what the operator wants now.
+        The keys may have waited for up to `waited` s. Old keys do not show what the operator wants
+        now, so they stop the robot. Keys are old if they may have waited for more than `GRACE_S`,
+        or if more than `BURST` keys arrive together. After such a wait, an earlier press drives
+        the robot no further.
         """
         keys = split(text)
-        if len(keys) > BURST:
+        if len(keys) > BURST or waited > GRACE_S:
             self._old_until = now + BURST_S
-        for key in [STOP] if keys and now < self._old_until else keys:
+        if now < self._old_until and (keys or now < self._until):
+            keys = [STOP]
+        for key in keys:
             self.press(key, now)
 
     def press(self, key: str, now: float) -> None:
@@ -108,14 +114,15 @@ class Ride:
         # After a silence the robot may require a return to neutral, for example because it was
         # stopped and cleared during the silence.
         self._commander = Commander(leads=True)
-        self._fine = clock.steady_s()
+        self._fine = self._stepped = clock.steady_s()
         self._watch = Watch(robot, self._fine)
 
     def step(self, typed: str) -> None:
         """Process the typed keys, send the command that is due, and process received states."""
         now = clock.steady_s()
         now_ns = round(now * NS_PER_S)
-        self._keyboard.take(typed, now)
+        waited, self._stepped = now - self._stepped, now
+        self._keyboard.take(typed, now, waited)
         wish = self._keyboard.wish(now)
         if wish is not None:
             self._commander.take(Wish(wish), now_ns)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from itertools import combinations
 from typing import Any
@@ -353,6 +354,64 @@ def test_another_word_that_is_typed_while_a_motor_turns_ends_nothing() -> None:
 
     robot = Robot()
     assert Checked(robot, Types(robot)).failed == []
+
+
+class Stalls(Robot):
+    """A robot whose check stands still once, while all `turning` motors have a set point.
+
+    The host's clock advances in the stall only if the computer is not `asleep`.
+    """
+
+    def __init__(self, seconds: float, *, asleep: bool, turning: int) -> None:
+        super().__init__()
+        self._seconds, self._asleep, self._turning = seconds, asleep, turning
+        self.asleep_ns = 0
+        self.stalled = False
+        self.turned_after: list[bytes] = []
+        """Lines after the stall that turn a motor."""
+
+    def send(self, data: bytes) -> None:
+        if self.stalled and re.search(rb"[1-9]", data.partition(b"#")[0]):
+            self.turned_after.append(data)
+        super().send(data)
+
+    def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
+        if self.stalled or sum(map(bool, self.mcu.vehicle.set_points)) < self._turning:
+            return super().listen(until_ns)
+        self.stalled = True
+        stall_ns = int(self._seconds * 1e9)
+        if self._asleep:
+            self.mcu.vehicle.set_points[:] = [0.0] * 4  # the watchdog stopped the motors
+            self.asleep_ns = stall_ns
+            return super().listen(until_ns)
+        return super().listen(until_ns + stall_ns)
+
+
+@pytest.mark.parametrize("asleep", [False, True], ids=["stopped", "suspended"])
+@pytest.mark.parametrize("turning", [1, 2])
+def test_a_check_that_stood_still_while_a_motor_turns_turns_no_motor_any_more(
+    turning: int, asleep: bool
+) -> None:
+    robot = Stalls(60.0, asleep=asleep, turning=turning)
+    questions: list[str] = []
+
+    class Away(Person):
+        def ask(self, question: str, answers: Sequence[str]) -> str | None:
+            assert not robot.stalled
+            questions.append(question)
+            return super().ask(question, answers)
+
+    found: list[Finding] = []
+    procedure.run(robot, Away(robot), robot.config, found.append, lambda: robot.asleep_ns)
+    assert robot.stalled
+    assert robot.turned_after == []
+    stopped, rest = found[-2:]
+    assert (stopped.name, stopped.verdict) == ("stall", "FAIL")
+    assert stopped.figure == "stood still for 60.0 s"
+    assert "start the check again" in stopped.mend
+    assert rest.text.startswith("the check ended early: stall; not tried: ")
+    assert robot.later() == [0.0] * 4
+    assert (len(questions) > 1) == (turning > 1)
 
 
 class Trouble(Robot):

@@ -68,13 +68,17 @@ class World:
         self.stalls: tuple[float, float] = math.inf, 0.0
         """Time at which this program stops running, and for how long, s. The states of this time
         are lost, except for one that waits in the queue."""
+        self.blocks: tuple[float, float] = math.inf, 0.0
+        """Time from which the bus accepts nothing, and for how long, s."""
         self._says, self._told = says, 100.0
 
     def send(self, linear: float, angular: float = 0.0) -> None:
+        self._block()
         self.sent.append(linear)
 
     def subscribe(self, name: str) -> Any:
         assert name == "state"
+        self._block()
         return self
 
     def undeclare(self) -> None:
@@ -112,6 +116,12 @@ class World:
                 self.now += pause
                 self._stall()
         return self.now - 100.0
+
+    def _block(self) -> None:
+        begin, blocked = self.blocks
+        if self.now - 100.0 >= begin:
+            self.now += blocked
+            self.blocks = math.inf, 0.0
 
     def _stall(self) -> None:
         begin, stalled = self.stalls
@@ -277,7 +287,8 @@ def test_a_drive_does_not_go_on_after_this_program_stood_still(
     """The daemon publishes its state as always, and one state waits in the queue."""
     world = World(followed)
     world.stalls = begins, 4.0
-    with pytest.raises(NotDrivenError, match=r"stood still for 4\.[01] s.*not finished"):
+    words = r"sent no command for 4\.[01] s.*not finished.*suspended"
+    with pytest.raises(NotDrivenError, match=words):
         world.drive(monkeypatch, 60.0)
     assert begins + 4.0 <= world.now - 100.0 < begins + 4.1
     assert (0.5 in world.sent) == (begins == 0.9)
@@ -290,8 +301,30 @@ def test_a_drive_whose_end_passed_while_this_program_stood_still_was_not_finishe
 ) -> None:
     world = World(followed)
     world.stalls = 0.9, 4.0
-    with pytest.raises(NotDrivenError, match="stood still"):
+    with pytest.raises(NotDrivenError, match="sent no command"):
         world.drive(monkeypatch, 1.0)
+
+
+@pytest.mark.parametrize("begins", [0.1, 0.9], ids=["opening", "driving"])
+def test_a_drive_does_not_go_on_after_the_bus_accepted_no_command_and_names_the_network(
+    monkeypatch: pytest.MonkeyPatch, begins: float
+) -> None:
+    world = World(followed)
+    world.blocks = begins, 0.6
+    words = r"sent no command for 0\.[67] s.*not finished.*network"
+    with pytest.raises(NotDrivenError, match=words):
+        world.drive(monkeypatch, 60.0)
+    assert begins + 0.6 <= world.now - 100.0 < begins + 0.8
+    assert world.sent[-1] == 0.0
+
+
+def test_a_drive_begins_however_long_the_bus_takes_to_subscribe(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    world = World(followed)
+    world.blocks = 0.0, 0.6
+    world.drive(monkeypatch)
+    assert world.sent.count(0.5) in (20, 21)
 
 
 def test_a_drive_goes_on_after_a_short_stall(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from acsard.client.commander import STALE_NS, Commander, Wish
 from acsard.client.outbox import Outbox
-from acsard.core.values import REST, Twist
+from acsard.core.values import NS_PER_S, REST, Twist
 from acsard.host import clock
 from tests.system.harness import until
 
@@ -72,6 +72,36 @@ def test_a_speed_that_became_too_old_is_dropped_and_a_zero_is_sent(bus: Bus) -> 
     outbox.flush(PATIENCE_S)
     assert bus.sent == [ZERO, ZERO]
     assert dropped == [True]
+
+
+def test_a_speed_that_waited_for_a_burst_during_a_suspend_is_dropped(
+    bus: Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The monotonic clock stands still in a suspend."""
+    asleep_ns = 0
+    monkeypatch.setattr(clock, "asleep_ns", lambda: asleep_ns)
+    dropped: list[bool] = []
+    outbox, one = Outbox(lambda: dropped.append(True)), Commander(gathers=True)
+    with outbox._news:  # the thread cannot send the command before the suspend
+        outbox.take(one, bus.put, AHEAD)
+        asleep_ns = 3600 * NS_PER_S
+    outbox.flush(PATIENCE_S)
+    assert bus.sent == []
+    assert dropped == [True]
+
+
+def test_no_zero_is_sent_for_a_drive_that_ended_before_a_suspend(
+    bus: Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asleep_ns = 0
+    monkeypatch.setattr(clock, "asleep_ns", lambda: asleep_ns)
+    outbox, one = Outbox(), Commander()
+    outbox.take(one, bus.put, AHEAD)
+    outbox.flush(PATIENCE_S)
+    asleep_ns = 3600 * NS_PER_S
+    outbox.release(one, 0.25)
+    outbox.end(PATIENCE_S)
+    assert bus.sent == [AHEAD]
 
 
 def test_a_sender_that_leaves_while_the_bus_is_blocked_still_gets_its_zero(bus: Bus) -> None:

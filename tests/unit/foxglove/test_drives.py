@@ -161,6 +161,16 @@ def test_what_waited_behind_another_s_bus_that_is_locked_is_too_old_to_go(
     assert [one.twist.linear for one in second.heard if one.twist != REST] == [0.3]
 
 
+def test_a_viewer_does_not_drive_after_a_suspend(
+    viewers: Viewers, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The monotonic clock stands still in a suspend."""
+    viewers.publish(1, AHEAD)
+    assert list(viewers.drives.driving()) == [1]
+    monkeypatch.setattr(clock, "asleep_ns", lambda: 10**15)
+    assert not viewers.drives.driving()
+
+
 def test_a_bus_that_fails_one_viewer_is_told_and_fails_no_other(viewers: Viewers) -> None:
     viewers.sessions[1].broken = True
     viewers.publish(1, AHEAD)

@@ -17,7 +17,9 @@ from acsard.client import fleet as fleets
 from acsard.client.fleet import Row
 from acsard.client.follower import FLEET_ASK_S
 from acsard.core.messages.schema import BatterySummary, Info, Time
+from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.address import Address
+from acsard.host import clock as clocks
 from acsard.top.fleet_table import HEADS, Roster, table
 from tests.each import each
 from tests.unit.top.screens import STATE, sample_of
@@ -243,7 +245,7 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     clock = Clock()
-    monkeypatch.setattr(fleets, "time", SimpleNamespace(monotonic=lambda: clock.now))
+    monkeypatch.setattr(fleets, "clock", SimpleNamespace(steady_s=lambda: clock.now))
     return clock
 
 
@@ -313,6 +315,20 @@ def test_the_version_of_a_robot_that_publishes_its_state_often_is_asked_for(
         version = fleet.rows()[0].version
         clock.now += 0.1
     assert version == "0.1"
+
+
+def test_a_state_from_before_a_suspend_is_old(
+    session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The monotonic clock stands still in a suspend."""
+    fleet = fleet_of(session)
+    session.comes("robot1")
+    fleet._state(sample_of(STATE, "acsard/robot1/state"))
+    slept_ns = clocks.asleep_ns() + 3600 * NS_PER_S
+    monkeypatch.setattr(clocks, "asleep_ns", lambda: slept_ns)
+    (row,) = fleet.rows()
+    assert row.silent
+    assert row.age >= 3600.0
 
 
 @pytest.mark.parametrize(

@@ -253,17 +253,59 @@ def test_keys_that_a_stalled_connection_held_back_do_not_drive(
     assert robot.sent[-1] == 0.5
 
 
-def test_a_key_that_was_pressed_before_a_suspend_does_not_drive_after_it(
-    monkeypatch: pytest.MonkeyPatch,
+@each("asleep", [60.0, 0.0])
+@each("reads", [[""], ["i"], [8 * "i"], [64 * "i", "ii"]])
+def test_a_key_that_was_pressed_before_or_in_a_stall_does_not_drive_after_it(
+    reads: list[str], asleep: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """The computer was suspended for `asleep` s of the stall. Keys were typed in the meantime."""
     robot = Robot()
     drive = Drive(robot, monkeypatch)
     drive.step("i", times=5)
     sent = len(robot.sent)
     drive.now += 60.0
-    drive.asleep += 60.0
+    drive.asleep += asleep
+    for read in reads:
+        drive.ride.step(read)
+        drive.now += 0.005
+    drive.step(times=10)
+    assert len(robot.sent) > sent
+    assert set(robot.sent[sent:]) == {0.0}
+    drive.step("i", times=3)
+    assert robot.sent[-1] == 0.5
+
+
+def test_a_press_does_not_drive_for_the_rest_of_its_hold_after_a_stall(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    robot = Robot()
+    drive = Drive(robot, monkeypatch)
+    drive.step(times=10)
+    drive.ride.step("i")
+    sent = len(robot.sent)
+    drive.now += (GRACE_S + HOLD_S) / 2
     drive.step(times=10)
     assert robot.sent[sent:] == [0.0] * ZEROS
+
+
+def test_a_stall_without_a_key_sends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A zero would stop another program that drives as the same source."""
+    robot = Robot()
+    drive = Drive(robot, monkeypatch)
+    drive.step(times=10)
+    sent = len(robot.sent)
+    drive.now += 60.0
+    drive.step(times=10)
+    assert len(robot.sent) == sent
+
+
+def test_a_key_drives_after_a_short_stall(monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = Robot()
+    drive = Drive(robot, monkeypatch)
+    drive.step(times=10)
+    drive.now += 0.8 * GRACE_S
+    drive.step("i", times=2)
+    assert robot.sent[-1] == 0.5
 
 
 def test_a_space_stops_at_the_next_step(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,6 +13,7 @@ from acsard.client.follower import ASK_S, FIRST_S, SILENT_S, Watch
 from acsard.core.messages.schema import Time
 from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.address import Address
+from acsard.host import clock
 from acsard.web import robots
 from acsard.web.metrics import Counts
 from acsard.web.robots import LOOK_S, About, Robots, _Asking
@@ -27,11 +27,11 @@ class World:
     """A page's robot whose time passes as fast as the page looks."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.now = 100.0
+        self.now, self.asleep = 100.0, 0.0
         self.answers: Callable[[], Any] = lambda: None
         self.asked = 0
-        clock = SimpleNamespace(mono_ns=lambda: round(self.now * NS_PER_S))
-        monkeypatch.setattr(robots, "clock", clock)
+        monkeypatch.setattr(clock, "mono_ns", lambda: round((self.now - self.asleep) * NS_PER_S))
+        monkeypatch.setattr(clock, "asleep_ns", lambda: round(self.asleep * NS_PER_S))
         monkeypatch.setattr(robots, "LOOK_S", 0.0)
 
         async def at_once(call: Callable[[], Any], timeout: float | None) -> Any:
@@ -118,3 +118,18 @@ def test_a_robot_that_comes_back_is_here_at_once(world: World) -> None:
     found = world.told(10.0, lambda t: None if 2.0 < t < 6.0 else world.state())
     assert [bool(gone) for _, gone in found] == [False, True, False]
     assert found[-1][0] <= 6.0 + 2 * LOOK_S
+
+
+def test_a_robot_whose_last_state_is_from_before_a_suspend_is_silent_at_once(world: World) -> None:
+    def publishes(t: float) -> Any:
+        if t < 5.0:
+            return world.state()
+        if not world.asleep:
+            world.asleep = 60.0
+            world.now += 60.0
+        return None
+
+    (_, here), (at, gone) = world.told(70.0, publishes)
+    assert here == ""
+    assert "nothing is received" in gone
+    assert 65.0 <= at <= 65.0 + 2 * LOOK_S

@@ -12,6 +12,8 @@ import pytest
 import zenoh
 
 from acsard.client import Client
+from acsard.core.values import NS_PER_S
+from acsard.host import clock
 from acsard.web.streams import Stream, Streams
 
 KEY = "acsard/acsar/events"
@@ -49,6 +51,29 @@ def test_an_answer_that_was_overtaken_is_left_out(samples: list[zenoh.Sample]) -
     stream.take(samples[1])
     stream.answered(samples[0])
     assert stream.value()[:2] == (1, b"2")
+
+
+def test_the_age_of_a_message_counts_a_suspend(
+    samples: list[zenoh.Sample], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The monotonic clock stands still in a suspend."""
+    stream = Stream()
+    stream.take(samples[0])
+    slept_ns = clock.asleep_ns() + 3600 * NS_PER_S
+    monkeypatch.setattr(clock, "asleep_ns", lambda: slept_ns)
+    assert stream.value()[2] >= 3_600_000.0
+
+
+def test_an_age_is_never_negative(
+    samples: list[zenoh.Sample], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The clock's reading is too late by the time for which a thread waited for a core in it."""
+    stream = Stream()
+    with monkeypatch.context() as patched:
+        slept_ns = clock.asleep_ns() + NS_PER_S
+        patched.setattr(clock, "asleep_ns", lambda: slept_ns)
+        stream.take(samples[0])
+    assert stream.value()[2] == 0.0
 
 
 def test_what_comes_by_itself_is_not_asked_for_of_another_robot(session: zenoh.Session) -> None:
