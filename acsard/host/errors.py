@@ -70,7 +70,7 @@ class ReplyError(MendableError, RuntimeError):
 
 
 class NotDrivenError(MendableError, RuntimeError):
-    """The robot does not follow this client's commands, or this program sent no command for some time during a drive.
+    """The robot does not follow this client's commands, or the client sent none for some time.
 
     The text is the reason.
     """
