@@ -246,13 +246,23 @@ class Wait(Struct, frozen=True):
     """The condition that a command source waits for (`arbiter_text.py` makes a sentence of it)."""
 
     what: Literal[
-        "nothing", "command", "proof", "late", "neutral", "zeros", "higher", "equal", "senders"
+        "nothing",
+        "command",
+        "proof",
+        "late",
+        "stalled",
+        "neutral",
+        "zeros",
+        "higher",
+        "equal",
+        "senders",
     ]
     source: str = ""
     """The source that the condition `what` names, "" if it names none.
 
-    - neutral, proof, late: The waiting source itself. It must send a zero, must show that its
-      delays are steady, or sends its commands too late.
+    - neutral, proof, late, stalled: The waiting source itself. It must send a zero, must show that
+      its delays are steady, sends its commands too late, or has sent none since the daemon stood
+      still.
     - zeros: The source that controls the robot, but sends only zeros.
     - higher, equal: The source that controls the robot with a higher or an equal priority.
     """

@@ -269,7 +269,7 @@ def test_the_simulator_is_calibrated_from_the_first_question_to_the_written_line
     person.asked("from its mark", RIDES_S)
     where = bus.get("sim/pose")["pose"]["position"]
     person.types("far")
-    person.shows("guide-wrong", "a number of m")
+    person.shows("guide-wrong", "a number in m")
     person.types(f"{math.hypot(where['x'], where['y']):.3f}".replace(".", ","))
     person.asked("2. The robot drives back")
     person.press("start")

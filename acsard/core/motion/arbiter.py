@@ -28,7 +28,8 @@ from acsard.core.motion.neutral import Sender, is_zero
 from acsard.core.values import NS_PER_S, REST, Command, SourceStatus, Twist, Wait
 
 MAX_SENDERS = 16
-"""Largest number of senders that one source remembers. Live, armed senders are never replaced."""
+"""Largest number of senders that one source remembers. Live, armed senders are never replaced,
+and neither is one that must send a zero again because its clock was just set."""
 
 Objection = Literal["", "unknown_source", "not_finite", "too_many_senders", "unproven", "stale"]
 """The reason to refuse a command, or "" if the arbiter accepts it."""
@@ -75,6 +76,7 @@ class _Source:
         self.timeout_ns = int(settings.timeout * NS_PER_S)
         self.proof = Wait("proof", settings.name, min(self.timeout_ns, LONGEST_PROOF_NS) / NS_PER_S)
         self.late = Wait("late", settings.name, settings.timeout)
+        self.stalled = Wait("stalled", settings.name)
         for sender in self.senders.values():
             sender.use(self.timeout_ns, self.pause_ns)
 
@@ -91,8 +93,8 @@ class _Source:
     def _account(self, name: str, now_ns: int) -> tuple[bool, bool, int]:
         """Return the rank of a sender. `add` replaces the sender with the lowest rank."""
         sender = self.senders[name]
-        armed = sender.armed(now_ns)
-        return armed and sender.present(now_ns), armed, sender.noticed_ns
+        holds = sender.holds(now_ns)
+        return holds, holds or sender.armed(now_ns), sender.noticed_ns
 
     def cancel_zeros(self, at_ns: int) -> None:
         """Record a message that may be a speed of any sender with a shared identity."""
@@ -154,7 +156,7 @@ class _Source:
     def why(self, sender: Sender, now_ns: int) -> Wait:
         """Return why the robot does not follow this sender, which is not live."""
         if not sender.doubtful(now_ns):
-            return COMMAND
+            return self.stalled
         if sender.doubt == "stale":
             return self.late
         return self.proof if sender.armed(now_ns) else self.neutral(sender)
@@ -209,7 +211,8 @@ class Arbiter:
         """Begin a step at this monotonic time, before its commands.
 
         If the daemon stood still since the last step, the bus may not have delivered yet what
-        arrived meanwhile. Each sender keeps its place, and `commands.neutral_pause` takes longer.
+        arrived meanwhile. Each sender keeps its place for a short time more, and
+        `commands.neutral_pause` takes longer (see `Sender.resume`).
         """
         before_ns, self._begun_ns = self._begun_ns, now_ns
         if now_ns - before_ns > STALL_NS:

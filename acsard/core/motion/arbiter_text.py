@@ -56,6 +56,8 @@ def waiting(wait: Wait) -> str:
                 "network delays them, or the sender's clock was set; if this goes on, check the "
                 "network, then restart the sender"
             )
+        case "stalled":
+            return f"the daemon stood still: waiting for the next command of {wait.source}"
         case "neutral":
             lasts = f"; it has sent speeds for over {lasting(wait.lasts)}" if wait.lasts else ""
             alone = f", and no speed for {wait.seconds:g} s after it," if wait.shared else ""

@@ -126,10 +126,14 @@ class _Proof:
       backlog arrives, or only rise, as while a queue grows.
     """
 
-    def __init__(self, delay: int, at_ns: int, needed_ns: int, share: int, again: bool) -> None:
+    def __init__(
+        self, delay: int, at_ns: int, timeout_ns: int, needed_ns: int, share: int, again: bool
+    ) -> None:
+        self.timeout_ns = timeout_ns
+        """Timeout of the source whose command began the test, ns."""
         self.least = self._first = self._half = delay
         self._length_ns, self._share, self._again = needed_ns // 2, share, again
-        self._begun_ns = self._last_ns = at_ns
+        self._begun_ns = self.last_ns = at_ns
         self._halves: list[tuple[int, int]] = []
         """Start (monotonic) and minimum delay of the latest halves, ns."""
 
@@ -142,7 +146,7 @@ class _Proof:
         if not -EARLY_NS <= delay - self._first <= WAVER_NS:
             return "failed"
         proven = False
-        if at_ns - self._begun_ns >= self._length_ns and at_ns - self._last_ns > TOGETHER_NS:
+        if at_ns - self._begun_ns >= self._length_ns and at_ns - self.last_ns > TOGETHER_NS:
             self._halves.append((self._begun_ns, self._half))
             self._begun_ns += self._length_ns
             if at_ns - self._begun_ns >= self._length_ns:
@@ -150,7 +154,7 @@ class _Proof:
             self._half = delay
             proven = self._constant(at_ns)
         self._half, self.least = min(self._half, delay), min(self.least, delay)
-        self._last_ns = at_ns
+        self.last_ns = at_ns
         return "proven" if proven and delay - self.least <= timeout_ns else "open"
 
     def _constant(self, at_ns: int) -> bool:
@@ -182,9 +186,6 @@ class _Clock:
         self.gap_ns = GAP_NS
         """Longest silence that is not a pause, ns: `GAP_NS`, or the longest timeout of the sources
         that the sender has commanded."""
-        self._short_ns = KEEP_NS
-        """Shortest timeout, ns, of the sources that the clock's senders have commanded. A command
-        is on time if it is late by at most this."""
         self.forgiven_ns = 0
         """Part of the last trusted rise of the delay that no adjustment of stamps explains, ns."""
         self._stamp_ns = 0
@@ -208,6 +209,9 @@ class _Clock:
         adjustment, and the stamp before the adjustment, all in ns."""
         self._paused = False
         """Whether the sender paused since its last timely command. Its clock may have been set."""
+        self._leapt = False
+        """Whether the delay has jumped since it was last short. The commands of a source with a
+        longer timeout are fresh meanwhile, and must not hide the jump from another source."""
         self._budget, self._budget_at_ns = FORGIVE_NS, at_ns
         self._proof: _Proof | None = None
         self._accepted: tuple[int, int] | None = None
@@ -224,7 +228,6 @@ class _Clock:
         silence, departed = at_ns - self.at_ns, stamp_ns - self._stamp_ns
         number = -1 if command.sequence is None else command.sequence
         self.gap_ns = max(self.gap_ns, timeout_ns)
-        self._short_ns = min(self._short_ns, timeout_ns)
         if self._repeats(stamp_ns, number, silence):
             return "stale"
         if silence > FORGET_NS and departed > FORGET_NS:
@@ -306,7 +309,7 @@ class _Clock:
             if sign == "open":
                 return "unproven"
         needed_ns = min(timeout_ns, LONGEST_PROOF_NS)
-        self._proof = _Proof(delay, at_ns, needed_ns, EVEN, again=False)
+        self._proof = _Proof(delay, at_ns, timeout_ns, needed_ns, EVEN, again=False)
         return "first"
 
     def _compare(
@@ -314,35 +317,34 @@ class _Clock:
     ) -> Verdict:
         late = delay - self._least
         early = max(0, self._early - silence // CREEP) + max(0, -late)
-        fresh = late <= timeout_ns and early <= EARLY_NS
-        if fresh and late <= self._short_ns:
+        jumped = abs(delay - self._delay) > silence // CREEP + JITTER_NS
+        proof = self._proof
+        if late <= timeout_ns and early <= EARLY_NS:
+            self._paused = False
+            if proof is not None and late > proof.timeout_ns:
+                # This source has a longer timeout than the one whose commands are in doubt.
+                return "fresh"
+            self._leapt = late > EARLY_NS and (jumped or self._leapt)
             self._proof, self._early = None, early
             self._least = min(self._least, delay)
             self._forget_adjustments()
             return "fresh"
-        if fresh and (steady or self._proof is None):
-            return "fresh"
         if steady:  # the known minimum was that of a backlog
             self.state, self._proof = "new", None
             return self._prove(delay, at_ns, silence, timeout_ns)
-        # If the command is fresh for its own source, it only helps to prove the clock for another
-        # source, which has a shorter timeout.
-        otherwise: Verdict = "fresh" if fresh else "stale"
-        proof, needed_ns, share = self._proof, min(timeout_ns, LONGEST_PROOF_NS), CREPT
+        needed_ns, share = min(timeout_ns, LONGEST_PROOF_NS), CREPT
         if proof is None:
             self._accrue(at_ns, FORGIVE_NS)
-        elif silence <= self.gap_ns:
-            sign = proof.add(delay, at_ns, self._short_ns if fresh else timeout_ns)
-            if sign == "open" or (sign == "proven" and not self._forgive(proof, at_ns)):
-                return otherwise
+        elif at_ns - proof.last_ns <= self.gap_ns:
+            sign = proof.add(delay, at_ns, timeout_ns)
+            if sign == "open":
+                return "stale"
             if sign == "proven":
-                return "set"
-        jumped = abs(delay - self._delay) > silence // CREEP + JITTER_NS
-        # A command of another source, with a longer timeout, may have shown the jump before.
-        if proof or jumped or self._delay - self._least > timeout_ns:
+                return "set" if self._forgive(proof, at_ns) else "stale"
+        if proof or jumped or self._leapt:
             needed_ns, share = max(needed_ns, JUMP_PROOF_NS), EVEN
-        self._proof = _Proof(delay, at_ns, needed_ns, share, again=True)
-        return otherwise
+        self._proof = _Proof(delay, at_ns, timeout_ns, needed_ns, share, again=True)
+        return "stale"
 
     def _forgive(self, proof: _Proof, at_ns: int) -> bool:
         """Trust the proven delay if that is allowed, and return whether it is.

@@ -1,7 +1,7 @@
 """Decides by the neutral-first rule whether one sender may drive the robot.
 
 A sender may drive if it is armed. Only a zero, which is a command to rest, arms a sender. Silence
-does not. The sender stays armed until `require_neutral` or `unlearn` is called.
+does not. The sender stays armed until `require_neutral`, `disarm` or `unlearn` is called.
 
 - If no other program shares the sender's identity, a zero arms the sender at once, even directly
   after speeds.
@@ -14,9 +14,10 @@ does not. The sender stays armed until `require_neutral` or `unlearn` is called.
   depends on the Zenoh session that stamps its commands. Therefore a speed of one identity cancels
   the zeros of all.
 
-A sender keeps its place before other senders while it is live. If the stamps of its commands come
-into doubt, for example because its clock was set, it keeps the place for at most `PLACE_NS` longer.
-Without this rule, a sender that holds the robot still would lose it to a moving one.
+A sender keeps its place before other senders while it is live, and `PLACE_NS` longer if its
+commands go on but their stamps are in doubt, for example because its clock was set, or if the
+daemon stood still. Without this rule, a sender that holds the robot still would lose it to a moving
+one.
 """
 
 from __future__ import annotations
@@ -24,9 +25,9 @@ from __future__ import annotations
 from acsard.core.motion.freshness import LONGEST_PROOF_NS, Verdict
 from acsard.core.values import REST, Command
 
-PLACE_NS = LONGEST_PROOF_NS * 3 // 2
+PLACE_NS = 2 * LONGEST_PROOF_NS
 """Longest time for which a sender keeps its place without an accepted command, ns, if its commands
-go on but their stamps are in doubt, and then for which it keeps its place without being armed. A
+go on but their stamps are in doubt, and then for which it keeps the robot without being armed. A
 longest proof that restarts with its second half ends within this time."""
 
 GRACE_NS = 100_000_000
@@ -121,14 +122,19 @@ class Sender:
 
     def disarm(self, now_ns: int) -> None:
         """Require a zero again because the sender's clock was set. The sender keeps its place."""
+        if self.armed(now_ns):
+            self.disarmed_ns = now_ns
         self._zero_ns = self._proven_zero_ns = None
         self._armed = self._proven_armed = not self._neutral_first
-        self.disarmed_ns = now_ns
 
     def holds(self, now_ns: int) -> bool:
-        """Return whether the sender may keep a robot that it controls."""
+        """Return whether the sender may keep a robot that it controls.
+
+        After `disarm`, that is so for `PLACE_NS`, and while `commands.neutral_pause` runs.
+        """
         just_set = self.disarmed_ns is not None and now_ns - self.disarmed_ns <= PLACE_NS
-        return self.present(now_ns) and (just_set or self.armed(now_ns))
+        waits = just_set or self._zero_ns is not None
+        return self.present(now_ns) and (waits or self.armed(now_ns))
 
     def unlearn(self) -> None:
         """Undo the effect of zeros with unproven stamps, which the network may have delayed."""
@@ -138,7 +144,8 @@ class Sender:
         """Continue after the daemon stood still between these monotonic times.
 
         The commands that arrived meanwhile may come after this step. Therefore the sender keeps its
-        place for one timeout more, and the stall does not count as `commands.neutral_pause`.
+        place for one timeout more, at most until `PLACE_NS` after its last accepted command, and
+        the stall does not count as `commands.neutral_pause`.
         """
         if self.present(before_ns):
             self._present_ns = now_ns

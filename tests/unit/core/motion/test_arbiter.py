@@ -287,8 +287,8 @@ def test_a_source_s_age_is_that_of_the_last_command_of_any_sender() -> None:
 # senders whose stamps are in doubt
 
 
-@each(("seconds", "driver"), [(2.5, ""), (3.5, "low")])
-def test_a_source_whose_stamps_are_in_doubt_keeps_its_priority_for_three_seconds(
+@each(("seconds", "driver"), [(3.5, ""), (4.5, "low")])
+def test_a_source_whose_stamps_are_in_doubt_keeps_its_priority_for_four_seconds(
     seconds: float, driver: str
 ) -> None:
     bench = Bench(HIGH, LOW).known(HIGH, "clock", "a")
@@ -375,6 +375,48 @@ def test_a_shared_sender_whose_clock_was_set_keeps_the_robot_through_its_pause(
     assert bench.choice().twist == REST
 
 
+@each("pause", [0.5, 3.0, 10.0])
+def test_a_shared_sender_whose_clock_was_set_waits_for_a_new_pause_and_keeps_the_robot(
+    pause: float,
+) -> None:
+    bench = Bench(LEFT, RIGHT, armed=False, pause=pause)
+    set_at, waits = 40 + int(20 * pause), []
+    for at in range(set_at + int(20 * (3.0 + pause))):
+        late_ms = 9000.0 * (at >= set_at)
+        bench.wait(50).stamped(LEFT, late_ms, "clock", REST, "a", shared=True)
+        if at > set_at - 10:
+            bench.send(RIGHT, GO if at > set_at - 9 else REST, "b")
+        choice = bench.choice()
+        waits.append(choice.wait.what)
+        assert choice.source == "left" or at < 10
+    assert waits[set_at:].count("neutral") == 20 * pause
+
+
+def test_a_sender_that_must_send_a_zero_again_is_not_forgotten_for_a_new_one() -> None:
+    bench = Bench(LEFT, RIGHT, armed=False).known(LEFT, "clock", "a")
+    for number in range(15):
+        bench.send(LEFT, REST, f"sender {number}")
+    for _ in range(40):
+        bench.wait(50).stamped(LEFT, 9000.0, "clock", GO, "a")
+        assert bench.choice().sender == "a"
+    assert bench.choice().wait.what == "neutral"
+    bench.send(LEFT, GO, "one more")
+    assert bench.choice().sender == "a"
+
+
+def test_a_sender_whose_clock_is_set_again_and_again_keeps_the_robot_once_only() -> None:
+    bench = Bench(LEFT, RIGHT, armed=False).known(LEFT, "clock", "a")
+    bench.send(RIGHT, REST, "b")
+    late_ms, drives = 0.0, []
+    for at in range(400):
+        late_ms += 3000.0 * (at % 60 == 0)
+        bench.wait(50).stamped(LEFT, late_ms, "clock", GO, "a")
+        bench.send(RIGHT, GO, "b")
+        drives.append(bench.choice().sender == "b")
+    assert drives.index(True) < 20 * 7
+    assert all(drives[20 * 7 :])
+
+
 @each("other", [LEFT, RIGHT])
 def test_a_stall_of_the_daemon_takes_the_robot_from_no_sender(other: Source) -> None:
     bench = Bench(LEFT, RIGHT, armed=False)
@@ -388,6 +430,7 @@ def test_a_stall_of_the_daemon_takes_the_robot_from_no_sender(other: Source) -> 
     bench.wait(400).arbiter.begin(bench.now_ns)
     bench.send(other, GO, "b")
     assert (bench.choice().sender, bench.choice().twist) == ("a", None)
+    assert bench.choice().wait == bench.status(LEFT).waits_for == Wait("stalled", "left")
     bench.wait(5).send(LEFT, REST, "a")
     assert (bench.choice().sender, bench.choice().twist) == ("a", REST)
 
@@ -399,7 +442,7 @@ def test_a_delay_that_rose_heals_although_another_source_of_the_clock_has_a_long
     """A rise by 1.1 s exceeds the budget, so only the source with the long timeout goes on."""
     long = Source("long", 10, timeout=2.0)
     bench = Bench(HIGH, long, armed=False).known(HIGH, "clock", "a").known(long, "clock", "a")
-    for at in range(100):
+    for at in range(130):
         # The delay rises slowly enough that no stamp goes back.
         late_ms = min(12.0 * at, most_ms)
         bench.wait(25)

@@ -55,6 +55,10 @@ SENTENCES = [
         "commands of high arrive more than 0.25 s too late: the network delays them, or the "
         "sender's clock was set; if this goes on, check the network, then restart the sender",
     ),
+    (
+        Wait("stalled", "high"),
+        "the daemon stood still: waiting for the next command of high",
+    ),
     (Wait("higher", "high"), "high has priority: wait until it is silent"),
     (Wait("equal", "right"), "right has the same priority and came first: wait until it is silent"),
     (

@@ -23,12 +23,14 @@ class Clock:
         self.now = 0.0
         self.steadily(0.0, 1000 if known else 0)
 
-    def sends(self, delay: float, after: float = 50.0, name: str = "a") -> Verdict:
+    def sends(
+        self, delay: float, after: float = 50.0, name: str = "a", timeout: int = 250
+    ) -> Verdict:
         self.now += after
         at_ns = round(self.now * MS)
         stamp_ns = at_ns - round(delay * MS)
         command = Command("high", GO, at_ns, stamp_ns, name, steady=self.steady)
-        return self.freshness.judge(command, 250 * MS)
+        return self.freshness.judge(command, timeout * MS)
 
     def steadily(self, delay: float, lasting: float, every: float = 50.0) -> list[Verdict]:
         return [self.sends(delay, every) for _ in range(int(lasting / every))]
@@ -535,3 +537,36 @@ def test_numbers_without_stamps_keep_their_order_until_the_sender_pauses() -> No
     for number in range(1025):
         judged(2012, 1, f"stranger {number}")
     assert judged(2013, 1) == "fresh"
+
+
+# two sources of one clock
+
+
+def test_a_pause_excuses_no_rise_of_the_delay_once_a_command_was_fresh() -> None:
+    clock = Clock()
+    clock.sends(300.0)
+    assert clock.sends(400.0, 3000.0, timeout=1000) == "fresh"
+    clock.sends(5000.0, 5000.0, timeout=1000)
+    verdicts = [clock.sends(5000.0, timeout=1000) for _ in range(200)]
+    assert set(verdicts) == {"stale"}
+
+
+def test_a_late_command_of_a_source_does_not_disarm_it_while_its_others_are_fresh() -> None:
+    clock = Clock()
+    clock.sends(400.0, 1000.0, timeout=1000)
+    assert clock.sends(1200.0, 1000.0, timeout=1000) == "stale"
+    verdicts = [clock.sends(400.0 + at % 2, timeout=1000) for at in range(200)]
+    assert set(verdicts) == {"fresh"}
+
+
+@each(("rise", "least", "most"), [(400.0, 30, 40), (2.0, 1, 8)])
+def test_a_jump_that_a_source_with_a_long_timeout_has_hidden_is_tested_for_longer(
+    rise: float, least: int, most: int
+) -> None:
+    clock, delay, refused = Clock(), 0.0, 0
+    clock.now += 500.0
+    for _ in range(300):
+        delay = min(400.0, delay + rise)
+        assert clock.sends(delay, 25.0, timeout=1000) in ("fresh", "set")
+        refused += clock.sends(delay, 25.0) == "stale"
+    assert least <= refused <= most
