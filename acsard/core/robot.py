@@ -27,13 +27,14 @@ from acsard.core.link.link_state import WATCHDOG_S
 from acsard.core.link.session import McuSession
 from acsard.core.motion.arbiter import Arbiter, Choice
 from acsard.core.motion.arbiter_text import REFUSED, CommandEvents, chosen, missed, refused
-from acsard.core.motion.battery import Battery
+from acsard.core.motion.battery import EMPTY, Battery
 from acsard.core.motion.bumpers import Bumpers, missing
 from acsard.core.motion.emergency_stop import (
     DRIVER_FAULT,
     DRIVER_MEND,
     MISSING,
     PRESSED,
+    SILENT,
     EmergencyStop,
 )
 from acsard.core.motion.event_throttle import EventThrottle
@@ -70,6 +71,13 @@ UNHEARD_S = WATCHDOG_S - 0.05
 """If no line was written to the port for this time, s, the next speeds start from rest, because the
 MCU has stopped the motors after `WATCHDOG_S`. The 0.05 s are there because the clock of the MCU may
 run a little fast."""
+
+REPORTS = {
+    "estop": "its emergency stop",
+    "bumpers": "its bumpers",
+    "driver": "its motor drivers",
+}
+"""What the board reports, in words."""
 
 HALTED = (Mode.STOPPED, Mode.FAULT, Mode.SHUTDOWN)
 """Modes in which the robot brakes at the stop deceleration."""
@@ -135,10 +143,14 @@ class Robot:
         self._refused = ""
         self._refused_ns: int | None = None
         self._sanity = Sanity(config.feedback)
-        pressed = latches.stop is not None and any(c.why == PRESSED for c in latches.stop.causes)
-        self._estop = EmergencyStop(config.safety.estop, pressed)
+        stops = () if latches.stop is None else latches.stop.causes
+        causes = [latch.why for latch in (latches.fault, *stops) if latch and not latch.by]
+        self._estop = EmergencyStop(config.safety.estop, PRESSED in causes)
         self._bumpers = Bumpers(config.safety)
-        self._battery = Battery(config.battery)
+        self._battery = Battery(config.battery, any(why.startswith(EMPTY) for why in causes))
+        self._unreported = {name: why for why in causes if (name := _input(why))}
+        """Why each input of the board must be reported before a `clear`: it caused a latch that was
+        set before the daemon started. The keys are those of `REPORTS`."""
         self._answered = UnansweredLines(config.mcu.reply_period)
         self._tally = EventThrottle()
         self._asked: tuple[str, str, int | None] = ("", "", None)
@@ -288,7 +300,8 @@ class Robot:
             for part in (self._estop, self._bumpers, self._battery):
                 part.reopen()
         known = self._estop.state or self._bumpers.state or self._battery.status
-        if session.statuses or known or session.forgot:
+        kept = self._unreported or self._battery.held
+        if session.statuses or known or kept or session.forgot:
             self._watch_inputs(inputs.now, events)
         if link != "up":
             # Without a link the daemon cannot ramp, so set the speeds to zero at once. When the
@@ -350,7 +363,8 @@ class Robot:
         if self.session.forgot:
             for part in (estop, bumpers, battery):
                 part.forget()
-        held = "", ""
+            self._unreported = {}
+        held = self._awaited_report() if self._unreported else ("", "")
         if estop.why:
             held = estop.why, estop.mend
         elif bumpers.held:
@@ -360,6 +374,19 @@ class Robot:
         elif battery.held:
             held = battery.why, battery.mend
         self._life.hold(*held, now.mono_ns)
+
+    def _awaited_report(self) -> tuple[str, str]:
+        """Return the cause of a kept latch that the board has not reported yet, and what to do."""
+        reported = {
+            "estop": self._estop.use == "off" or bool(self._estop.state),
+            "bumpers": self._bumpers.use == "off" or bool(self._bumpers.state),
+            "driver": self.session.status.driver_fault is not None,
+        }
+        for name in [name for name in self._unreported if reported[name]]:
+            del self._unreported[name]
+        for name, why in self._unreported.items():
+            return why, f"wait until the board has reported {REPORTS[name]}"
+        return "", ""
 
     def _keep_away(self, now_ns: int) -> None:
         """Reduce the chosen command to its motion away from the pressed bumpers.
@@ -415,9 +442,12 @@ class Robot:
         """Update the odometry with a plausible line, and return the estimate."""
         checks = self._odometry.checks
         wheels = checks.wheels
-        # While the emergency stop counts as pressed, the motors may have no power, so wheels that
-        # ignore the speeds are no sign of a fault.
-        commanded = None if self._estop.why or self._estop.pressed_now else self._written
+        # While the emergency stop counts as pressed, the motors may have no power. In lines that
+        # waited for a late step, the board may have stopped them. So wheels that ignore the speeds
+        # are no sign of a fault.
+        unheard = self.session.lateness.step_s > UNHEARD_S
+        free = self._estop.why or self._estop.pressed_now or unheard
+        commanded = None if free else self._written
         fault = wheels.watch(commanded, line.speeds, line.since)
         if fault:
             self._fault(fault, now, events)
@@ -593,3 +623,12 @@ class Robot:
                 return GOING_DOWN
             case _:
                 assert_never(self._life.mode)
+
+
+def _input(why: str) -> str:
+    """Return the input of the board that this cause of a latch is about, or ""."""
+    if why in (PRESSED, SILENT):
+        return "estop"
+    if why == DRIVER_FAULT:
+        return "driver"
+    return "bumpers" if "bumper" in why else ""

@@ -8,7 +8,7 @@ from contextlib import nullcontext
 
 import pytest
 
-from acsard.core.config.settings import Config, SimConfig
+from acsard.core.config.settings import Config, McuConfig, SimConfig
 from tests.scenarios.world import World
 
 
@@ -49,3 +49,18 @@ def test_no_line_of_a_robot_that_answers_at_uneven_times_is_dropped(counts: int)
     assert "line_implausible" not in world.state.counters
     assert not [event for event in world.events if event.name == "fault"]
     assert world.state.encoder_counts == [0] * 4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("configured", [True, False])
+@pytest.mark.parametrize("counts", [16, 20])
+def test_a_robot_whose_wheels_respond_late_brakes_without_a_fault(
+    counts: int, configured: bool
+) -> None:
+    sim = SimConfig(encoder_counts=counts, motor_time_constant=0.2)
+    world = World(Config(sim=sim, mcu=McuConfig(encoder_counts=counts * configured)))
+    world.run(0.5)
+    for at in range(3):
+        world.drive(1.0, seconds=1.5 + 0.017 * at)
+        world.hold(0.0, 0.0, 1.5)
+    assert world.state.mode == "driving"

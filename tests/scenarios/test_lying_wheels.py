@@ -12,6 +12,7 @@ from acsard.core.config.settings import (
     Config,
     FeedbackConfig,
     LimitsConfig,
+    McuConfig,
     OdometryConfig,
     SimConfig,
 )
@@ -282,3 +283,18 @@ def test_a_gyro_that_is_none_is_named_in_its_first_turn_and_never_used(
         assert made.state.gyro == does
     made.hold(0.0, seconds=1.0)
     assert off(made)[1] < 0.02
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("baud", "period"), [(38400, 0.01), (19200, 0.02)])
+def test_lines_that_waited_while_the_computer_stood_still_are_no_fault(
+    baud: int, period: float
+) -> None:
+    """The board reports by its own clock, and its watchdog has stopped the motors."""
+    world = World(Config(mcu=McuConfig(baud_rate=baud, reply_period=period)))
+    with world.mcu.free_running(period):
+        world.run(2.0)
+        world.drive(0.6, seconds=2.5)
+        world.stall(1.5)
+        world.run(0.02)
+    assert world.state.mode == "ready"

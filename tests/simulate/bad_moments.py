@@ -536,6 +536,54 @@ def _doubtful_holder(plan: Plan, dice: random.Random) -> None:
     plan["senders"] = [first, second]
 
 
+def _coarse(plan: Plan, dice: random.Random) -> None:
+    """Give the robot encoders with few counts, and wheels that respond as late as allowed."""
+    config, counts = plan["config"], dice.choice((16, 20, 32, 48))
+    config.pop("feedback", None)
+    config["drive"] = {"wheel_radius": 0.05, "wheel_separation": 0.3}
+    config["limits"] |= {
+        "linear_speed": 1.0, "angular_speed": 4.0, "wheel_speed": 40.0,
+        "linear_acceleration": 1.0, "linear_deceleration": 1.0,
+        "angular_acceleration": 4.0, "angular_deceleration": 4.0,
+        "linear_stop_deceleration": 3.0, "angular_stop_deceleration": 12.0,
+    }  # fmt: skip
+    config["sim"] |= {"encoder_counts": counts, "motor_time_constant": dice.choice((0.15, 0.2))}
+    config["mcu"].pop("encoder_counts", None)
+    if dice.random() < 0.5:
+        config["mcu"]["encoder_counts"] = counts
+    for name in ("linear_jerk", "angular_jerk"):
+        config["limits"].pop(name, None)
+    driver = _alone(plan, dice, [])
+    at, phases = 0.0, []
+    while at < plan["seconds"]:
+        rests_s = 1.5 + (config["commands"].get("neutral_pause", 1.0) if at == 0.0 else 0.0)
+        speed = dice.choice((-1, 1)) * round(dice.uniform(0.8, 1.0), 3)
+        phases += [[round(at, 3), 0.0, 0.0], [round(at + rests_s, 3), speed, 0.0]]
+        at += rests_s + dice.uniform(1.3, 2.5)
+    driver["phases"] = phases
+
+
+def _late_lines(plan: Plan, dice: random.Random) -> None:
+    """Stall the computer while a board reports by its own clock over a slow wire.
+
+    The board stops its motors meanwhile, and its lines wait.
+    """
+    config = plan["config"]
+    period, baud = dice.choice(((0.01, 38400), (0.01, 115200), (0.02, 19200), (0.05, 9600)))
+    config["mcu"] |= {"baud_rate": baud, "reply_period": period}
+    config["control"]["rate"] = min(100.0, 1.0 / period)
+    config["feedback"] = {"fault_time": dice.choice((0.1, 0.2, 0.5, 0.5))}
+    for source in config["commands"]["sources"]:
+        source["timeout"] = max(source["timeout"], 0.25)
+    plan["board"] = [["free_running", period]]
+    _alone(plan, dice, _drives(plan, dice, 0.5, 4.0, 8.0))
+    at = 5.0
+    while at < plan["seconds"] - 4.0:
+        lasts = round(dice.uniform(0.5, 1.6), 3)
+        plan["events"].append({"at": round(at, 3), "do": "stall", "for": lasts})
+        at += lasts + dice.uniform(5.0, 9.0)
+
+
 MOMENTS: dict[str, tuple[float, Callable[[Plan], bool], Callable[[Plan, random.Random], None]]] = {
     "late step": (0.05, _any, _late_step),
     "half duplex": (0.12, _is_plain, _half_duplex),
@@ -552,6 +600,8 @@ MOMENTS: dict[str, tuple[float, Callable[[Plan], bool], Callable[[Plan, random.R
     "behind a press": (0.04, _without_check, _behind_a_press),
     "stall behind a zero": (0.03, _any, _stall_behind_a_zero),
     "doubtful holder": (0.03, _any, _doubtful_holder),
+    "coarse encoders": (0.05, _may_be_ideal, _coarse),
+    "late lines": (0.05, _may_be_ideal, _late_lines),
 }
 """The share of the plans that have each moment, of those that can have it, whether a plan can have
 it, and what makes it."""

@@ -23,7 +23,8 @@ PLANS_OF_FAULT = {
     "moment": "late step", "robot set": "late step",
     "neutral stall": "stall behind a zero", "neutral place": "doubtful holder",
     "neutral set": "doubtful holder", "driver release": "behind a press",
-    "wheel press": "behind a press",
+    "wheel press": "behind a press", "wheel counts": "coarse encoders",
+    "wheel waited": "late lines",
     "freshness halves": "backlogs of newcomers", "freshness budget": "later and later",
 }  # fmt: skip
 """Kinds of plans by the name of a fault, or by the first word of its name."""
@@ -810,6 +811,20 @@ FAULTS = (
         WITNESS,
         "self.driven = self.driven and abs(seen) > SLACK",
         "self.driven = self.driven",
+    ),
+    fault(
+        "wheel counts",
+        "a wheel with few encoder counts is a runaway because its smoothed speed is late",
+        WITNESS,
+        "turns > 1.5 * due + SLACK",
+        "turns > 1.5 * fastest + SLACK",
+    ),
+    fault(
+        "wheel waited",
+        "the lines of a board that stopped its motors during a stall are a wheel fault",
+        ROBOT,
+        "unheard = self.session.lateness.step_s > UNHEARD_S",
+        "unheard = False",
     ),
     fault(
         "driver cut",

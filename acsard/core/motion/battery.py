@@ -37,6 +37,9 @@ since the previous report. Without this bound, a report during a motor start wou
 after a gap. Because of the bound, a mean of one report a second follows the voltage about a third
 as fast as it otherwise would."""
 
+EMPTY = "battery below "
+"""Beginning of the reason for the stop at the level "stop"."""
+
 ORDER: tuple[BatteryLevel, ...] = get_args(BatteryLevel)[:4]
 """The battery levels without "unknown", from the best to the worst."""
 
@@ -76,7 +79,8 @@ def _with_unit(config: BatteryConfig, value: float) -> str:
 class Battery:
     """The values of the battery that the board reports, and the level that follows from them."""
 
-    def __init__(self, config: BatteryConfig) -> None:
+    def __init__(self, config: BatteryConfig, stopped: bool = False) -> None:
+        """`stopped` says whether an empty battery stopped the robot before this daemon started."""
         self._config = config
         self._bounds = config.bounds
         self.status: BatteryStatus | None = None
@@ -87,7 +91,7 @@ class Battery:
         """The last values by name, each with its monotonic time of arrival, ns."""
         self._awaited = True
         """Whether the board has not reported `battery.measure` since the port was opened."""
-        self._known: BatteryLevel = "ok"
+        self._known: BatteryLevel = "stop" if stopped and "stop" in self._bounds else "ok"
         """The last level that was not "unknown": silence of the board does not end a stop."""
         self._told: BatteryLevel | None = None
         """The level in the last event, None before the first one."""
@@ -106,7 +110,7 @@ class Battery:
     @property
     def why(self) -> str:
         """The reason for the stop at the level "stop", in words without measured values."""
-        return f"battery below {_threshold(self._config, 'stop')}"
+        return f"{EMPTY}{_threshold(self._config, 'stop')}"
 
     @property
     def mend(self) -> str:

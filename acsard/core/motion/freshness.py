@@ -209,9 +209,6 @@ class _Clock:
         adjustment, and the stamp before the adjustment, all in ns."""
         self._paused = False
         """Whether the sender paused since its last timely command. Its clock may have been set."""
-        self._leapt = False
-        """Whether the delay has jumped since it was last short. The commands of a source with a
-        longer timeout are fresh meanwhile, and must not hide the jump from another source."""
         self._budget, self._budget_at_ns = FORGIVE_NS, at_ns
         self._proof: _Proof | None = None
         self._accepted: tuple[int, int] | None = None
@@ -317,14 +314,12 @@ class _Clock:
     ) -> Verdict:
         late = delay - self._least
         early = max(0, self._early - silence // CREEP) + max(0, -late)
-        jumped = abs(delay - self._delay) > silence // CREEP + JITTER_NS
         proof = self._proof
         if late <= timeout_ns and early <= EARLY_NS:
             self._paused = False
             if proof is not None and late > proof.timeout_ns:
                 # This source has a longer timeout than the one whose commands are in doubt.
                 return "fresh"
-            self._leapt = late > EARLY_NS and (jumped or self._leapt)
             self._proof, self._early = None, early
             self._least = min(self._least, delay)
             self._forget_adjustments()
@@ -341,7 +336,7 @@ class _Clock:
                 return "stale"
             if sign == "proven":
                 return "set" if self._forgive(proof, at_ns) else "stale"
-        if proof or jumped or self._leapt:
+        if proof or abs(delay - self._delay) > silence // CREEP + JITTER_NS:
             needed_ns, share = max(needed_ns, JUMP_PROOF_NS), EVEN
         self._proof = _Proof(delay, at_ns, timeout_ns, needed_ns, share, again=True)
         return "stale"

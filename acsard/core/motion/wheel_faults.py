@@ -306,8 +306,8 @@ class WheelFaults:
         """Compare the wheel speeds in a line with their commands. The caller must then call `look`.
 
         If a wheel has contradicted its command for `feedback.fault_time`, return the reason of the
-        fault, which names the wheel. Otherwise return "". `commanded` is None while the emergency
-        stop counts as pressed. `dt` is the time since the line before, s.
+        fault, which names the wheel. Otherwise return "". `commanded` is None while the motors may
+        have no power. `dt` is the time since the line before, s.
         """
         self.pushed = ""
         if commanded is None:

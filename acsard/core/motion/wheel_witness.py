@@ -99,6 +99,9 @@ class Witness:
         """Drop the evidence of faults, but keep `driven`, `ratio` and `slow`."""
         self.speed = 0.0
         """Measured speed, smoothed, rad/s."""
+        self._due = 0.0
+        """Magnitude that this smoothed speed may have, rad/s: the expected one, equally smoothed.
+        Few counts need much smoothing, and a healthy wheel then seems to brake too late."""
         self._seen, self._begins = 0.0, True
         self.evidence: dict[FaultKind, float] = dict.fromkeys(FAULTS, 0.0)
         """Seconds for which the wheel has shown each fault."""
@@ -132,13 +135,15 @@ class Witness:
         goal, command = expected.speed, expected.commanded
         if self._begins:
             self._begins, self.speed = False, seen
-        speed = self.speed = self.speed + (seen - self.speed) * dt / (count / CLEAR + dt)
+        share = dt / (count / CLEAR + dt)
+        speed = self.speed = self.speed + (seen - self.speed) * share
         constant, self._seen = seen == self._seen, seen
         size, wish, turns = abs(goal), abs(command), abs(speed)
         driven = self.driven = not still or (self.driven and turns > SLACK)
         fastest, least = (size, wish) if size > wish else (wish, size)
+        due = self._due = max(fastest, self._due + (fastest - self._due) * share)
         moving = size > SLACK and expected.settled
-        fast = driven and turns > 1.5 * fastest + SLACK
+        fast = driven and turns > 1.5 * due + SLACK
         against = moving and speed * goal < 0.0 and turns > 0.3 * size
         # A wheel that slows down sooner than `response_time` says is not dead, so compare its speed
         # with the smaller one of command and expected speed.

@@ -353,7 +353,10 @@ def test_a_restarted_daemon_starts_with_the_latch_of_the_press() -> None:
     after = Bench(latches=latches).linked()
     assert after.mode() == "stopped"
     assert after.out.reason.startswith("emergency stop pressed at the robot (latched at ")
-    assert after.out.reason.endswith("before the restart); call srv/clear")
+    assert after.out.reason.endswith(
+        "before the restart); wait until the board has reported its emergency stop, "
+        "then call srv/clear"
+    )
 
 
 def test_wheels_that_roll_without_power_are_no_fault() -> None:
@@ -899,9 +902,42 @@ def test_a_restarted_daemon_keeps_the_stop_and_judges_the_battery_anew() -> None
     after = Bench(GUARDED, latches=latches).linked()
     assert after.mode() == "stopped"
     assert after.out.reason.startswith("battery below battery.stop_below = 21 V (latched at ")
+    assert not after.answer("clear").success
     # Without a report nothing holds the stop.
-    after.step(ms=2500)
+    for _ in range(310):
+        after.step()
     assert after.answer("clear").success
+
+
+@each(
+    ("line", "words"),
+    [
+        (PRESSED_LINE, "its emergency stop"),
+        (OK_LINE + DRIVER_FAULT, "its motor drivers"),
+        (b"!status bumpers=.X\r\n", "its bumpers"),
+    ],
+)
+def test_a_restarted_daemon_refuses_clear_until_the_board_has_reported_the_cause(
+    line: bytes, words: str
+) -> None:
+    bench = Button(line)
+    latches = bench.linked().out.latches.after_restart()
+    after = Button(b"", latches=latches)
+    after.linked()
+    refused = after.answer("clear")
+    assert not refused.success
+    assert f"wait until the board has reported {words}" in refused.message
+    after.status(b"!status estop=ok driver=ok bumpers=..\r\n")
+    for _ in range(3):  # a new number of bumpers counts from its second line on
+        after.step()
+    assert after.answer("clear").success
+
+
+def test_a_restarted_daemon_that_waits_for_a_report_in_vain_allows_clear_after_3_s() -> None:
+    latches = Button(PRESSED_LINE).linked().out.latches.after_restart()
+    after = Bench(latches=latches).linked()
+    allowed = [after.answer("clear").success for _ in range(320)]
+    assert 290 < allowed.index(True) < 310
 
 
 # the link

@@ -559,14 +559,12 @@ def test_a_late_command_of_a_source_does_not_disarm_it_while_its_others_are_fres
     assert set(verdicts) == {"fresh"}
 
 
-@each(("rise", "least", "most"), [(400.0, 30, 40), (2.0, 1, 8)])
-def test_a_jump_that_a_source_with_a_long_timeout_has_hidden_is_tested_for_longer(
-    rise: float, least: int, most: int
-) -> None:
+@each("rise", [400.0, 2.0])
+def test_a_source_with_a_long_timeout_does_not_keep_another_of_its_clock_out(rise: float) -> None:
     clock, delay, refused = Clock(), 0.0, 0
     clock.now += 500.0
     for _ in range(300):
         delay = min(400.0, delay + rise)
         assert clock.sends(delay, 25.0, timeout=1000) in ("fresh", "set")
         refused += clock.sends(delay, 25.0) == "stale"
-    assert least <= refused <= most
+    assert 1 <= refused <= 8
