@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+from typing import Literal
 
 import pytest
 from msgspec.structs import replace
@@ -288,7 +289,7 @@ def test_a_gyro_that_is_none_is_named_in_its_first_turn_and_never_used(
 @pytest.mark.slow
 @pytest.mark.parametrize(("baud", "period"), [(38400, 0.01), (19200, 0.02)])
 def test_lines_that_waited_while_the_computer_stood_still_are_no_fault(
-    baud: int, period: float
+    baud: Literal[19200, 38400], period: float
 ) -> None:
     """The board reports by its own clock, and its watchdog has stopped the motors."""
     world = World(Config(mcu=McuConfig(baud_rate=baud, reply_period=period)))

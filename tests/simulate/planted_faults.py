@@ -323,7 +323,7 @@ FAULTS = (
         "neutral set",
         "a sender with a shared identity whose clock was set loses the robot to an equal one",
         NEUTRAL,
-        "and (just_set or self.armed(now_ns))",
+        "and (waits or self.armed(now_ns))",
         "and self.armed(now_ns)",
     ),
     fault(
