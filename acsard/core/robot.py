@@ -149,8 +149,8 @@ class Robot:
         self._bumpers = Bumpers(config.safety)
         self._battery = Battery(config.battery, any(why.startswith(EMPTY) for why in causes))
         self._unreported = {name: why for why in causes if (name := _input(why))}
-        """Why each input of the board must be reported before a `clear`: it caused a latch that was
-        set before the daemon started. The keys are those of `REPORTS`."""
+        """The causes of latches from before the start of the daemon, by the input that the board
+        must report before a `clear` (a key of `REPORTS`)."""
         self._answered = UnansweredLines(config.mcu.reply_period)
         self._tally = EventThrottle()
         self._asked: tuple[str, str, int | None] = ("", "", None)
@@ -442,13 +442,15 @@ class Robot:
         """Update the odometry with a plausible line, and return the estimate."""
         checks = self._odometry.checks
         wheels = checks.wheels
-        # While the emergency stop counts as pressed, the motors may have no power. In lines that
-        # waited for a late step, the board may have stopped them. So wheels that ignore the speeds
-        # are no sign of a fault.
-        unheard = self.session.lateness.step_s > UNHEARD_S
-        free = self._estop.why or self._estop.pressed_now or unheard
-        commanded = None if free else self._written
-        fault = wheels.watch(commanded, line.speeds, line.since)
+        # While the emergency stop counts as pressed, the motors may have no power, so wheels that
+        # ignore the speeds are no sign of a fault.
+        pressed = self._estop.why or self._estop.pressed_now
+        if self.session.lateness.step_s > UNHEARD_S and not pressed:
+            # The board may have stopped the motors since the last line, so the lines that waited
+            # say nothing about the wheels.
+            fault = wheels.pushed = ""
+        else:
+            fault = wheels.watch(None if pressed else self._written, line.speeds, line.since)
         if fault:
             self._fault(fault, now, events)
         if wheels.pushed:

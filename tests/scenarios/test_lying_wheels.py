@@ -299,3 +299,44 @@ def test_lines_that_waited_while_the_computer_stood_still_are_no_fault(
         world.stall(1.5)
         world.run(0.02)
     assert world.state.mode == "ready"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("clear", [True, False])
+@pytest.mark.parametrize(("counts", "speed"), [(16, 1.0), (48, 0.5), (3200, 0.8)])
+def test_a_runaway_is_found_behind_a_late_step_and_again_behind_a_clear(
+    counts: int, speed: float, clear: bool
+) -> None:
+    """Single lines of few counts report no motion, although the wheel turns."""
+    mcu = McuConfig(encoder_counts=counts, reply_period=0.01)
+    world = World(Config(mcu=mcu, sim=SimConfig(encoder_counts=counts)))
+    with world.mcu.free_running(0.01):
+        world.run(0.5)
+        world.drive(speed, seconds=0.8)
+        with world.mcu.pushed(speed):
+            world.stall(0.3)
+            world.hold(0.0, 0.0, 2.5)
+            assert world.state.mode == "fault"
+            if clear:
+                assert world.call("clear").success
+                world.hold(0.0, 0.0, 2.5)
+                assert world.state.mode == "fault"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("every", "fault_time"), [(0.5, 0.5), (0.7, 0.8)])
+def test_a_computer_that_is_late_again_and_again_hides_no_runaway(
+    every: float, fault_time: float
+) -> None:
+    config = Config(
+        mcu=McuConfig(reply_period=0.01), feedback=FeedbackConfig(fault_time=fault_time)
+    )
+    world = World(config)
+    with world.mcu.free_running(0.01):
+        world.run(0.5)
+        world.drive(0.8, seconds=1.0)
+        with world.mcu.pushed(0.8):
+            for _ in range(4):
+                world.stall(0.3)
+                world.hold(0.0, 0.0, every)
+    assert world.state.mode == "fault"

@@ -809,7 +809,7 @@ FAULTS = (
         "wheel press",
         "a wheel that rested during a press and is then turned by hand is a runaway",
         WITNESS,
-        "self.driven = self.driven and abs(seen) > SLACK",
+        "self.driven = self.driven and not self._rests(seen, dt, count)",
         "self.driven = self.driven",
     ),
     fault(
@@ -823,8 +823,8 @@ FAULTS = (
         "wheel waited",
         "the lines of a board that stopped its motors during a stall are a wheel fault",
         ROBOT,
-        "unheard = self.session.lateness.step_s > UNHEARD_S",
-        "unheard = False",
+        "if self.session.lateness.step_s > UNHEARD_S and not pressed:",
+        "if False:",
     ),
     fault(
         "driver cut",

@@ -306,15 +306,16 @@ class WheelFaults:
         """Compare the wheel speeds in a line with their commands. The caller must then call `look`.
 
         If a wheel has contradicted its command for `feedback.fault_time`, return the reason of the
-        fault, which names the wheel. Otherwise return "". `commanded` is None while the motors may
-        have no power. `dt` is the time since the line before, s.
+        fault, which names the wheel. Otherwise return "". `commanded` is None while the emergency
+        stop counts as pressed, so that the motors may have no power. `dt` is the time since the
+        line before, s.
         """
         self.pushed = ""
         if commanded is None:
             for side in self._sides:
                 side.forget()
                 for wheel, witness in zip(side.wheels, side.witnesses, strict=True):
-                    witness.coast(seen.as_tuple()[wheel])
+                    witness.coast(seen.as_tuple()[wheel], dt, self._count)
             return ""
         limit, lag = self._settings.fault_time, self._settings.response_time
         left, right, speeds = self._left, self._right, seen.as_tuple()

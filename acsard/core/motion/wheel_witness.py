@@ -93,15 +93,17 @@ class Witness:
         """Angle that the wheel rolled in `RATIO_S` of driving, divided by the expected angle."""
         self.slow = False
         """Whether the wheel turns in the right direction, but too slowly."""
+        self._due = 0.0
+        """Magnitude that the smoothed speed may have, rad/s: the expected one, equally smoothed.
+        Few counts need much smoothing, and a healthy wheel then seems to brake too late."""
+        self._rested_s = 0.0
+        """Time since the last line with more than `SLACK`, s."""
         self.forget()
 
     def forget(self) -> None:
-        """Drop the evidence of faults, but keep `driven`, `ratio` and `slow`."""
+        """Drop the evidence of faults, but keep what is known about the motion of the wheel."""
         self.speed = 0.0
         """Measured speed, smoothed, rad/s."""
-        self._due = 0.0
-        """Magnitude that this smoothed speed may have, rad/s: the expected one, equally smoothed.
-        Few counts need much smoothing, and a healthy wheel then seems to brake too late."""
         self._seen, self._begins = 0.0, True
         self.evidence: dict[FaultKind, float] = dict.fromkeys(FAULTS, 0.0)
         """Seconds for which the wheel has shown each fault."""
@@ -117,12 +119,18 @@ class Witness:
         """Whether the wheel was too fast, stood, or turned against its command in the last line."""
         self._seconds = self._went = self._way = 0.0
 
-    def coast(self, seen: float) -> None:
+    def coast(self, seen: float, dt: float, count: float) -> None:
         """Look at the speed of a wheel, rad/s, whose motor may have no power.
 
-        If it comes to rest, nothing but a push can turn it until the next command.
+        If it comes to rest, nothing but a push can turn it until the next command. `dt` and `count`
+        are those of `look`.
         """
-        self.driven = self.driven and abs(seen) > SLACK
+        self.driven = self.driven and not self._rests(seen, dt, count)
+
+    def _rests(self, seen: float, dt: float, count: float) -> bool:
+        """Return whether the wheel is slower than `SLACK`, also if its encoder has few counts."""
+        self._rested_s = 0.0 if abs(seen) > SLACK else self._rested_s + dt
+        return self._rested_s >= count / SLACK and abs(seen) <= SLACK
 
     def look(
         self, seen: float, expected: Expected, dt: float, most: float, count: float, still: bool
@@ -139,7 +147,8 @@ class Witness:
         speed = self.speed = self.speed + (seen - self.speed) * share
         constant, self._seen = seen == self._seen, seen
         size, wish, turns = abs(goal), abs(command), abs(speed)
-        driven = self.driven = not still or (self.driven and turns > SLACK)
+        rests = self._rests(seen, dt, count) and turns <= SLACK
+        driven = self.driven = not still or (self.driven and not rests)
         fastest, least = (size, wish) if size > wish else (wish, size)
         due = self._due = max(fastest, self._due + (fastest - self._due) * share)
         moving = size > SLACK and expected.settled

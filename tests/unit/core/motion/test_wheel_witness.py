@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from acsard.core.config.settings import DriveConfig, FeedbackConfig
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.wheel_faults import LEFT, RIGHT, WheelFaults
+from acsard.core.motion.wheel_witness import Witness
 from acsard.core.values import STILL, WHEELS, WheelSpeeds
 from tests.each import each
 
@@ -550,3 +551,16 @@ def test_a_reversed_encoder_that_is_left_out_is_a_fault_at_a_creep_too() -> None
 def test_motors_without_power_contradict_no_command() -> None:
     robot = driven(10.0)
     assert not any(robot.watch(None, STILL, DT) for _ in range(200))
+
+
+@each(("counts", "rests_s"), [(3200, 0.01), (96, 0.04), (16, 0.2)])
+def test_a_wheel_without_power_rests_when_it_has_not_turned_for_the_time_of_a_slow_count(
+    counts: int, rests_s: float
+) -> None:
+    witness, count, time_s = Witness(), math.tau / counts, 0.0
+    witness.driven = True
+    witness.coast(20.0, 0.01, count)
+    while witness.driven:
+        witness.coast(0.0, 0.01, count)
+        time_s += 0.01
+    assert time_s == pytest.approx(rests_s)
