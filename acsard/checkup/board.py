@@ -107,9 +107,9 @@ class Board:
         """Whether all motors have stood still once. From then on, a runaway motor ends the
         check."""
         self.between: Callable[[], object] = _nothing
-        """Function that is called when the board begins to listen, and then after each wait of up
-        to `BEAT_NS`. It may raise an exception that ends the check. It is not called while the last
-        zeros are sent."""
+        """Function that is called before `send` sends a line that turns a motor, when the board
+        begins to listen, and then after each wait of up to `BEAT_NS`. It may raise an exception
+        that ends the check. It is not called while the last zeros are sent."""
         # Results of the steps
         self.baud_rate: int = mcu.baud_rate
         self.comma = mcu.trailing_comma
@@ -238,6 +238,8 @@ class Board:
 
     def send(self, motors: Motors, comma: bool | None = None) -> None:
         """Send one line that commands these speeds, rad/s. The parameters are those of `line()`."""
+        if any(motors):
+            self.between()
         turned, self._commanded = any(self._commanded), motors
         self.wire.send(self.line(motors, comma))
         self.sent_lines += 1

@@ -301,9 +301,9 @@ FAIL wheels: not lifted
     -> lift the wheels, start the check again and confirm it
 FAIL stall: seen | stood still for {seconds:.1f} s
     this program did not run for that time. The operator may have left the robot meanwhile, so the
-    check turns no motor any more
-    -> was the computer suspended, or did something keep this program from running (Ctrl-Z, a
-    stalled terminal)? Stay at the robot and start the check again
+    check does not turn a motor again
+    -> was the computer suspended or overloaded, or did the terminal stall? Try again when the
+    computer is idle, and stay at the robot
 FAIL runaway: along | {letter}: commanded {told:.1f}, measured {seen:.1f} rad/s
     the encoder of {motor} reports more than {most:g} rad/s
     -> are the counts per turn in the firmware too low, or is its control loop unstable?

@@ -65,8 +65,9 @@ LATE_AGAIN, LATE_MOST = 2, 8
 """Largest numbers of repetitions because this computer was late: of one step, and of all steps.
 Without the limit for all steps, a check could take four minutes."""
 
-STALL_S = 0.5
-"""Longest time for which the program may stand still, s. After a longer stall, the check ends,
+STALL_S, ZEROS_STALL_S = 0.5, 5.0
+"""Longest time for which the program may stand still, s; `ZEROS_STALL_S` until the motors have
+stood still once, because only zeros are sent until then. After a longer stall, the check ends,
 because the operator may have left the robot. After a shorter one, a step may be repeated (see
 `LATE_AGAIN`)."""
 
@@ -86,8 +87,8 @@ def run(
 
     Before the operator confirms that the wheels are lifted, only zeros are sent. The last lines are
     always zeros, unless the serial port is lost. The check ends early if this program stands still
-    for more than `STALL_S` while it waits for no answer. Raises `KeyboardInterrupt` if the operator
-    types `QUITS`, also while a motor turns.
+    for more than `STALL_S`, or `ZEROS_STALL_S`, while it does not wait for an answer. Raises
+    `KeyboardInterrupt` if the operator types `QUITS`, also while a motor turns.
 
     `asleep_ns` returns for how long this computer was suspended since its start, ns. The wire's
     clock stands still in a suspend.
@@ -116,7 +117,7 @@ def run(
             board.zeros()
             if operator.ask(CONFIRM, (LIFTED,)) != LIFTED:
                 raise StoppedError(outcomes.find("wheels: not lifted"))
-            watched = _Watched(operator, lambda: (wire.now_ns() + asleep_ns()) / NS_PER_S)
+            watched = _Watched(operator, board, asleep_ns)
             board.between = watched.look
             _Steps(board, watched, once, seen).all(config.safety)
     except StoppedError as end:
@@ -136,12 +137,16 @@ def run(
 class _Watched:
     """The operator during the steps. `look` ends the check if the operator cannot attend to it."""
 
-    def __init__(self, operator: Operator, now_s: Callable[[], float]) -> None:
-        """`now_s` returns a monotonic time, s, that also advances during a suspend."""
+    def __init__(self, operator: Operator, board: Board, asleep_ns: Callable[[], int]) -> None:
+        """`asleep_ns` is the argument of `run`."""
         self.doing, self.keys = operator.doing, operator.keys
-        self._operator, self._now_s = operator, now_s
-        self._ran_s = now_s()
+        self._operator, self._board, self._asleep_ns = operator, board, asleep_ns
+        self._ran_s = self._now_s()
         """Time of the last call of `look`, or of the last answer if that came later."""
+
+    def _now_s(self) -> float:
+        """Return a monotonic time, s, that also advances during a suspend."""
+        return self._board.now_s + self._asleep_ns() / NS_PER_S
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
         """Ask the operator, who may take any time to answer."""
@@ -153,8 +158,11 @@ class _Watched:
         """Raise `KeyboardInterrupt` if the operator quits; `StoppedError` after a stall."""
         now_s = self._now_s()
         stalled_s, self._ran_s = now_s - self._ran_s, now_s
-        if stalled_s > STALL_S:
+        if stalled_s > (STALL_S if self._board.armed else ZEROS_STALL_S):
             raise StoppedError(outcomes.find("stall: seen", seconds=stalled_s))
+        if stalled_s > STALL_S:
+            # The board's own measurement leaves out a suspend, and a stall of the terminal.
+            self._board.lateness.look(stalled_s, self._board.now_s)
         if QUITS in self.keys(0.0).lower():
             raise KeyboardInterrupt
 

@@ -34,11 +34,11 @@ and the emergency stop and the bumpers that the board reports. It opens the port
 daemon first (exit code 75 if the daemon has the port). It asks you to type that the wheels are
 lifted. Then it turns the motors one by one, and then all together. It commands at most 3 rad/s, but
 a wheel whose encoder is dead or reversed can reach full speed. If the board restarts during a test,
-the tool reports that and repeats the test. If the tool itself stands still for more than 0.5 s, for
-example because the computer is suspended, the check ends. Its last lines to the board are always
-zeros, then it is silent. The exit code is 0 if every test was judged and none failed. It is 1 if a
-test failed, if the tool ended early, or if this computer was too slow to judge a test; in that case
-try again when the computer is idle.
+the tool reports that and repeats the test. If the tool itself stands still for more than 0.5 s, or
+for more than 5 s before the tests of the motors, the check ends, for example because the computer
+is suspended. Its last lines to the board are always zeros, then it is silent. The exit code is 0 if
+every test was judged and none failed. It is 1 if a test failed, if the tool ended early, or if this
+computer was too slow to judge a test; in that case try again when the computer is idle.
 """
 
 

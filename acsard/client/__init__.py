@@ -28,7 +28,7 @@ to do:
     NotDrivenError     RuntimeError     the robot does not follow your drive: it is stopped or in
                                         fault, another client drives, or you may not; or your
                                         program sent no command for 0.5 s, because it stood still or
-                                        the network failed; the text says which
+                                        the network failed; the text names the possible causes
     NotPermittedError  PermissionError  your certificate does not allow this, or you may not read
                                         its files
     CertificateError   ValueError       the certificates do not exist or cannot be used

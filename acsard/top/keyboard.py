@@ -3,7 +3,8 @@
 A terminal reports a key press but never its release. Each press therefore drives the robot for
 `HOLD_S`. Once the keyboard repeats a held key, each repeat drives the robot for `REPEAT_S` only.
 When the time of the last press or repeat is over, `acsard drive` sends three zero commands and then
-nothing. Keys that the operator typed while this program stood still do not drive the robot.
+nothing. Keys that the operator typed while this program stood still for more than 0.5 s do not
+drive the robot.
 """
 
 from __future__ import annotations
@@ -114,8 +115,9 @@ class Ride:
         # After a silence the robot may require a return to neutral, for example because it was
         # stopped and cleared during the silence.
         self._commander = Commander(leads=True)
+        self._watch = Watch(robot, clock.steady_s())
+        # To subscribe may take long. The terminal discards the keys that are typed meanwhile.
         self._fine = self._stepped = clock.steady_s()
-        self._watch = Watch(robot, self._fine)
 
     def step(self, typed: str) -> None:
         """Process the typed keys, send the command that is due, and process received states."""

@@ -281,7 +281,7 @@ class Page:
         If none arrives in time, return an answer with the status 304.
         """
         seen = request.headers.get("If-None-Match", "").strip('"')
-        begun_ns = clock.mono_ns()
+        begun_ns = clock.steady_ns()
         number = int(seen) if seen.isdecimal() and len(seen) < 16 else 0
         picture = await self._camera.after(number)
         if picture is None:
@@ -289,7 +289,7 @@ class Page:
         async with self._camera.sending(request[WHO].token):
             _limit_buffer(request)
             picture = self._camera.newest or picture  # a newer one may have arrived
-            now_ns = clock.mono_ns()
+            now_ns = clock.steady_ns()
             told = {
                 "Content-Type": "image/jpeg",
                 "ETag": f'"{picture.number}"',

@@ -44,7 +44,7 @@ _LENGTH = re.compile(rb"(?im)^content-length:[ \t]*(\d{1,8})[ \t]*\r?$")
 
 
 class Picture(Struct, frozen=True):
-    """One JPEG picture, its number, and the monotonic time, ns, at which it arrived."""
+    """One JPEG picture, its number, and its arrival time on the clock `steady_ns`, ns."""
 
     body: bytes
     number: int
@@ -119,7 +119,7 @@ class Camera:
                 404,
                 "no camera is configured: to show one, set web.camera to the address of its stream",
             )
-        self._asked_ns = clock.mono_ns()
+        self._asked_ns = clock.steady_ns()
         if self._reading is None or self._reading.done():
             self._reading = asyncio.create_task(self._read_again_and_again())
         with suppress(TimeoutError):
@@ -188,9 +188,9 @@ class Camera:
         if body is None or (self.newest is not None and body == self.newest.body):
             return
         self._number += 1
-        self.newest = Picture(body, self._number, clock.mono_ns())
+        self.newest = Picture(body, self._number, clock.steady_ns())
         self._changed.set()
         self._changed.clear()
 
     def _idle(self) -> bool:
-        return clock.mono_ns() - self._asked_ns > 5.0 * NS_PER_S
+        return clock.steady_ns() - self._asked_ns > 5.0 * NS_PER_S

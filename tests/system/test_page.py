@@ -1173,6 +1173,12 @@ FAILS = [
 ]
 """The expected trace of a first attempt that gets no answer."""
 
+SLOW = """let answer;
+    stopping.send = () => new Promise((done) => { answer = done; });
+    while (!answer) await new Promise((done) => setTimeout(done, 10));
+    stopping.over(); """
+"""Gives up the STOP while the second attempt waits for its answer."""
+
 
 @pytest.mark.parametrize(
     ("script", "then"),
@@ -1191,6 +1197,17 @@ FAILS = [
             "lost = false; await new Promise((done) => setTimeout(done, 300)); ok = true",
             [*FAILS, "sent", ""],
         ),
+        (SLOW + "answer({ok: true})", ["STOP was not confirmed", ""]),
+        (SLOW + "answer({ok: false})", ["STOP was not confirmed"]),
+        (
+            "const given = stopping.over(); stopping.over(); stopping.released(given)",
+            ["STOP was not confirmed", "STOP was not confirmed", ""],
+        ),
+        (
+            "const given = stopping.over(); ok = true; const again = stopping.press();"
+            "stopping.released(given); await again",
+            ["STOP was not confirmed", "sent", ""],
+        ),
     ],
     ids=[
         "answered",
@@ -1200,6 +1217,10 @@ FAILS = [
         "a clock set back",
         "pressed again",
         "answered: not ended yet",
+        "answered after the release was pressed",
+        "not answered after the release was pressed",
+        "released twice and the first release is confirmed",
+        "pressed again before the release is confirmed",
     ],
 )
 def test_a_stop_is_sent_until_it_arrived_and_never_much_later_than_it_was_pressed(

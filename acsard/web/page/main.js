@@ -35,6 +35,7 @@ const NEEDLESS = { waiting: ON, driving: ON, ready: ON, inactive: { deactivate: 
 const SETTLED = 1000;
 const HASTY = "this button has just appeared or changed, or was pressed twice: read it, wait a second, then press it once";
 const DATED = "nothing is received from the robot, so this press did nothing: press again when this button is not grey";
+const UNSHOWN = "nothing is received from the robot, so this page does not know what it would release";
 const SOON = 300; // ms in which the WebSocket answers a STOP, unless it is dead but still open
 
 const link = new Link(refused);
@@ -56,6 +57,7 @@ let silent = ""; // why the robot is silent, as reported by the page's server
 let uninvited = ""; // why the invitation was rejected
 let degrees = false; // turn rates are shown in degrees per second
 let note = { why: "", at: 0 }; // the message at the stick and its time, by performance.now()
+let complaint = { why: "", at: 0 }; // the message about a button and its time, by performance.now()
 let offer = ""; // the mode and the latch that the release button ends, "" while it is hidden
 let settling = 0; // time at which `offer` changed or the release button was last clicked, by performance.now()
 let down = null; // time at which a finger came down on the release button
@@ -97,15 +99,21 @@ async function asked(verb, payload) {
 
 /** Show the answer to a button, and return it. */
 function answered(told) {
-  views.complain(told.ok ? "" : words(told.text));
+  complain(told.ok ? "" : told.text);
   said(told.ok ? told : { ok: true, text: "" });
   return told;
+}
+
+/** Show in every view why a button failed, until `why` is "". */
+function complain(why) {
+  complaint = { why, at: performance.now() };
+  views.complain(words(why));
 }
 
 /** Release what this page shows. Without a state it has shown nothing, and the call would release anything. */
 function released(verb) {
   if (state) return asked(verb, { latch: state.latch });
-  return answered({ ok: false, text: "nothing is received from the robot, so this page does not know what it would release" });
+  return answered({ ok: false, text: UNSHOWN });
 }
 
 async function set(payload) {
@@ -184,8 +192,16 @@ function looked() {
 
 /** Drop what a button or a press of the stick was told in the mode before. */
 function outdated() {
-  views.complain("");
+  complain("");
   if (note.why && (note.why === state.reason || LATCHED.includes(state.mode))) told("");
+}
+
+/** Drop the message about a button: at once if it says that nothing is received and the state is fresh, otherwise after a
+ *  time to read it. */
+function expired() {
+  if (!complaint.why) return;
+  const untrue = [DATED, UNSHOWN].includes(complaint.why) && !dated();
+  if (untrue || performance.now() - complaint.at > READ) complain("");
 }
 
 /** Drop a message at the stick whose cause is gone: at once if it is what keeps the robot from following this page,
@@ -254,6 +270,7 @@ function stated({ detail }) {
   views.text("where", spot(state.x, state.y, state.yaw));
   const { linear, angular } = state; // null without feedback from the board
   dialled();
+  expired();
   forgotten();
   const late = state.latencies.period_lateness?.last_minute;
   plots.late.add(heard, late ? late.p99 / 1000 : null, late ? late.max / 1000 : null);
@@ -373,7 +390,7 @@ link.addEventListener("gone", ({ detail }) => {
 });
 link.addEventListener("up", () => {
   tried = camera.connected = true;
-  views.complain("");
+  complain("");
   views.waiting();
 });
 link.addEventListener("down", ({ detail }) => {
@@ -432,7 +449,7 @@ stopping.after = (told) => {
   if (state?.mode === "fault") answered({ ok: false, text: "STOP is latched behind the fault: Release fault leads to STOPPED" });
 };
 stopping.before = () => {
-  views.complain("");
+  complain("");
   drive.release();
   guide.leave();
 };

@@ -17,6 +17,7 @@ const RELOAD = "A part of this page did not load, so only STOP works here. Reloa
 class Stopping {
   #tell;
   #press = 0;
+  #given = 0; // number of the last press that was given up
   #unconfirmed = false; // the robot has not answered the last STOP, which may be given up
   #whole = false; // the modules of the page run
   /** Called at each press before the stop is sent. */
@@ -45,23 +46,24 @@ class Stopping {
     for (;;) {
       const told = await this.send();
       if (press !== this.#press) return; // a newer press took over
-      if (this.#ends(told)) return;
+      if (this.#ends(told) || press === this.#given) return;
       this.#tell(`STOP is not confirmed. This page sends it again; the robot's own switch stops it too. (${told.text})`);
       await new Promise((done) => setTimeout(done, PAUSE));
-      if (press !== this.#press) return;
+      if (press !== this.#press || press === this.#given) return;
       if (Date.now() > last || performance.now() > since + URGENT) return this.over();
     }
   }
 
   /** Give up the pending STOP, because the operator releases it or leaves the page. The message stays until the robot
-   *  answers a STOP or `released` is called. Returns the number that `released` takes. */
+   *  answers a STOP, which may be the one that was given up, or `released` is called. Returns the number that `released`
+   *  takes: two calls for one STOP return the same number. */
   over() {
     if (this.#unconfirmed) this.#tell(UNSURE);
-    return ++this.#press;
+    return (this.#given = this.#press);
   }
 
-  /** Note that the robot has confirmed the release of STOP for which `over` returned `press`. The STOP before it then
-   *  needs no confirmation. */
+  /** Note that the robot has confirmed a release of STOP for which `over` returned `press`. Unless STOP was pressed
+   *  again since, it then needs no confirmation. */
   released(press) {
     if (press === this.#press) this.#settle("");
   }

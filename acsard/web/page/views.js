@@ -153,9 +153,11 @@ function doubted(words) {
   text("doubt", words);
 }
 
-/** Show in every view why a button failed, until `words` is "". */
+/** Show in every view why a button failed, until `words` is "". A repeated message is set again, because a screen reader
+ *  announces it only if the text changes. */
 export function complain(words) {
   document.getElementById("complaint").hidden = !words;
+  text("complaint", "");
   text("complaint", words);
 }
 

@@ -359,10 +359,11 @@ def test_another_word_that_is_typed_while_a_motor_turns_ends_nothing() -> None:
 class Stalls(Robot):
     """A robot whose check stands still once, while all `turning` motors have a set point.
 
-    The host's clock advances in the stall only if the computer is not `asleep`.
+    With more than four motors to turn, the check stands still when a test calls `stall`. The host's
+    clock advances in the stall only if the computer is not `asleep`.
     """
 
-    def __init__(self, seconds: float, *, asleep: bool, turning: int) -> None:
+    def __init__(self, seconds: float, *, asleep: bool = False, turning: int = 5) -> None:
         super().__init__()
         self._seconds, self._asleep, self._turning = seconds, asleep, turning
         self.asleep_ns = 0
@@ -378,13 +379,17 @@ class Stalls(Robot):
     def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
         if self.stalled or sum(map(bool, self.mcu.vehicle.set_points)) < self._turning:
             return super().listen(until_ns)
+        return self.stall(until_ns)
+
+    def stall(self, until_ns: int = 0) -> list[tuple[int, bytes]]:
+        """Let the check stand still from `until_ns`, or from now on if that is later."""
         self.stalled = True
         stall_ns = int(self._seconds * 1e9)
         if self._asleep:
             self.mcu.vehicle.set_points[:] = [0.0] * 4  # the watchdog stopped the motors
             self.asleep_ns = stall_ns
             return super().listen(until_ns)
-        return super().listen(until_ns + stall_ns)
+        return super().listen(max(until_ns, self.now_ns()) + stall_ns)
 
 
 @pytest.mark.parametrize("asleep", [False, True], ids=["stopped", "suspended"])
@@ -408,10 +413,77 @@ def test_a_check_that_stood_still_while_a_motor_turns_turns_no_motor_any_more(
     stopped, rest = found[-2:]
     assert (stopped.name, stopped.verdict) == ("stall", "FAIL")
     assert stopped.figure == "stood still for 60.0 s"
-    assert "start the check again" in stopped.mend
+    assert "suspended or overloaded" in stopped.mend
     assert rest.text.startswith("the check ended early: stall; not tried: ")
     assert robot.later() == [0.0] * 4
     assert (len(questions) > 1) == (turning > 1)
+
+
+@pytest.mark.parametrize("asleep", [False, True], ids=["stopped", "suspended"])
+@pytest.mark.parametrize("at", ["motor b", "wheel map", "encoder counts"])
+def test_after_a_stall_of_the_terminal_the_check_sends_no_line_that_turns_a_motor(
+    at: str, asleep: bool
+) -> None:
+    """The terminal stalls while it shows what the check does next, or a finding."""
+    robot = Stalls(60.0, asleep=asleep)
+
+    class Watches(Person):
+        def doing(self, text: str) -> None:
+            super().doing(text)
+            shows(text)
+
+    def shows(text: str) -> None:
+        if text.startswith(at) and not robot.stalled:
+            robot.stall()
+
+    found: list[Finding] = []
+
+    def tell(finding: Finding) -> None:
+        found.append(finding)
+        shows(finding.name)
+
+    procedure.run(robot, Watches(robot), robot.config, tell, lambda: robot.asleep_ns)
+    assert robot.stalled
+    assert robot.turned_after == []
+    assert [finding.name for finding in found[-2:]] == ["stall", REST]
+
+
+@pytest.mark.parametrize("asleep", [False, True], ids=["stopped", "suspended"])
+@pytest.mark.parametrize(("seconds", "ends"), [(0.6, False), (4.5, False), (60.0, True)])
+def test_before_a_wheel_has_turned_only_a_long_stall_ends_the_check(
+    seconds: float, ends: bool, asleep: bool
+) -> None:
+    robot, found = Stalls(seconds, asleep=asleep, turning=0), list[Finding]()
+    procedure.run(robot, Nobody(), robot.config, found.append, lambda: robot.asleep_ns)
+    assert robot.stalled
+    failed = [finding.name for finding in found if finding.verdict in ("FAIL", "WARN")]
+    assert failed == (["stall"] if ends else [])
+    assert bool(robot.turned_after) != ends
+
+
+def test_a_step_that_a_suspend_spoilt_before_a_wheel_has_turned_is_repeated() -> None:
+    class Loses(Stalls):
+        """A robot of which the host loses replies after a suspend while it counts lost lines."""
+
+        counts, waits = False, 0
+
+        def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
+            self.waits += self.counts
+            got = self.stall(until_ns) if self.waits == 60 else super().listen(until_ns)
+            return [] if 60 <= self.waits < 80 else got
+
+    class Reads(Nobody):
+        def doing(self, text: str) -> None:
+            robot.counts |= text.startswith("counting lost lines")
+
+    robot, found = Loses(2.0, asleep=True), dict[str, Finding]()
+
+    def tell(finding: Finding) -> None:
+        found[finding.name] = finding
+
+    procedure.run(robot, Reads(), robot.config, tell, lambda: robot.asleep_ns)
+    assert robot.stalled
+    assert found["lost lines"].figure.startswith("none of ")
 
 
 class Trouble(Robot):

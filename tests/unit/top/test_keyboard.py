@@ -308,6 +308,22 @@ def test_a_key_drives_after_a_short_stall(monkeypatch: pytest.MonkeyPatch) -> No
     assert robot.sent[-1] == 0.5
 
 
+def test_the_first_key_drives_however_long_the_bus_took_to_subscribe(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    drive = Drive(Robot(), monkeypatch)
+
+    class Slow(Robot):
+        def subscribe(self, name: str) -> Any:
+            drive.now += 2 * GRACE_S
+            return super().subscribe(name)
+
+    robot: Any = Slow()
+    drive.ride = Ride(robot, Keyboard(0.5, 2.0))
+    drive.step("i", times=2)
+    assert robot.sent == [0.0, 0.5]
+
+
 def test_a_space_stops_at_the_next_step(monkeypatch: pytest.MonkeyPatch) -> None:
     robot = Robot()
     drive = Drive(robot, monkeypatch)

@@ -7,15 +7,21 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from aiohttp import web
+from aiohttp.test_utils import make_mocked_request
 from msgspec.structs import replace
 
 from acsard.core.config.live import LIVE
 from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
+from acsard.core.values import NS_PER_S
+from acsard.host import clock
 from acsard.host.threads import NoThreadError
 from acsard.web import app
 from acsard.web.acceptor import Acceptor
+from acsard.web.admission import WHO
 from acsard.web.app import Page, settings_in
+from acsard.web.camera import Camera
 from acsard.web.guide import Guide, Reach
 from acsard.web.metrics import Counts
 from acsard.web.tokens import Vault
@@ -52,6 +58,30 @@ async def test_a_phone_stays_if_no_thread_can_read_the_tokens_and_leaves_if_the_
     monkeypatch.setattr(app, "in_thread", fails(error))
     await page.tidy()
     assert bool(ends) != isinstance(error, NoThreadError)
+
+
+async def test_the_age_of_a_picture_counts_a_suspend(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The monotonic clock stands still in a suspend."""
+    counts, headers = Counts(), dict[str, str]()
+    parts = Parts(robots(None), Guide(Reach("", "", "", ""), ""), counts)
+    page = Page(parts, Vault(tmp_path, "acsar"), frozenset(), Acceptor(counts))
+    page._camera = Camera("http://127.0.0.1:1/")
+
+    async def sent(request: web.Request, body: bytes, told: dict[str, str], *_: object) -> None:
+        headers.update(told)
+
+    monkeypatch.setattr(app, "sent_in_pieces", sent)
+    page._camera._take(b"picture")
+    slept_ns = clock.asleep_ns() + 3600 * NS_PER_S
+    monkeypatch.setattr(clock, "asleep_ns", lambda: slept_ns)
+    request = make_mocked_request("GET", "/api/camera")
+    request[WHO] = MAINTAINER
+    await page.picture(request)
+    page._camera.close()
+    assert int(headers["Age-Ms"]) >= 3_600_000
+    assert int(headers["Waited-Ms"]) < 60_000
 
 
 ROWS = {row.key: row for row in settings_in(effective(Config()))}

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.web.camera import MAX_HEAD, MAX_PICTURE, Parts
+from acsard.core.values import NS_PER_S
+from acsard.host import clock
+from acsard.web.camera import MAX_HEAD, MAX_PICTURE, Camera, Parts
 from tests.each import each
 
 PICTURES = [bytes([0xFF, 0xD8, n]) * (n + 1) + b"\r\n--\r\n\r\n" for n in range(5)]
@@ -47,3 +49,16 @@ def test_every_picture_is_found_in_pieces_of_any_size(boundary, form, size) -> N
 def test_a_stream_that_would_fill_the_memory_is_an_error(stream: bytes) -> None:
     with pytest.raises(ValueError, match=r"no header lines|more than"):
         Parts("frame").feed(stream)
+
+
+async def test_a_camera_that_no_client_asked_for_in_a_suspend_is_idle(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    camera = Camera("http://127.0.0.1:1/")
+    camera._take(b"picture")
+    await camera.after(0)
+    camera.close()
+    assert not camera._idle()
+    slept_ns = clock.asleep_ns() + 3600 * NS_PER_S
+    monkeypatch.setattr(clock, "asleep_ns", lambda: slept_ns)
+    assert camera._idle()

@@ -67,7 +67,7 @@ def test_the_age_of_a_message_counts_a_suspend(
 def test_an_age_is_never_negative(
     samples: list[zenoh.Sample], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The clock's reading is too late by the time for which a thread waited for a core in it."""
+    """A reading is late if NTP speeds up two of its clocks while the thread waits for a core."""
     stream = Stream()
     with monkeypatch.context() as patched:
         slept_ns = clock.asleep_ns() + NS_PER_S
