@@ -115,7 +115,7 @@ class Battery:
     @property
     def mend(self) -> str:
         """What the operator must do to end the level "stop", in words without measured values."""
-        if self._told is None:
+        if self.held and self._told is None:
             return "wait until the board has reported its battery for some seconds"
         config = self._config
         return f"charge the battery to {_with_unit(config, config.stop_below + config.hysteresis)}"
