@@ -662,6 +662,18 @@ def test_drivers_that_lack_power_after_a_press_hold_the_stop_until_they_are_soun
     assert bench.status(OK_LINE + DRIVER_FAULT).step().mode == "fault"
 
 
+def test_a_clear_that_releases_only_a_fault_leaves_the_drivers_excused() -> None:
+    bench = Button(OK_LINE + DRIVER_OK)
+    bench.linked()
+    bench.status(PRESSED_LINE).step()
+    bench.status(OK_LINE + DRIVER_OK).step(guard_trip="the line does not end")
+    assert bench.mode() == "fault"
+    bench.step()
+    assert bench.answer("clear").success
+    assert bench.mode() == "stopped"
+    assert bench.status(OK_LINE + DRIVER_FAULT).step().mode == "stopped"
+
+
 def test_a_driver_fault_after_a_silence_of_the_button_counts() -> None:
     bench = Button(OK_LINE + DRIVER_OK)
     bench.linked()
