@@ -95,6 +95,8 @@ class Followed:
         """The last command that was followed of the sender that keeps the robot."""
         self._going_ns = 0
         """Arrival of the last command of that sender, followed or not. It was never silent."""
+        self._rests_ns: dict[Who, int] = {}
+        """Arrival of the newest zero of each sender, by the robot's clock."""
         self._zero_ns: dict[Who, int] = {}
         """When the newest zero of each sender was sent, of those that arrived."""
         self._before: dict[str, Command] = {}
@@ -122,6 +124,7 @@ class Followed:
         who = sender["source"], sample.identity
         found = Command(at_ns, wish.arrived_ns, who, sender, message, sample.clock, wish.v, wish.w)
         if not (wish.v or wish.w or message.junk):
+            self._rests_ns[who] = at_ns
             self._zero_ns[who] = max(message.sent_ns, self._zero_ns.get(who, 0))
         if self._keeper is not None and self._keeper.who == who:
             self._go_on(at_ns)
@@ -188,8 +191,14 @@ class Followed:
 
     @property
     def wish(self) -> tuple[float, float] | None:
-        """The speeds of the command that the robot follows, None if that is not known."""
-        return None if self._holder is None else (self._holder.v, self._holder.w)
+        """The speeds of the command that the robot follows, None if that is not known.
+
+        A newer zero of the same sender may have ended them, although its delay is in doubt.
+        """
+        holder = self._holder
+        if holder is None or self._rests_ns.get(holder.who, -1) > holder.arrived_ns:
+            return None
+        return holder.v, holder.w
 
     @property
     def sender(self) -> dict[str, Any] | None:

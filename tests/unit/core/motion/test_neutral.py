@@ -314,16 +314,20 @@ def test_a_zero_whose_stamp_is_in_doubt_ends_an_earlier_speed_and_holds_no_robot
     assert one.armed(20 * MS)
 
 
-@each(("late_ms", "clock", "twist"), [(30, "a", REST), (251, "a", GO), (30, "b", GO)])
+@each(
+    ("ahead_ms", "clock", "twist"),
+    [(1, "a", REST), (250, "a", REST), (251, "a", GO), (0, "a", GO), (1, "b", GO)],
+)
 def test_a_speed_that_a_zero_in_doubt_overtook_does_not_begin_again(
-    late_ms: int, clock: str, twist: Twist
+    ahead_ms: int, clock: str, twist: Twist
 ) -> None:
-    one = sender()
-    one.take(replace(sent(GO, 10), stamp_ns=10, clock="a"), 0)
-    one.refuse(replace(sent(REST, 20), stamp_ns=30, clock="a"), "stale")
-    one.take(replace(sent(GO, 20 + late_ms), stamp_ns=20, clock=clock), 0)
+    """A stamp that is ahead by more than the timeout of 250 ms is wrong."""
+    one, stamp_ns = sender(), 5000 * MS
+    one.take(replace(sent(GO, 10), stamp_ns=stamp_ns - MS, clock="a"), 0)
+    one.refuse(replace(sent(REST, 20), stamp_ns=stamp_ns + ahead_ms * MS, clock="a"), "stale")
+    one.take(replace(sent(GO, 30), stamp_ns=stamp_ns, clock=clock), 0)
     assert one.twist == twist
-    one.take(replace(sent(GO, 21 + late_ms), stamp_ns=31, clock="a"), 0)
+    one.take(replace(sent(GO, 40), stamp_ns=stamp_ns + 251 * MS, clock="a"), 0)
     assert one.twist == GO
 
 
