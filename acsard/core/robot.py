@@ -77,7 +77,7 @@ REPORTS = {
     "bumpers": "its bumpers",
     "driver": "its motor drivers",
 }
-"""What the board reports, in words."""
+"""Names of the inputs for the words "wait until the board has reported ..."."""
 
 HALTED = (Mode.STOPPED, Mode.FAULT, Mode.SHUTDOWN)
 """Modes in which the robot brakes at the stop deceleration."""

@@ -23,6 +23,7 @@ from typing import Literal
 from msgspec import Struct
 
 from acsard.core.config.settings import CommandsConfig, Source
+from acsard.core.motion.emergency_stop import LATE_NS
 from acsard.core.motion.freshness import LONGEST_PROOF_NS, Freshness
 from acsard.core.motion.neutral import Sender, is_zero
 from acsard.core.values import NS_PER_S, REST, Command, SourceStatus, Twist, Wait
@@ -33,9 +34,6 @@ and neither is one that must send a zero again because its clock was just set.""
 
 Objection = Literal["", "unknown_source", "not_finite", "too_many_senders", "unproven", "stale"]
 """The reason to refuse a command, or "" if the arbiter accepts it."""
-
-STALL_NS = 150_000_000
-"""The daemon stood still if a step begins later than this after the step before it, ns."""
 
 LASTING_S = (3.0, 10.0, 60.0, 600.0, 3600.0)
 """`state` reports for how long a sender has sent only zeros, or has sent commands although it is
@@ -215,7 +213,7 @@ class Arbiter:
         `commands.neutral_pause` takes longer (see `Sender.resume`).
         """
         before_ns, self._begun_ns = self._begun_ns, now_ns
-        if now_ns - before_ns > STALL_NS:
+        if now_ns - before_ns > LATE_NS:
             self._watched_ns = now_ns
             for source in self._ranking:
                 for sender in source.senders.values():

@@ -48,9 +48,9 @@ The longest control period that can be configured is 100 ms."""
 
 EXCUSE_NS = 100_000_000
 """If this computer was late, the board counts as silent only after this further time, ns. In this
-time the daemon reads the lines that arrived while the computer was late. The daemon grants the
-extra time only once between two reports, so a computer that is always late does not delay the stop
-forever."""
+time the daemon reads the lines and commands that arrived while the computer was late. The daemon
+grants the extra time only once between two reports, so a computer that is always late does not
+delay the stop forever."""
 
 PRESSED = "emergency stop pressed at the robot"
 SILENT = (

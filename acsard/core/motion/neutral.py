@@ -14,14 +14,15 @@ does not. The sender stays armed until `require_neutral`, `disarm` or `unlearn` 
   depends on the Zenoh session that stamps its commands. Therefore a speed of one identity cancels
   the zeros of all.
 
-A sender keeps its place before other senders while it is live, and `PLACE_NS` longer if its
-commands go on but their stamps are in doubt, for example because its clock was set, or if the
-daemon stood still. Without this rule, a sender that holds the robot still would lose it to a moving
-one.
+A sender keeps its place before other senders while it is live. It also keeps its place for at most
+`PLACE_NS` after its last accepted command if its commands go on but their stamps are in doubt, for
+example because its clock was set, or if the daemon stood still. Otherwise a sender that holds the
+robot still would lose it to a moving one.
 """
 
 from __future__ import annotations
 
+from acsard.core.motion.emergency_stop import EXCUSE_NS
 from acsard.core.motion.freshness import LONGEST_PROOF_NS, Verdict
 from acsard.core.values import REST, Command
 
@@ -29,10 +30,6 @@ PLACE_NS = 2 * LONGEST_PROOF_NS
 """Longest time for which a sender keeps its place without an accepted command, ns, if its commands
 go on but their stamps are in doubt, and then for which it keeps the robot without being armed. A
 longest proof that restarts with its second half ends within this time."""
-
-GRACE_NS = 100_000_000
-"""Shortest rest of `commands.neutral_pause` after a stall of the daemon, ns. In this time the bus
-delivers what arrived during the stall."""
 
 
 class Sender:
@@ -144,14 +141,14 @@ class Sender:
         """Continue after the daemon stood still between these monotonic times.
 
         The commands that arrived meanwhile may come after this step. Therefore the sender keeps its
-        place for one timeout more, at most until `PLACE_NS` after its last accepted command, and
-        the stall does not count as `commands.neutral_pause`.
+        place for one timeout more, at most until `PLACE_NS` after its last accepted command. The
+        stall does not count as `commands.neutral_pause`, and at least `EXCUSE_NS` of it remains.
         """
         if self.present(before_ns):
             self._present_ns = now_ns
         self._settle(before_ns)
         if not self._armed and self._zero_ns is not None:
-            rest_ns = max(self._zero_ns + self._pause_ns - before_ns, GRACE_NS)
+            rest_ns = max(self._zero_ns + self._pause_ns - before_ns, EXCUSE_NS)
             proven = self._proven_zero_ns is not None
             self._zero_ns = now_ns + rest_ns - self._pause_ns
             self._proven_zero_ns = self._zero_ns if proven else None

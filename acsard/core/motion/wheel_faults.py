@@ -310,15 +310,15 @@ class WheelFaults:
         stop counts as pressed, so that the motors may have no power. `dt` is the time since the
         line before, s.
         """
-        self.pushed = ""
+        self.pushed, speeds = "", seen.as_tuple()
         if commanded is None:
             for side in self._sides:
                 side.forget()
                 for wheel, witness in zip(side.wheels, side.witnesses, strict=True):
-                    witness.coast(seen.as_tuple()[wheel], dt, self._count)
+                    witness.coast(speeds[wheel], dt, self._count)
             return ""
         limit, lag = self._settings.fault_time, self._settings.response_time
-        left, right, speeds = self._left, self._right, seen.as_tuple()
+        left, right = self._left, self._right
         front_right, front_left, rear_left, rear_right = speeds
         left.expected.follow(commanded.front_left, front_left, rear_left, dt, lag)
         right.expected.follow(commanded.front_right, front_right, rear_right, dt, lag)

@@ -915,7 +915,7 @@ def test_a_restarted_daemon_keeps_the_stop_and_judges_the_battery_anew() -> None
     assert after.mode() == "stopped"
     assert after.out.reason.startswith("battery below battery.stop_below = 21 V (latched at ")
     assert "wait until the board has reported its battery" in after.answer("clear").message
-    # Without a report nothing holds the stop.
+    # Without a report for 3 s, `clear` is allowed.
     for _ in range(310):
         after.step()
     assert after.answer("clear").success
