@@ -126,8 +126,14 @@ class Followed:
         if not (wish.v or wish.w or message.junk):
             self._rests_ns[who] = at_ns
             self._zero_ns[who] = max(message.sent_ns, self._zero_ns.get(who, 0))
-        if self._keeper is not None and self._keeper.who == who:
-            self._go_on(at_ns)
+        if self._keeper is not None:
+            priority = self._witness.priority
+            if self._keeper.who == who:
+                self._go_on(at_ns)
+            elif priority[who[0]] > priority[self._keeper.who[0]]:
+                # If a sender of higher priority gets the robot, also one that must send a zero, the
+                # first of the others to come gets the robot behind it.
+                self._keeper = None
         self._arrived[at_ns] = None if at_ns in self._arrived else found
         if len(self._arrived) > KEPT:
             del self._arrived[next(iter(self._arrived))]

@@ -83,10 +83,12 @@ class PoseWitness:
         sure = rates.get("yaw_variance_per_metre", 1.0) < 1e-4
         sure |= rates.get("yaw_variance_per_radian", 1.0) < 1e-2
         coarse = (counts or 3200) <= 400 and not told
-        rounded = isinstance(rate, float) and rate > 100.0 and coarse
+        fast = isinstance(rate, float) and rate > 100.0
         # Nobody knows the heading as well as these rates say at ten lines a second, or from lines
         # so frequent that their speeds are a count or none.
-        self._drifts = sure and (self._seldom or rounded)
+        self._drifts = sure and (self._seldom or (fast and coarse))
+        # A board that is asked more often than it computes speeds repeats its counts.
+        self._drifts |= (counts or 3200) < 200 and fast and rate > (250.0 if told else 100.0)
         self._true: deque[tuple[int, Pose]] = deque(maxlen=400)
         self._anchor: tuple[Pose, Pose] | None = None
         self._gyro = bool(rates.get("gyro"))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import pytest
 from msgspec.structs import replace
 
@@ -145,6 +147,20 @@ def test_the_sample_fields_take_more_still() -> None:
         )
     )
     assert "control.rate = 80 takes 86% of the wire at 57600 baud" in warning
+
+
+@each(("counts", "rate", "check", "warned"), [
+    (96, 275, "off", True), (96, 250, "off", False), (200, 275, "off", False),
+    (96, 275, "auto", False),
+])  # fmt: skip
+def test_lines_that_repeat_counts_are_named(
+    counts: int, rate: float, check: Literal["off", "auto"], warned: bool
+) -> None:
+    mcu = McuConfig(encoder_counts=counts, link_check=check)
+    sim = SimConfig(encoder_counts=counts)
+    found = warnings(Config(mcu=mcu, control=ControlConfig(rate=rate), sim=sim))
+    expected = "control.rate = 275 with mcu.encoder_counts = 96: lines follow each other so soon"
+    assert any(expected in line for line in found) == warned
 
 
 @each(
