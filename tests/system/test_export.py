@@ -76,7 +76,10 @@ def assert_among(live: Sequence[Any], told: Sequence[Any], topic: str) -> None:
     """Check that each live message is in the file, in order, and few others are."""
     at = iter(enumerate(told))
     found = [next((n for n, other in at if other == one), None) for one in live]
-    assert None not in found, f"{topic}: live message {found.index(None)} of {len(found)}"
+    if None in found:
+        missing = live[found.index(None)]
+        stamped = [one for one in told if not isinstance(one, bytes) and one[0] == missing[0]]
+        pytest.fail(f"{topic}: {found.index(None)} of {len(found)}: {missing}, written: {stamped}")
     first, last = found[0], found[-1]
     assert first is not None
     assert last is not None

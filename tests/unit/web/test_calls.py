@@ -185,7 +185,8 @@ async def test_stops_of_one_client_to_one_robot_share_the_next_one_and_none_is_l
     for _ in range(3):
         await asyncio.gather(*(asked() for _ in range(100)))
     assert len(sent) == 4
-    assert all(later - sooner >= MERGE_S for sooner, later in pairwise(sent))
+    # The time begins shortly before a stop is sent.
+    assert all(later - sooner > 0.9 * MERGE_S for sooner, later in pairwise(sent))
     await asyncio.gather(*(merged.ask((f"viewer {n}", "r2"), stop) for n in range(9)))
     assert len(sent) == 13
     await asyncio.sleep(2 * MERGE_S)
