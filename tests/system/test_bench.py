@@ -37,7 +37,6 @@ auto_activate = false
 
 
 @pytest.mark.slow
-@pytest.mark.nightly
 def test_it_measures_the_simulator_and_moves_nothing_on_a_real_port(
     tmp_path: Path, peer: Peer
 ) -> None:
