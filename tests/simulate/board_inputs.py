@@ -262,13 +262,17 @@ class _Input:
 class _Mean:
     """The mean of the battery's measure, and the levels that it must and may have reached."""
 
-    def __init__(self, config: dict[str, Any]) -> None:
+    def __init__(self, config: dict[str, Any], emptied: bool) -> None:
+        """`emptied` says whether the daemon may have started with the stop of an empty battery.
+
+        The battery then counts as empty until its mean rises.
+        """
         names = [name for name in ("warning", "return", "stop") if config.get(f"{name}_below")]
         self.bounds = {name: config[f"{name}_below"] for name in names}
         self._room = 0.05 if config.get("measure", "volts") == "volts" else 0.5
         self._rise = config.get("hysteresis", 0.5)
         self.must = dict.fromkeys(self.bounds, False)
-        self.may = dict.fromkeys(self.bounds, False)
+        self.may = dict.fromkeys(self.bounds, emptied)
         self.mean = self.stood_s = 0.0
         self.at_ns: int | None = None
         self.sure = True
@@ -318,6 +322,8 @@ class Inputs:
         self._powered = True
         """Whether a fault of a motor driver certainly counts: no emergency stop was pressed since
         the robot was last released. This outlasts a restart of the daemon."""
+        self._emptied = False
+        """Whether an empty battery may have stopped the robot. This outlasts a restart."""
         self._field = b"volts" if config.get("battery", {}).get("measure") == "volts" else b"charge"
         self.new_life()
 
@@ -328,7 +334,7 @@ class Inputs:
         """Whether a line of this step certainly reports a fault of a motor driver that counts."""
         self._cut_ns: int | None = None
         """True time of a press that certainly has cut this power, or None."""
-        self.battery = _Mean(self._witness.config.get("battery", {}))
+        self.battery = _Mean(self._witness.config.get("battery", {}), self._emptied)
         self._mode = ""
         self._looked_ns = self._stepped_ns = 0
         self._due_ns: int | None = None
@@ -656,6 +662,7 @@ class Inputs:
             self._doubtful = True
             witness.perhaps_latched.add("clear")
             return
+        self._emptied |= battery.may["stop"]
         if battery.may["stop"] and seen.mode == "stopped" != self._mode and not witness.stops:
             witness.counts["battery empty"] += 1
             witness.stops.append(true_ns)
