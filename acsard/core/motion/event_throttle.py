@@ -45,7 +45,9 @@ class _Held:
             what = f"{what or f'{self.count} times'}; the last"
         text = ": ".join(part for part in (what, last.text) if part)
         level, by = LEVELS[self._level], ", ".join(self._by)
-        return Event(last.name, text, level, by, count=self.count, news=self.news)
+        # A flood of news is one row of `events` for all its lines.
+        news = self.news and self.count == last.count
+        return Event(last.name, text, level, by, count=self.count, news=news)
 
 
 class EventThrottle:
@@ -64,6 +66,8 @@ class EventThrottle:
         for event in events:
             self._held.setdefault(event.name, _Held()).add(event)
         told = [name for name, held in self._held.items() if self._may(name, held.news, now_ns)]
+        if "clear" in told and "stop" in self._held and "stop" not in told:
+            told.insert(0, "stop")  # the log must not say that a stop came behind this release
         return tuple([self._held.pop(name).line() for name in told])
 
     def _may(self, name: EventName, news: bool, now_ns: int) -> bool:

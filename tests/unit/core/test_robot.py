@@ -1275,11 +1275,11 @@ def test_a_stop_brakes_by_its_own_deceleration_and_is_latched() -> None:
     assert bench.out.reason == "stopped by request at 2027-01-15 08:00:50 UTC; call srv/clear"
 
 
-def test_a_stop_that_is_repeated_is_answered_and_is_no_second_event() -> None:
+def test_a_stop_of_a_stopped_robot_is_an_event_because_a_clear_must_name_its_latch() -> None:
     bench = Bench().driving()
     bench.step(ask="stop")
     assert bench.answer("stop").success
-    assert names(bench.out) == []
+    assert names(bench.out) == ["stop"]
 
 
 def test_a_refused_request_is_no_event() -> None:
