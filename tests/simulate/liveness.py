@@ -198,13 +198,16 @@ class Liveness:
                     raise BrokenError("a lawful sender drives", now_ns, text)
 
     def _stays_armed(self, now_ns: int) -> None:
-        """A sender that the robot has followed is armed until an event asks it for a zero."""
+        """A sender whose speed the robot has followed is armed until an event asks it for a zero.
+
+        A zero may be followed, and arm its sender, until its clock turns out to be unproven.
+        """
         run = self.run
         sender = run.followed.sender
         # Behind a stall the daemon may ask the board for its check, and finds the loss only then.
         asks = run.witness.mode == "waiting" and now_ns < self._stall[1] + ASKS_NS
         sole = sender is not None and self._sole_senders.get(sender["source"]) == sender["name"]
-        if sender is not None and sole and not asks:
+        if sender is not None and any(run.followed.wish or ()) and sole and not asks:
             self._followed_ns[sender["source"]] = now_ns
         witness = run.witness
         if witness.mode != "ready" or "must send a zero" not in witness.reason or witness.pending:
