@@ -33,7 +33,7 @@ from acsard.core.messages.signature import Signature, public_name
 from acsard.core.values import Plain, Pose
 from acsard.daemon.bus.address import Address, address_by_environment
 from acsard.daemon.bus.identity import Identity, identity
-from acsard.daemon.bus.robot_discovery import explain_silence, presence
+from acsard.daemon.bus.robot_discovery import NO_BATTERY, explain_silence, presence
 from acsard.daemon.bus.subscription import Subscription, encoded, queue_on
 from acsard.daemon.bus.tls import shown_at
 from acsard.daemon.bus.zenoh_sessions import client_session
@@ -425,6 +425,8 @@ class Client:
         where = self.where
         seen = presence(self.session, where.robot_id, where.endpoint)
         if seen is None or seen.here or not where.endpoint:
+            if key == "battery":
+                return NoAnswerError(f"{no_answer}: {NO_BATTERY}")
             return NoAnswerError(
                 f"{no_answer}; is the daemon of robot.id {where.robot_id!r} stuck, does it have "
                 "this key (`acsard topics`), and may you query it (`acsard whoami`)?"

@@ -199,10 +199,16 @@ class Followed:
     def wish(self) -> tuple[float, float] | None:
         """The speeds of the command that the robot follows, None if that is not known.
 
-        A newer zero of the same sender may have ended them, although its delay is in doubt.
+        A newer zero of the same sender may have ended them, although its delay is in doubt. If
+        several programs share a clock by name, a zero that came earlier may have the later stamp.
         """
         holder = self._holder
-        if holder is None or self._rests_ns.get(holder.who, -1) > holder.arrived_ns:
+        if holder is None:
+            return None
+        overtakes_ns = 0
+        if holder.clock in self._witness.shared_clocks:
+            overtakes_ns = 2 * self._witness.timeout[holder.who[0]]
+        if self._rests_ns.get(holder.who, -overtakes_ns - 1) > holder.arrived_ns - overtakes_ns:
             return None
         return holder.v, holder.w
 

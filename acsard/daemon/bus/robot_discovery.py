@@ -180,7 +180,15 @@ def _silent(key: str) -> str:
     return _unpublished(key, row)
 
 
+NO_BATTERY = (
+    "battery has no value before the board has reported one, and most boards report none "
+    "(deploy/firmware/README.md)"
+)
+
+
 def _unpublished(key: str, row: Topic) -> str:
+    if row.key == "battery":
+        return NO_BATTERY
     match row.rate:
         case "on change":
             return (
