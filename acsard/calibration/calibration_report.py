@@ -188,8 +188,14 @@ def odometry(calibration: Calibration) -> dict[str, float]:
     return {name: float(f"{value:.{DIGITS - 1}g}") for name, value in calibration.odometry.items()}
 
 
-def parts(report: Report, calibration: Calibration, where: str) -> Iterator[RenderableType]:
-    """Yield the sentences and the table of the report. `where` names the configuration file."""
+def parts(
+    report: Report, calibration: Calibration, where: str, *, guided: bool
+) -> Iterator[RenderableType]:
+    """Yield the sentences and the table of the report.
+
+    `where` names the configuration file. `guided` is True if the tool guided the drive, and False
+    for a recorded drive (`--log`).
+    """
     drives = calibration.drives
     yield (
         f"{report.log}: {many(drives.runs, 'run')}, {drives.seconds:.0f} s, "
@@ -209,7 +215,7 @@ def parts(report: Report, calibration: Calibration, where: str) -> Iterator[Rend
     yield from ("", table(rows, ("", "now", "found", "standard deviation"), right={1, 2}), "")
     yield from _better(report)
     yield ""
-    yield from _remains(report, calibration)
+    yield from _remains(report, calibration, guided=guided)
     yield from (
         "",
         f"{where}: written"
@@ -251,7 +257,7 @@ def _two(value: float) -> str:
     return f"{value:.0f}" if value >= 10 else f"{value:.1f}" if value >= 1 else f"{value:.2f}"
 
 
-def _remains(report: Report, calibration: Calibration) -> list[str]:
+def _remains(report: Report, calibration: Calibration, *, guided: bool) -> list[str]:
     fastest = calibration.drives.fastest
     multipliers = calibration.multipliers
     share = multipliers.std[SEPARATION] / multipliers.values[SEPARATION]
@@ -263,10 +269,16 @@ def _remains(report: Report, calibration: Calibration) -> list[str]:
         "track also differs on other ground, so calibrate where you drive"
     ]
     if not report.scale:
+        advice = (
+            "calibrate with --method tape, or with --method gyro and type the distance that it "
+            "asks for after the straight leg"
+            if guided
+            else "drive 2 m or more straight ahead, measure the distance, and give --distance "
+            "METRES"
+        )
         sentences.append(
             "the calibration compared only the left with the right wheels and did not measure "
             "their size, so distances are only as accurate as drive.wheel_radius. To measure the "
-            "size, drive 2 m or more straight ahead, measure the distance, and give --distance "
-            "METRES"
+            f"size, {advice}"
         )
     return sentences

@@ -184,6 +184,8 @@ class Log(Struct, frozen=True):
 
     runs: tuple[Run, ...]
     notes: tuple[str, ...]
+    true_positions: bool = False
+    """True if the positions are the true ones of the built-in simulator, which have no error."""
 
 
 def runs(table: Table) -> Log:

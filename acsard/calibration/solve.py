@@ -408,7 +408,7 @@ def _calibration(
     notes += [_stays(name, deviation) for name, deviation in best.kept.items()]
     notes += _of_noise(shown)
     notes += _cuts(log.runs)
-    notes += _too_good(made, fitted)
+    notes += _too_good(made, fitted, log)
     notes += plausibility.remarks(
         delays, best.gyro_bias, by_wheels, result.values, base, sized=bool(scale)
     )
@@ -454,7 +454,7 @@ def _cuts(driven: Sequence[Run]) -> Iterator[str]:
         )
 
 
-def _too_good(made: Prepared, fitted: Fit) -> Iterator[str]:
+def _too_good(made: Prepared, fitted: Fit, log: Log) -> Iterator[str]:
     """Yield a sentence for each sensor that was probably computed from the wheels."""
     rows, headings, base = made.rows, made.headings, made.base
     if headings is not None:
@@ -462,7 +462,7 @@ def _too_good(made: Prepared, fitted: Fit) -> Iterator[str]:
         off -= np.median(off / rows.seconds) * rows.seconds
         if float(off @ off) < PERFECT**2 * float(rows.turned @ rows.turned):
             yield _own(headings.source)
-    if made.segments:
+    if made.segments and not log.true_positions:
         along = [positions.path(steps, base, fitted.parameters) for steps in made.steps]
         reach = max(positions.extent(segment.place) for segment in made.segments)
         if positions.spread(made.segments, along, fitted.parameters) < PERFECT * reach:

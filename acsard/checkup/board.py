@@ -18,8 +18,7 @@ from acsard.checkup.findings import StoppedError, WireLostError, motor_name, mot
 from acsard.checkup.lateness import Lateness
 from acsard.checkup.motion import ZERO, Reply
 from acsard.checkup.restarts import RestartedError, Restarts
-from acsard.core.config.motion_rules import LONGEST_REPLY_S
-from acsard.core.config.settings import McuConfig, WheelMap
+from acsard.core.config.settings import LONGEST_REPLY_S, McuConfig, WheelMap
 from acsard.core.config.wire_time import line_bytes, wire_ns
 from acsard.core.link.board_status import STATUS, decode_status
 from acsard.core.link.checked_line import ASK_SAMPLE, SEQUENCES, seal, unseal

@@ -51,6 +51,9 @@ from acsard.terminal.output import SENTENCES, plain, show
 from acsard.terminal.prompt import NobodyError, Prompt, ended_by_signals
 from acsard.terminal.terminal_prompt import NoPrompt, TerminalPrompt
 
+TRUE_POSE = "sim/pose"
+"""Key of the true pose, which only a daemon with the built-in simulator publishes."""
+
 DRIVE_OPTIONS = ("method", "positions", "positions_at", "imu", "yes", "json_lines")
 """Options that fit only a drive that this tool guides, and not a recorded one (`--log`)."""
 
@@ -125,13 +128,14 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
         except MendableError as error:  # print the result of the long drive before the error
             trouble = error
     told = report(source, found, config.drive, written)
+    words = parts(told, found, where, guided=not args.log)
     if lines is None:
         if args.json:
             print(msgspec.json.encode(told).decode())
         else:
-            show(*parts(told, found, where), most=SENTENCES)
+            show(*words, most=SENTENCES)
     else:
-        lines.result(plain(*parts(told, found, where), width=SENTENCES))
+        lines.result(plain(*words, width=SENTENCES))
         differing = _differing(config, mine, where)
         if not args.write and lines.offer(args.config, keys(found), differing):
             written = where
@@ -245,8 +249,12 @@ def _guided(
                 elsewhere = client_session(args.positions_at, tls)
                 stack.callback(elsewhere.close)
             robot.positions(args.positions, elsewhere)
+        true = info.simulated and args.positions in (TRUE_POSE, full_key(robot_id, TRUE_POSE))
         try:
-            return guide(name, made, prompt, robot.ride, simulated=info.simulated), config
+            found = guide(
+                name, made, prompt, robot.ride, simulated=info.simulated, true_positions=true
+            )
+            return found, config
         except KeyboardInterrupt:
             raise GuideError("the operator ended the drive. No file was written") from None
 

@@ -70,8 +70,9 @@ def loopback(text: str) -> tuple[str, int]:
     if not address.is_loopback:
         raise UsageError(
             f"other machines could reach {text}, but this protocol has no authentication: every "
-            f"client that connects could drive. Listen on {DEFAULT} and, on the other machine, "
-            f"open a tunnel: ssh -N -L {port}:127.0.0.1:{port} USER@ROBOT"
+            "client that connects could stop the robot, and with --drive could drive it. Listen on "
+            f"127.0.0.1:{port} and, on the other machine, open a tunnel: "
+            f"ssh -N -L {port}:127.0.0.1:{port} USER@ROBOT"
         )
     return str(address), port
 

@@ -13,8 +13,9 @@ is 1 if a robot refuses, and 69 if one does not answer.
 from __future__ import annotations
 
 import argparse
+import re
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import msgspec
@@ -23,7 +24,8 @@ from acsard.cli.connection import MANY, add_bus, connected_to_many
 from acsard.cli.replies import of_each, print_each
 from acsard.client import Client
 from acsard.core.config.live import flat, live
-from acsard.core.config.lowered import stays
+from acsard.core.config.lowered import TABLE, lowered, stays
+from acsard.core.config.settings import LimitsConfig
 from acsard.core.config.validation import show
 from acsard.core.formatting import json_line, lines
 from acsard.core.messages.encodings import encode
@@ -34,6 +36,9 @@ from acsard.daemon.bus.robot_discovery import named
 from acsard.host.config_file import change, require_changeable, writable
 from acsard.host.errors import Exit, MendableError, UsageError
 from acsard.host.extras import install
+
+_CHANGE = re.compile(r"([\w.-]+) = (.+?) \(was (.+?)\)(?:, |$)")
+"""Pattern of one change in the daemon's answer."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -78,14 +83,13 @@ def main(args: argparse.Namespace) -> int:
         if many:
             return _set_all(robot, many, settings, keep=args.keep, as_json=args.json)
         reply = robot.set(settings, keep=args.keep)
-    until = _until(settings)
+    text = reply.message if args.keep or not reply.success else _lasting(reply.message)
     if reply.success and file is not None:
         try:
             change(file, settings)
         except MendableError as error:
-            raise MendableError(f"{reply.message}, {until}; not written: {error}") from None
-        until = f"written to {file}"
-    text = f"{reply.message}; {until}" if reply.success and not args.keep else reply.message
+            raise MendableError(f"{text}; not written: {error}") from None
+        text = f"{reply.message}; written to {file}"
     print(json_line(encode(reply, "json").decode()) if args.json else lines(text))
     return int(Exit.OK if reply.success else Exit.FAILURE)
 
@@ -120,10 +124,38 @@ def _require_for_many(args: argparse.Namespace, settings: dict[str, Plain]) -> N
         )
 
 
-def _until(settings: dict[str, Plain]) -> str:
-    """Return a text which says until when the settings stay in force."""
-    survives = "; a lowered limit survives a restart of the daemon, except on the simulator"
-    return f"until the daemon's next start{survives if any(map(stays, settings)) else ''}"
+def _lasting(message: str) -> str:
+    """Return the daemon's answer, and until when the changed settings stay in force."""
+    until = _until(message)
+    return f"{message}; {until}" if until else message
+
+
+def _until(message: str) -> str:
+    """Return a text which says until when the settings stay in force, "" if none has changed.
+
+    `message` is the daemon's answer: "KEY = NEW (was OLD), KEY = NEW (was OLD)".
+    """
+    changes = {key: (new, old) for key, new, old in _CHANGE.findall(message)}
+    if not changes:
+        return ""
+    limits = {key: pair for key, pair in changes.items() if stays(key)}
+    try:
+        kept = lowered(_limits(limits, 1), _limits(limits, 0))
+    except (TypeError, ValueError):  # a daemon of another version may have other limits
+        kept = {}
+    if not kept:
+        return "until the daemon's next start"
+    if len(kept) == len(changes):
+        return "a lowered limit survives a restart of the daemon, except on the simulator"
+    return (
+        f"until the daemon's next start; only {', '.join(kept)} is lowered and survives a restart, "
+        "except on the simulator"
+    )
+
+
+def _limits(pairs: Mapping[str, Sequence[str]], at: int) -> LimitsConfig:
+    """Return limits with the new (`at` = 0) or the old values (`at` = 1) of these changes."""
+    return LimitsConfig(**{key.removeprefix(TABLE): float(pair[at]) for key, pair in pairs.items()})
 
 
 def _set_all(
@@ -133,7 +165,7 @@ def _set_all(
         reply = one.set(settings, keep=keep)
         if as_json or keep or not reply.success:
             return reply
-        return ServiceReply(True, f"{reply.message}; {_until(settings)}")
+        return ServiceReply(True, _lasting(reply.message))
 
     replies = of_each(robot, ids, change_one)
     return print_each(replies, robot, ids, "NO ANSWER: {error}", as_json=as_json)

@@ -7,6 +7,7 @@ from __future__ import annotations
 import argparse
 import re
 import socket
+from collections.abc import Mapping
 from pathlib import Path
 
 from acsard.cli.common import add_config, load, whole
@@ -134,28 +135,29 @@ def _add_common(action: argparse.ArgumentParser) -> None:
 def main_init(args: argparse.Namespace) -> int:
     directory = args.directory.resolve()
 
-    robots: list[str] = []
+    configs: list[Config] = []
 
     def keys(config: Config) -> dict[str, object]:
-        robots.append(config.robot.id)
+        configs.append(config)
         return certificates.keys(config, directory)
 
     if args.write:
         require_tomlkit()
         require_changeable(args.write, keys, new=True)
     else:
-        robots.append(load(None)[1].robot.id)
+        # The file may already have https:// or tls/ addresses, which need these certificates.
+        wanted: Mapping[str, object] = keys(load(None, {"bus.tls": str(directory)})[1])
     names = certificates.init(args.directory, args.address, args.days, force=args.force)
     if args.write:
-        changed = change(args.write, keys, new=True)
-        listen = write(changed["bus.listen"])
-        print(f"{args.write}: set bus.listen = {listen} and bus.tls\n")
+        wanted = change(args.write, keys, new=True)
+        print(f"{args.write}: set bus.listen = {write(wanted['bus.listen'])} and bus.tls\n")
     _admit_service(directory)
-    host, robot = socket.gethostname(), robots[-1]
+    host, robot = socket.gethostname(), configs[-1].robot.id
     files = {"ca": CA, "certificate": CERTIFICATE, "key": KEY}
-    lines = "" if args.write else _LINES.format(directory=directory, port=certificates.PORT)
+    listen = write(wanted["bus.listen"])
+    lines = "" if args.write else _LINES.format(listen=listen, directory=directory)
     print(_certified(names))
-    where = f"tls/{host}.local:{certificates.PORT}"
+    where = f"tls/{host}.local:{certificates.port(configs[-1])}"
     print(_NEXT.format(directory=directory, robot=robot, where=where, lines=lines, **files))
     return 0
 
@@ -276,7 +278,7 @@ _LINES = """\
 On the robot, in acsard.toml (--write FILE does it):
 
 [bus]
-listen = ["tcp/127.0.0.1:7448", "tls/0.0.0.0:{port}"]
+listen = {listen}
 tls = "{directory}"
 
 """

@@ -6,9 +6,9 @@ import argparse
 
 from acsard.cli.common import add_config, load
 from acsard.core.config.settings import Config
-from acsard.core.incoming.queries import topic_table
+from acsard.core.incoming.queries import note_of, topic_table
 from acsard.core.messages.encodings import encode
-from acsard.core.messages.keys_and_roles import by_key
+from acsard.core.messages.keys_and_roles import COMMANDS, by_key, source_keys
 from acsard.core.messages.schema import TopicInfo, Topics
 from acsard.core.ros.names import full_name
 from acsard.core.ros.parameters import SETTING
@@ -36,10 +36,11 @@ def main(args: argparse.Namespace) -> int:
 def ros_table(config: Config) -> Topics:
     """Return the ROS topics and services that are switched on, each with its bus key."""
     ros = config.ros
+    known = source_keys(source.name for source in config.commands.sources)
     rows = []
     for row in ros_names(ros, left_out(config)) if ros.bridge or ros.rmw else ():
         native = by_key(row.native)
-        note = f"as {row.native}" + (f": {native.note}" if native else "")
+        note = f"as {row.native}" + (f": {note_of(config, native)}" if native else "")
         if row.direction == "query":
             sets = row.name.endswith(SETTING)
             note = (
@@ -47,6 +48,8 @@ def ros_table(config: Config) -> Topics:
                 if sets
                 else "the configuration as parameters"
             )
+        elif row.native.partition("/")[0] in COMMANDS and row.native not in known:
+            note += ": refused, because no [[commands.sources]] has this name"
         name = full_name(ros.namespace, row.name)
         rows.append(TopicInfo(name, row.direction, row.type, native.rate if native else "", note))
     return Topics(rows)

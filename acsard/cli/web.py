@@ -93,7 +93,8 @@ def main(args: argparse.Namespace) -> int:
         raise MendableError(
             f"needs the libraries aiohttp and segno; run: {install('web')}"
         ) from None
-    where, loaded = load(args.config, {"record.directory": args.record or None})
+    options = {"record.directory": args.record or None, "bus.tls": args.tls or None}
+    where, loaded = load(args.config, options)
     config = recorded(loaded)
     if args.invite:
         return _invite(args, config, where)

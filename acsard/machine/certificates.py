@@ -156,6 +156,12 @@ def keys(config: Config, directory: Path) -> dict[str, object]:
     return {"bus.listen": listen, "bus.tls": str(directory)}
 
 
+def port(config: Config) -> str:
+    """Return the port of the first endpoint with TLS in the settings of `keys`."""
+    ports = [at.rpartition(":")[2] for at in config.bus.listen if at.startswith("tls/")]
+    return ports[0] if ports else str(PORT)
+
+
 def _maker() -> type[Authority]:
     try:
         from acsard.machine.authority import Authority

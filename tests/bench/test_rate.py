@@ -3,7 +3,7 @@
     pytest -s -m bench tests/bench/test_rate.py
 
 The rate is that of the whole daemon on a simulated microcontroller in another process, with one
-subscriber of odometry, and a line and a reply every period. `acsard.toml` allows at most 1000 Hz
+subscriber of odometry, and a line and a reply every period. `control.rate` allows at most 1000 Hz
 and the rate that the baud rate carries; `unlimited.py` describes how these limits are lifted. The
 search doubles the rate, then halves the interval.
 """

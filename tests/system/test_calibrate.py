@@ -365,6 +365,7 @@ def test_the_simulator_is_calibrated_by_its_true_pose_without_a_person(tmp_path:
     assert found["reference"] == "positions"
     assert abs(found["wheel_separation_multiplier"] - 1.6 * 1.06) < 0.1
     assert found["left_wheel_radius"] == pytest.approx(0.0495, abs=0.0001)
+    assert not any("better with the wheels than a sensor can" in note for note in found["notes"])
 
 
 @pytest.mark.soak

@@ -58,14 +58,16 @@ def angle_before(leg: Leg) -> str:
 
 
 def guide(
-    name: str, setup: Setup, prompt: Prompt, ride: Callable[[Leg], Run], *, simulated: bool = False
-) -> Calibration:
+    name: str, setup: Setup, prompt: Prompt, ride: Callable[[Leg], Run], *,
+    simulated: bool = False, true_positions: bool = False,
+) -> Calibration:  # fmt: skip
     """Lead a person through the legs of a method of calibration, and return the result.
 
     Args:
         name: the name of the method, as in `METHODS`.
         ride: the function that drives one leg and returns its recording.
         simulated: whether the robot is the built-in simulator, which allows more repeats.
+        true_positions: whether the recorded positions are the simulator's true ones.
 
     Raises:
         GuideError: the drive cannot continue.
@@ -137,5 +139,6 @@ def guide(
         return replace(found, notes=notes, feedback=follows.settings())
     metres = answers.get((STRAIGHT, "metres"), 0.0)
     tape = Tape(metres, STRAIGHT) if metres >= LEAST_M else None
-    log = Log(tuple(replace(run, name=name) for name, run in rides.items()), ())
+    driven = tuple(replace(run, name=name) for name, run in rides.items())
+    log = Log(driven, (), true_positions)
     return calibrate(log, setup.drive, tape, setup.odometry, setup.feedback)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ipaddress
 import math
+from collections.abc import Callable
 from itertools import pairwise
 
 from acsard.core.config import motion_rules, named_faults
@@ -109,8 +110,8 @@ def _count_warnings(config: Config) -> list[str]:
     if mcu.simulated and mcu.encoder_counts != config.sim.encoder_counts:
         found.append(
             f"mcu.encoder_counts = {mcu.encoder_counts}, but the simulated robot's encoders have "
-            f"sim.encoder_counts = {config.sim.encoder_counts}: every distance will be wrong; "
-            "write the same number for both keys"
+            f"sim.encoder_counts = {config.sim.encoder_counts}: distances may be wrong; write the "
+            "same number for both keys"
         )
     coarse = mcu.encoder_counts < FEW_COUNTS and not mcu.wants_samples
     if coarse and config.rate_hz > FASTEST_HZ:
@@ -227,15 +228,19 @@ def _battery_problems(config: Config) -> list[str]:
     return found
 
 
-def _repeated(noun: str, names: dict[str, str]) -> list[str]:
+def _repeated(
+    noun: str, names: dict[str, str], part: Callable[[str], str] = lambda name: name
+) -> list[str]:
+    """Return a line for each name whose `part` an earlier name has too. `names` has them by key."""
     first: dict[str, str] = {}
     found = []
     for key, name in names.items():
-        if name in first:
+        same = part(name)
+        if same in first:
             found.append(
-                f"{key} = {show(name)}: {first[name]} already has this {noun}; write another"
+                f"{key} = {show(name)}: {first[same]} already has this {noun}; write another"
             )
-        first.setdefault(name, key)
+        first.setdefault(same, key)
     return found
 
 
@@ -308,6 +313,36 @@ def _endpoint_problems(config: Config, key: str) -> list[str]:
     return found
 
 
+def _listen_twice_problems(config: Config) -> list[str]:
+    """Find a host and port at which the daemon or its TLS gateway would listen twice."""
+    listen = _endpoints(config.bus).get("listen", ())
+    names = {f"bus.listen[{i}]": endpoint for i, endpoint in enumerate(listen)}
+    return _repeated("host and port", names, lambda endpoint: endpoint.partition("/")[2])
+
+
+def _page_problems(config: Config) -> list[str]:
+    """Find addresses at which the page would not start, as `acsard/web/listen.py` decides."""
+    addresses, found = config.web.address, []
+    for address in addresses:
+        where = f"web.address = {show(address)}"
+        scheme, _, place = address.partition("://")
+        host, _, port = place.rpartition(":")
+        if not 0 < int(port) < 65536:
+            found.append(f"{where}: a port is a number from 1 to 65535")
+        elif scheme == "http" and not _is_loopback(host.strip("[]")):
+            found.append(
+                f"{where}: http is only for this machine; write 127.0.0.1, or https:// with the "
+                "robot's certificate, like https://0.0.0.0:8443"
+            )
+        elif scheme == "https" and not config.bus.tls:
+            found.append(
+                f"{where}: needs a certificate; `acsard tls init` makes it and prints the bus.tls "
+                "to write"
+            )
+    names = {f"web.address[{i}]": address for i, address in enumerate(addresses)}
+    return found + _repeated("host and port", names, lambda address: address.partition("://")[2])
+
+
 def _access_problems(config: Config) -> list[str]:
     access = config.access
     lists = {"viewers": access.viewers, "operators": access.operators}
@@ -355,9 +390,11 @@ def _is_loopback(host: str) -> bool:
     if host == "localhost":
         return True
     try:
-        return ipaddress.ip_address(host).is_loopback
+        address = ipaddress.ip_address(host)
     except ValueError:
         return False
+    mapped = getattr(address, "ipv4_mapped", None)
+    return (mapped or address).is_loopback
 
 
 RULES: tuple[Rule, ...] = (
@@ -375,6 +412,8 @@ RULES: tuple[Rule, ...] = (
     _reachability_problems,
     lambda config: _endpoint_problems(config, "listen"),
     lambda config: _endpoint_problems(config, "connect"),
+    _listen_twice_problems,
+    _page_problems,
     _access_problems,
     _ros_problems,
     *named_faults.RULES,

@@ -11,7 +11,7 @@ import math
 from msgspec import Struct
 
 from acsard.core.config.partial import Rule, mistakes
-from acsard.core.config.settings import Config
+from acsard.core.config.settings import LONGEST_REPLY_S, Config
 
 LEAST_JERK = 0.01
 """Smallest allowed jerk limit, m/s3 or rad/s3. With less, reaching walking pace takes over 10 s."""
@@ -28,10 +28,6 @@ HEADROOM = 1.1
 
 MOST_WHEEL_SPEED = 99.99
 """Highest wheel speed that a line to the board can express, rad/s."""
-
-LONGEST_REPLY_S = 0.25
-"""Longest allowed time between two feedback lines, s. A board that is silent for one second counts
-as restarted. With this period, the next line arrives in time even if two lines are lost."""
 
 LINES_OF_EVIDENCE = 2
 """Number of feedback lines that must show a wheel fault before the fault is reported."""
@@ -114,12 +110,10 @@ def _reply_problems(config: Config) -> list[str]:
     most = longest_reply(fault_s)
     if period <= most:
         return []
-    fix = ""
-    if period <= LONGEST_REPLY_S:
-        fix = f"; or write feedback.fault_time = {_rounded_up(period * LINES_OF_EVIDENCE):g}"
     return [
-        f"mcu.reply_period = {period:g}: one lost line would look like a wheel fault or like a "
-        f"restart of the board; write {most:g} or less and make the firmware report more often{fix}"
+        f"mcu.reply_period = {period:g}: one lost line would look like a wheel fault; write "
+        f"{most:g} or less and make the firmware report more often; or write feedback.fault_time "
+        f"= {_rounded_up(period * LINES_OF_EVIDENCE):g}"
     ]
 
 

@@ -42,7 +42,8 @@ CommonName = Annotated[
         # The name becomes a part of keys on the bus, and the message `state` shows it.
         pattern=r"^(?!@)[\w .:@+-]{1,64}\Z",
         extra={
-            "unit": "the common name of a certificate: letters, digits, spaces and _.:@+-",
+            "unit": "the common name of a certificate: 1 to 64 letters, digits, spaces and "
+            "_.:@+-, and no @ at the start",
             "example": "operator",
         },
     ),
@@ -145,12 +146,18 @@ class WheelMap(Struct, frozen=True):
 SIMULATOR = "sim"
 """Port name that selects the built-in simulator."""
 
+LONGEST_REPLY_S = 0.25
+"""Longest allowed time between two feedback lines, s. A board that is silent for one second counts
+as restarted. With this period, the next line arrives in time even if two lines are lost."""
+
 
 class McuConfig(Struct, frozen=True):
     port: Text = SIMULATOR
     baud_rate: Baud = 115200
     trailing_comma: bool = False
-    reply_period: Annotated[float, Meta(ge=0.0, le=2.0, extra={"unit": "s"})] = 0.0
+    reply_period: Annotated[
+        float, Meta(ge=0.0, le=LONGEST_REPLY_S, extra={"unit": "s between two lines of the board"})
+    ] = 0.0
     link_check: Literal["off", "auto", "require"] = "off"
     encoder_counts: EncoderCounts = 0
     wheels: WheelMap = WheelMap()

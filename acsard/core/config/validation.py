@@ -126,10 +126,17 @@ def expected(kind: inspect.Type) -> str:
             return " or ".join(expected(type_) for type_ in types)
         case inspect.TupleType(item_types=items):
             return f"a list of {len(items)} values, each {expected(items[0])}"
-        case inspect.VarTupleType(item_type=item):
-            return f"a list, each {expected(item)}"
+        case inspect.VarTupleType(item_type=item, min_length=least, max_length=most):
+            return f"a list{_entries(least, most)}, each {expected(item)}"
         case _:
             return "another kind of value"
+
+
+def _entries(least: int | None, most: int | None) -> str:
+    """Return the allowed number of entries of a list, with a space in front; "" without a limit."""
+    if most is None:
+        return "" if least is None else f" of {least} or more entries"
+    return f" of at most {most} entries" if least is None else f" of {least} to {most} entries"
 
 
 def _fix(field: FieldInfo, where: str) -> str:

@@ -30,6 +30,7 @@ from acsard.core.messages.keys_and_roles import (
     SERVICES,
     VERBS,
     WHOAMI,
+    Topic,
     full_key,
     offered,
     whoami_key,
@@ -54,7 +55,7 @@ from acsard.core.ros.parameters import (
     outcome,
     wished,
 )
-from acsard.core.ros.transports import PARAMETERS, in_ros_words
+from acsard.core.ros.transports import PARAMETERS, in_ros_words, left_out
 from acsard.core.values import ROLES, Answer, Outputs, Request
 
 Current = Callable[[str], Message | None]
@@ -321,14 +322,23 @@ def _format(query: Query) -> Format:
 
 
 def topic_table(config: Config) -> Topics:
-    """Return the topic table with the rows that this daemon offers and with full keys."""
-    robot = config.robot.id
+    """Return the topic table with full keys, without the messages that this daemon never sends."""
+    robot, silent = config.robot.id, left_out(config)
     return Topics(
         [
-            TopicInfo(full_key(robot, t.key), t.direction, t.type, t.rate, t.note)
+            TopicInfo(full_key(robot, t.key), t.direction, t.type, t.rate, note_of(config, t))
             for t in offered(config)
+            if t.direction != "out" or t.key not in silent
         ]
     )
+
+
+def note_of(config: Config, topic: Topic) -> str:
+    """Return the meaning of a key with this configuration, which decides the fixed transforms."""
+    if topic.key != "tf_static":
+        return topic.note
+    frames = {"lidar": config.lidar.publish_tf, "base_footprint": config.footprint.publish_tf}
+    return "transform " + ", ".join(f"base -> {name}" for name, on in frames.items() if on)
 
 
 def interfaces(config: Config, outputs: Outputs | None) -> Interfaces:

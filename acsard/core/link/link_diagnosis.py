@@ -114,7 +114,7 @@ class Lateness:
                 f"{BUSY}"
             )
         if link == "stale" and self._simulated:
-            return f"{SIMULATOR}: {BUSY}"
+            return f"{SIMULATOR}, or a fault in sim.faults silences it: {BUSY}"
         return WORDS[link]
 
 

@@ -14,8 +14,7 @@ from __future__ import annotations
 
 from collections import Counter
 
-from acsard.core.config.motion_rules import LONGEST_REPLY_S
-from acsard.core.config.settings import FeedbackConfig, McuConfig
+from acsard.core.config.settings import LONGEST_REPLY_S, FeedbackConfig, McuConfig
 from acsard.core.link import link_diagnosis
 from acsard.core.link.board_status import STATUS, BoardStatus, decode_status, merged
 from acsard.core.link.checked_line import Reading, unseal

@@ -39,14 +39,21 @@ def test_of_a_scale_that_nothing_measured_nothing_is_written() -> None:
 
 
 def test_people_are_told_what_it_improves_and_what_remains() -> None:
-    told = plain(*parts(REPORT, FOUND, "acsard.toml"), width=SENTENCES)
+    told = plain(*parts(REPORT, FOUND, "acsard.toml", guided=False), width=SENTENCES)
     assert "wheel_separation_multiplier   " in told
     assert f"heading error after a turn of 360 deg: {REPORT.turn_error_before:.0f} deg now" in told
     assert "remaining error" in told
-    assert "--distance METRES" in told
+    assert "give --distance METRES" in told
+
+
+def test_a_guided_calibration_does_not_advise_an_option_that_needs_a_log() -> None:
+    told = plain(*parts(REPORT, FOUND, "acsard.toml", guided=True), width=9999)
+    assert "--distance" not in told
+    assert "calibrate with --method tape, or with --method gyro and type the distance" in told
 
 
 def test_the_notes_come_after_the_result() -> None:
-    told = plain(*parts(structs.replace(REPORT, notes=["one"]), FOUND, "acsard.toml"), width=99)
+    made = structs.replace(REPORT, notes=["one"])
+    told = plain(*parts(made, FOUND, "acsard.toml", guided=False), width=99)
     assert told.rstrip().endswith("note: one")
     assert told.index("wheel_separation_multiplier =") < told.index("note: one")

@@ -364,7 +364,8 @@ def test_noise_is_written_beside_the_geometry_and_told(found: Calibration) -> No
     assert after.yaw_variance_per_metre < before.yaw_variance_per_metre
     assert after.yaw_variance_per_radian < before.yaw_variance_per_radian / 10
     assert after.distance_variance_per_metre < before.distance_variance_per_metre
-    told = plain(*parts(report("a.csv", found, DriveConfig(), ""), found, "f"), width=SENTENCES)
+    made = report("a.csv", found, DriveConfig(), "")
+    told = plain(*parts(made, found, "f", guided=False), width=SENTENCES)
     assert "random heading error that the odometry messages state after 10 m of driving: " in told
     assert "random distance error that the odometry messages state after 10 m" in told
 

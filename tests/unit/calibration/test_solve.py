@@ -12,6 +12,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from acsard.calibration.calibration_report import keys
 from acsard.calibration.log_table import RefusedError
@@ -434,3 +435,12 @@ def test_a_million_rows_are_calibrated_with() -> None:
     text = drive(Robot(rng=rng), wander(rng, 4900.0)).csv()
     assert text.count("\n") > 1_000_000
     assert calibrated(text).multipliers.values[0] == pytest.approx(1.6 * 1.045, rel=0.02)
+
+
+def test_positions_that_agree_too_well_are_named_unless_they_are_the_simulators_true_pose() -> None:
+    robot = Robot(place_noise=0.0, outliers=0.0, lever=0j, slip=0.0, late=0.0, decimals=9)
+    log = log_of_runs([drive(robot, GUIDED)], gyro=False)
+    note = "these values agree better with the wheels than a sensor can"
+    assert any(note in line for line in calibrate(log, DriveConfig()).notes)
+    true = structs.replace(log, true_positions=True)
+    assert not any(note in line for line in calibrate(true, DriveConfig()).notes)

@@ -48,8 +48,13 @@ def test_an_address_of_this_machine_is_taken(text: str, address: tuple[str, int]
 
 @pytest.mark.parametrize("text", ["0.0.0.0:8765", "192.168.1.5:8765", "8.8.8.8:80"])
 def test_beyond_this_machine_is_refused_with_the_reason_and_the_tunnel(text: str) -> None:
-    with pytest.raises(UsageError, match=r"has no authentication.*ssh -N -L \d+:127\.0\.0\.1:\d+"):
+    port = text.rpartition(":")[2]
+    with pytest.raises(UsageError, match="has no authentication") as refused:
         foxglove.loopback(text)
+    told = str(refused.value)
+    assert "could stop the robot, and with --drive could drive it" in told
+    assert f"Listen on 127.0.0.1:{port} and" in told
+    assert f"ssh -N -L {port}:127.0.0.1:{port} USER@ROBOT" in told
 
 
 @each("text", ["", "8765", "127.0.0.1", "robot:8765", "127.0.0.1:x", "[::1]:8765"])

@@ -78,20 +78,31 @@ def test_several_robots_are_refused_for_a_list_and_for_the_local_file(
     assert why in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("key", "until"),
+SURVIVES = "; a lowered limit survives a restart of the daemon, except on the simulator"
+ENDS = "; until the daemon's next start"
+
+
+@each(
+    ("answer", "until"),
     [
+        ("limits.linear_speed = 0.6 (was 1.0)", SURVIVES),
+        ("limits.linear_speed = 0.6 (was 1.0), limits.linear_jerk = 2.0 (was 0.0)", SURVIVES),
+        ("limits.linear_speed = 1.0 (was 0.6)", ENDS),
+        ("limits.linear_jerk = 0.0 (was 2.0)", ENDS),
+        ("limits.linear_deceleration = 0.5 (was 1.0)", ENDS),
+        ("rates.state = 5.0 (was 10.0)", ENDS),
+        ("limits.unknown_here = 0.5 (was 1.0)", ENDS),
+        ("odometry.pose_covariance_diagonal = [1.0, 2.0] (was [0.0, 2.0])", ENDS),
         (
-            "limits.linear_speed",
-            "; until the daemon's next start; a lowered limit survives a restart of the daemon, "
-            "except on the simulator",
+            "rates.state = 5.0 (was 10.0), limits.linear_speed = 0.6 (was 1.0)",
+            f"{ENDS}; only limits.linear_speed is lowered and survives a restart, except on the "
+            "simulator",
         ),
-        ("limits.linear_deceleration", "; until the daemon's next start"),
-        ("rates.state", "; until the daemon's next start"),
+        ("nothing changes: all settings have these values already", ""),
     ],
 )
 def test_the_answer_says_how_long_the_setting_lasts(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], key: str, until: str
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], answer: str, until: str
 ) -> None:
     class Robot:
         def __enter__(self) -> Robot:
@@ -100,11 +111,11 @@ def test_the_answer_says_how_long_the_setting_lasts(
         def __exit__(self, *words: object) -> None: ...
 
         def set(self, settings: dict[str, object], *, keep: bool) -> ServiceReply:
-            return ServiceReply(True, "done; written to robot.toml" if keep else "done")
+            return ServiceReply(True, f"{answer}; written to robot.toml" if keep else answer)
 
     monkeypatch.setattr("acsard.cli.connection.connect", lambda *words, **more: Robot())
-    for words, told in (([], f"done{until}"), (["--keep"], "done; written to robot.toml")):
-        args = parser().parse_args(["set", key, "0.5", *words])
+    for words, told in (([], answer + until), (["--keep"], f"{answer}; written to robot.toml")):
+        args = parser().parse_args(["set", "rates.state", "0.5", *words])
         assert args.main(args) == 0
         assert capsys.readouterr().out == f"{told}\n"
 

@@ -659,6 +659,26 @@ def test_an_encrypted_authority_without_a_terminal_says_so(own: Path) -> None:
     assert "Traceback" not in done.stderr
 
 
+def test_the_printed_lines_are_those_that_write_writes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without --write, `tls init` reads the file too, even if it already needs certificates."""
+    monkeypatch.chdir(tmp_path)
+    text = '[bus]\nlisten = ["tcp/127.0.0.1:9", "tls/0.0.0.0:99"]\n'
+    for before in ('[bus]\nlisten = ["tcp/127.0.0.1:9"]\n', text):
+        Path("acsard.toml").write_text(before)
+        assert tls("init", "--force", "--directory", "tls") == 0
+        told = capsys.readouterr().out
+        printed = parse(tables(told)).bus
+        port = printed.listen[1].rpartition(":")[2]
+        assert f".local:{port} --tls" in told
+        Path("acsard.toml").write_text(f'{before}tls = "/old"\n')
+        words = ("--directory", "tls", "--write", "acsard.toml")
+        assert tls("init", "--force", *words) == 0
+        capsys.readouterr()
+        assert parse(Path("acsard.toml").read_bytes()).bus == printed
+
+
 @pytest.mark.parametrize("write", [True, False])
 def test_init_prints_how_this_robot_is_asked_by_its_id(
     write: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -12,7 +12,7 @@ import pytest
 
 from acsard.cli import VERBS
 from acsard.cli.topics import ros_table
-from acsard.core.config.settings import Config, RosConfig
+from acsard.core.config.settings import CommandsConfig, Config, RosConfig, Source
 from acsard.core.messages.keys_and_roles import PUBLISHED
 from acsard.core.ros.transports import PARAMETERS, left_out, ros_names
 
@@ -25,6 +25,15 @@ def test_every_ros_name_is_listed_with_what_it_stands_for() -> None:
     for row, name in zip(table.topics, names, strict=True):
         if not name.native.startswith(PARAMETERS):
             assert row.note.startswith(f"as {name.native}")
+
+
+def test_a_name_of_a_source_that_is_not_configured_is_said_to_be_refused() -> None:
+    config = Config(commands=CommandsConfig(sources=(Source("nav", 10),)))
+    notes = {row.key: row.note for row in ros_table(config).topics}
+    assert notes["/cmd_vel"] == "as cmd/nav"
+    refused = "refused, because no [[commands.sources]] has this name"
+    assert notes["/cmd_vel_dock"] == f"as cmd/dock: {refused}"
+    assert notes["/joint_commands"] == f"as wheel_cmd/ros2_control: {refused}"
 
 
 def test_a_published_name_has_the_rate_of_its_native_key() -> None:

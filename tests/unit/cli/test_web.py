@@ -52,6 +52,17 @@ def test_a_visitor_is_invited_for_an_hour_which_the_link_and_the_list_say(
     assert [row.rpartition(", ")[2] for row in rows] == ["1 h left", "30 d left"]
 
 
+def test_the_option_tls_gives_the_certificate_of_an_https_address_in_the_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("acsard.toml").write_text('[web]\naddress = ["https://127.0.0.1:8443"]\n')
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))
+    assert main(["web", "--tokens", "--tls", "tls"]) == 0
+    assert main(["web", "--tokens"]) == 78
+    assert "acsard tls init" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("words", "hint"),
     [

@@ -190,7 +190,7 @@ def test_errors_are_those_of_what_is_configured_and_of_what_was_found() -> None:
 
 def test_people_read_it_and_the_configuration_takes_it() -> None:
     made = calibrated("a tape", readings(), DRIVE, OdometryConfig())
-    told = plain(*parts(report("the drive", made, DRIVE, ""), made, "acsard.toml"))
+    told = plain(*parts(report("the drive", made, DRIVE, ""), made, "acsard.toml", guided=True))
     assert "compared with a tape" in told
     assert "heading error after a turn of 360 deg" in told
     config = parse("\n".join(excerpt(keys(made))).encode())

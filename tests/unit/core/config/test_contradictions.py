@@ -21,7 +21,10 @@ from acsard.core.config.settings import (
     RosConfig,
     SafetyConfig,
     SimConfig,
+    WebConfig,
 )
+from acsard.host.errors import UsageError
+from acsard.web.listen import listens
 from tests.each import each
 
 
@@ -83,6 +86,43 @@ def test_where_a_client_would_listen_is_neither_refused_nor_a_surprise(
     client = Config(bus=bus, ros=RosConfig(namespace="r1"))
     assert contradictions(client) == warnings(client) == []
     assert problems(bus=BusConfig(connect=here, listen=listen)) != []
+
+
+@each(
+    "addresses",
+    [
+        ("http://127.0.0.1:8080", "http://localhost:8081", "http://[::1]:8080"),
+        ("http://[::ffff:127.0.0.1]:8080",),
+        ("http://192.168.0.1:80",),
+        ("http://robot:8080",),
+        ("https://0.0.0.0:8443", "https://127.0.0.1:8444"),
+        ("http://127.0.0.1:0",),
+        ("http://127.0.0.1:65536",),
+    ],
+)
+@each("tls", ["", "/etc/acsard/tls"])
+def test_the_check_refuses_the_addresses_that_the_page_refuses(
+    addresses: tuple[str, ...], tls: str
+) -> None:
+    try:
+        found = [listens(address) for address in addresses]
+        refused = any(address.secure for address in found) and not tls
+    except UsageError:
+        refused = True
+    bus, web = BusConfig(tls=tls), WebConfig(address=addresses)
+    assert (problems(bus=bus, web=web) != []) == refused
+
+
+def test_the_page_and_the_bus_listen_once_at_a_port() -> None:
+    web = WebConfig(address=("http://127.0.0.1:8443", "https://127.0.0.1:8443"))
+    (line,) = problems(bus=BusConfig(tls="/etc/acsard/tls"), web=web)
+    assert line == (
+        'web.address[1] = "https://127.0.0.1:8443": web.address[0] already has this host and port; '
+        "write another"
+    )
+    assert len(problems(bus=BusConfig(listen=(HERE, HERE)))) == 1
+    client = BusConfig(mode="client", connect=(HERE,), listen=(HERE, HERE))
+    assert problems(bus=client) == []
 
 
 def test_a_certificate_has_one_role() -> None:
@@ -193,7 +233,7 @@ def test_counts_without_the_check_are_as_they_should_be() -> None:
 def test_counts_that_are_not_the_simulators_are_a_surprise() -> None:
     mcu = McuConfig(link_check="auto", encoder_counts=1600)
     (warning,) = warnings(Config(mcu=mcu))
-    assert "sim.encoder_counts = 3200" in warning
+    assert "sim.encoder_counts = 3200: distances may be wrong; write the same number" in warning
     assert warnings(Config(mcu=mcu, sim=SimConfig(encoder_counts=1600))) == []
 
 

@@ -156,7 +156,7 @@ PLANTED = [
     ('[joints]\nrear_left = "x\\n"', "joints.rear_left", '"x\\n"', "1 to 64"),
     ('[mcu]\nport = ""', "mcu.port", '""', "1 to 256 characters"),
     ("[mcu]\nbaud_rate = 14400", "mcu.baud_rate", "14400", "115200"),
-    ("[mcu]\nreply_period = -0.1", "mcu.reply_period", "-0.1", "from 0 to 2 s"),
+    ("[mcu]\nreply_period = -0.1", "mcu.reply_period", "-0.1", "from 0 to 0.25 s"),
     ('[mcu.wheels]\nrear_left = "c"', "mcu.wheels.rear_left", '"c"', '"+c"'),
     ("[control]\nrate = 0", "control.rate", "0", 'from 10 to 1000 Hz or one of "auto"'),
     ("[control]\nrate = 4", "control.rate", "4", "from 10"),
@@ -285,8 +285,7 @@ PLANTED = [
         "at most 2 s are allowed; either write 2 or more",
     ),
     ("[feedback]\nwheel_speed = 30", "feedback.wheel_speed", "30", "write 35.2 or more"),
-    ("[mcu]\nreply_period = 1.0", "mcu.reply_period", "1", "write 0.25 or less"),
-    ("[mcu]\nreply_period = 0.3", "mcu.reply_period", "0.3", "write 0.25 or less"),
+    ("[mcu]\nreply_period = 0.26", "mcu.reply_period", "0.26", "from 0 to 0.25 s"),
     (
         "[mcu]\nreply_period = 0.15\n[feedback]\nfault_time = 0.2",
         "mcu.reply_period",
@@ -297,6 +296,48 @@ PLANTED = [
     ("[bus]\nlisten = []", "bus.listen", "[]", 'write bus.listen = ["tcp/127.0.0.1:7448"]'),
     ('[bus]\nlisten = ["7448"]', "bus.listen", '"7448"', 'like "tcp/127.0.0.1:7448"'),
     ('[bus]\nconnect = ["tcp/10.0.0.2:1"]', "bus.connect", '"tcp/10.0.0.2:1"', "insecure = true"),
+    (
+        '[bus]\nlisten = ["tcp/127.0.0.1:1", "tcp/[::1]:1", "tcp/127.0.0.1:1"]',
+        "bus.listen[2]",
+        '"tcp/127.0.0.1:1"',
+        "bus.listen[0] already has this host and port; write another",
+    ),
+    # lists that are too long, and entries that look right
+    ("[web]\naddress = []", "web.address", "[]", "a list of 1 to 8 entries, each http(s)://"),
+    ("[web]\norigins = 5", "web.origins", "5", "a list of at most 16 entries, each http(s)://"),
+    ("[safety]\nbumpers = [1]", "safety.bumpers", "[1]", "a list of at most 4 entries, each one"),
+    ('[access]\nviewers = ["@x"]', "access.viewers", '["@x"]', "and no @ at the start"),
+    # addresses at which the page would not start
+    (
+        '[web]\naddress = ["http://0.0.0.0:8080"]',
+        "web.address",
+        '"http://0.0.0.0:8080"',
+        "http is only for this machine; write 127.0.0.1, or https://",
+    ),
+    (
+        '[web]\naddress = ["http://192.168.0.1:80"]',
+        "web.address",
+        '"http://192.168.0.1:80"',
+        "http is only for this machine; write 127.0.0.1, or https://",
+    ),
+    (
+        '[web]\naddress = ["https://0.0.0.0:8443"]',
+        "web.address",
+        '"https://0.0.0.0:8443"',
+        "needs a certificate; `acsard tls init` makes it",
+    ),
+    (
+        '[web]\naddress = ["http://127.0.0.1:0"]',
+        "web.address",
+        '"http://127.0.0.1:0"',
+        "a port is a number from 1 to 65535",
+    ),
+    (
+        '[web]\naddress = ["http://[::1]:1", "http://[::1]:2", "http://[::1]:2"]',
+        "web.address[2]",
+        '"http://[::1]:2"',
+        "web.address[1] already has this host and port; write another",
+    ),
     (
         '[bus]\nlisten = ["tcp/[::1]:1", "tcp/10.0.0.1:2", "tcp/localhost:3"]',
         "bus.listen",

@@ -10,8 +10,25 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.core.config.parsing import effective, from_builtins
-from acsard.core.config.settings import Config, JointsConfig, LimitsConfig, RobotConfig, RosConfig
-from acsard.core.incoming.queries import BUSY, Queries, Query, Reply, most_bytes, refused
+from acsard.core.config.settings import (
+    Config,
+    FootprintConfig,
+    JointsConfig,
+    LidarConfig,
+    LimitsConfig,
+    OdometryConfig,
+    RobotConfig,
+    RosConfig,
+)
+from acsard.core.incoming.queries import (
+    BUSY,
+    Queries,
+    Query,
+    Reply,
+    most_bytes,
+    refused,
+    topic_table,
+)
 from acsard.core.messages.cdr import Cdr
 from acsard.core.messages.encodings import FORMATS, DecodeError, Format, encode, encoding_name
 from acsard.core.messages.json_schema import SCHEMAS
@@ -181,6 +198,30 @@ def test_topics_is_the_whole_table_with_full_keys() -> None:
         (topic.direction, topic.type, topic.note) for topic in offered(CONFIG)
     ]
     assert reply.encoding == encoding_name("json", "Topics")
+
+
+@each(
+    ("lidar", "footprint", "note"),
+    [
+        (True, False, "transform base -> lidar"),
+        (False, True, "transform base -> base_footprint"),
+        (True, True, "transform base -> lidar, base -> base_footprint"),
+        (False, False, None),
+    ],
+)
+def test_the_table_has_only_the_transforms_that_the_daemon_publishes(
+    lidar: bool, footprint: bool, note: str | None
+) -> None:
+    config = Config(
+        lidar=LidarConfig(publish_tf=lidar), footprint=FootprintConfig(publish_tf=footprint)
+    )
+    notes = {row.key: row.note for row in topic_table(config).topics}
+    assert notes.get("acsard/acsar/tf_static") == note
+    assert "acsard/acsar/tf" in notes
+    silent = topic_table(Config(odometry=OdometryConfig(publish_tf=False)))
+    assert "acsard/acsar/tf" not in {row.key for row in silent.topics}
+    simulated = topic_table(Config(odometry=OdometryConfig(gyro=True)))
+    assert "acsard/acsar/imu" in {row.key for row in simulated.topics}
 
 
 @each("name", SCHEMAS)

@@ -72,7 +72,8 @@ def test_a_link_that_fell_silent_says_so_first_and_then_what_is_heard() -> None:
     for _ in range(20):
         bench.wait(10)
     assert bench.session.words().startswith(
-        "the built-in simulator, which is a part of this program, is late"
+        "the built-in simulator, which is a part of this program, is late, or a fault in "
+        "sim.faults silences it: "
     )
     for _ in range(302):
         bench.wait(10)
