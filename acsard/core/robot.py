@@ -448,7 +448,8 @@ class Robot:
         if self.session.lateness.step_s > UNHEARD_S and not pressed:
             # The board may have stopped the motors since the last line, so the lines that waited
             # say nothing about the wheels.
-            fault = wheels.pushed = ""
+            fault = ""
+            wheels.skip(line.speeds)
         else:
             fault = wheels.watch(None if pressed else self._written, line.speeds, line.since)
         if fault:

@@ -123,8 +123,8 @@ class Run:
         """What the board has sent of a line that has no end yet."""
         self._plain = "link_check" not in plan["config"]["mcu"]
         """The serial lines have no check, so that a whole line always counts."""
-        self._boards = 1
-        """Number of boards that were plugged in."""
+        self._begins = 1
+        """Number of times that a board began, because it was plugged in or reset."""
         self._linked = False
         """This daemon has heard the board: before that, no event disarms a sender."""
         self._stalled_ns = -NS
@@ -389,13 +389,14 @@ class Run:
                 self.at(after_ns, lambda: self._mended(fault))
             case "reset":
                 product.reset(int(event["deaf"] * NS))
+                self._begins += 1
                 self.pose.doubt()
                 self._troubled("reset")
                 deaf_ns = int(event["deaf"] * NS)
                 self.liveness.event(deaf_ns + TROUBLE_NS)
                 if deaf_ns > 12 * NS // 10:
-                    boards = self._boards
-                    self.at(self.true_ns + deaf_ns, lambda: self._hears_again(boards))
+                    begins = self._begins
+                    self.at(self.true_ns + deaf_ns, lambda: self._hears_again(begins))
             case "unplug":
                 self.inputs.lost()
                 product.unplug()
@@ -508,7 +509,7 @@ class Run:
             self.product.plug(new)
             self.inputs.plugged()
             self.witness.first, self._rest = True, b""
-            self._boards += new
+            self._begins += new
             if self.witness.blocked_ns is not None:
                 self.witness.blocked_ns = self.true_ns  # The new port has taken no line either.
             self.damage.forget()
@@ -614,9 +615,10 @@ class Run:
                 self._disarmed(true_ns)
         self._fed_ns = true_ns
 
-    def _hears_again(self, boards: int) -> None:
-        # A daemon that hears itself cannot know that the board was deaf. Another board was not.
-        if not self.echo.on and boards == self._boards:
+    def _hears_again(self, begins: int) -> None:
+        # A daemon that hears itself cannot know that the board was deaf. Another board was not, and
+        # a later reset ends the deaf time of an earlier one.
+        if not self.echo.on and begins == self._begins:
             self._disarmed(self.true_ns)
 
     def _disarmed(self, true_ns: int) -> None:

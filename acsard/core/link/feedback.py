@@ -215,7 +215,7 @@ class Timeline:
         style.read(lines, (end_ns - before) / self._usual_ns)
         if style.speaks is False:
             slots.forget()
-            if spoke:
+            if spoke and self._last_placed.clock != "prompts":
                 # No reply was assigned to a line while the board seemed to report by itself.
                 self._prompts.restart()
         self._prompts.read(end_ns, lines, following > 0)

@@ -67,7 +67,9 @@ class EventThrottle:
             self._held.setdefault(event.name, _Held()).add(event)
         told = [name for name, held in self._held.items() if self._may(name, held.news, now_ns)]
         if "clear" in told and "stop" in self._held and "stop" not in told:
-            told.insert(0, "stop")  # the log must not say that a stop came behind this release
+            # The log must not say that a stop came behind this release.
+            told.insert(0, "stop")
+            self._free_ns["stop"] += NS_PER_S
         return tuple([self._held.pop(name).line() for name in told])
 
     def _may(self, name: EventName, news: bool, now_ns: int) -> bool:

@@ -302,6 +302,13 @@ class WheelFaults:
         for side in self._sides:
             side.forget()
 
+    def skip(self, seen: WheelSpeeds) -> None:
+        """Leave out a line that waited while the board may have stopped the motors."""
+        self.pushed, speeds = "", seen.as_tuple()
+        for side in self._sides:
+            front, rear = side.wheels
+            side.expected.slow_down(speeds[front], speeds[rear])
+
     def watch(self, commanded: WheelSpeeds | None, seen: WheelSpeeds, dt: float) -> str:
         """Compare the wheel speeds in a line with their commands. The caller must then call `look`.
 

@@ -53,6 +53,11 @@ FAULTS: dict[FaultKind, str] = {
 }
 
 
+def faster(front: float, rear: float) -> float:
+    """Return the speed with the larger magnitude."""
+    return front if abs(front) > abs(rear) else rear
+
+
 class Expected:
     """The speed that healthy wheels of one side have according to their command, rad/s."""
 
@@ -64,6 +69,11 @@ class Expected:
         """Start over: expect the next reported speed, because the wheels may still coast."""
         self.commanded, self._begins, self.clear = 0.0, True, False
 
+    def slow_down(self, front: float, rear: float) -> None:
+        """Expect no more than these reported speeds, because the motors may have been stopped."""
+        most = faster(front, rear)
+        self.speed, self._slow = (min(most, old, key=abs) for old in (self.speed, self._slow))
+
     def follow(self, commanded: float, front: float, rear: float, dt: float, lag: float) -> None:
         """Update the expected speeds with a line, `dt` s after the one before.
 
@@ -72,7 +82,7 @@ class Expected:
         """
         if self._begins:
             self._begins = False
-            self.speed = self._slow = front if abs(front) > abs(rear) else rear
+            self.speed = self._slow = faster(front, rear)
         speed = self.speed = self.speed + (commanded - self.speed) * dt / (lag + dt)
         slow = self._slow = self._slow + (commanded - self._slow) * dt / (SLOWEST * lag + dt)
         self.commanded = commanded

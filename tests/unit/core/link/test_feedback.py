@@ -322,6 +322,24 @@ def test_an_answer_that_says_its_line_is_as_far_from_the_last_as_that() -> None:
         assert found.dt == pytest.approx((0.0, 0.01, 0.01, 0.017)[number])
 
 
+def test_a_stall_counts_once_if_replies_name_their_line_and_many_are_lost() -> None:
+    bench, total = Bench(counts=0), 0.0
+    began_ns = bench.now_ns
+    for number in range(200):
+        # A stall of 100 ms begins behind line 100. The reply to that line waits for its end.
+        left_ns = began_ns + (10 * number + 100 * (number > 100)) * MS
+        bench.timeline.left(left_ns)
+        if number < 95:
+            # The replies to these lines are lost, so the board seems to report by its own clock.
+            bench.timeline.left(left_ns + 3 * MS)
+            bench.timeline.left(left_ns + 6 * MS)
+        came_ns = bench.now_ns = left_ns + (109 if number == 100 else 9) * MS
+        bench.timeline.read(Instant(came_ns, came_ns), LENGTH, 1, 0)
+        total += bench.timeline.place(SPEEDS, None, 0, LENGTH, number == 100, left_ns).dt
+        if number > 90:
+            assert total == pytest.approx((left_ns - began_ns) / 1e9, abs=0.005), number
+
+
 def test_a_change_of_clocks_adds_up_to_no_time() -> None:
     bench = Bench(counts=0)
     began = bench.now_ns + 10 * MS

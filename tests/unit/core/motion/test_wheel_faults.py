@@ -40,6 +40,10 @@ def only(wheel: int, speed: float, others: float = 10.0) -> WheelSpeeds:
     return WheelSpeeds(*(speed if i == wheel else others for i in range(4)))
 
 
+def all_at(speed: float) -> WheelSpeeds:
+    return WheelSpeeds(speed, speed, speed, speed)
+
+
 class Bench:
     """A consistency check that is fed line by line."""
 
@@ -81,6 +85,28 @@ def driven(told: WheelSpeeds = TEN, counts: int = 3200) -> Bench:
 
 
 # faulty wheels
+
+
+def test_a_board_that_stopped_during_a_stall_has_no_dead_wheels_behind_it() -> None:
+    """Lines of 50 ms waited meanwhile, and the first command reaches the board 60 ms late."""
+    faults = WheelFaults(Kinematics(DriveConfig()), 3200, FeedbackConfig(fault_time=0.1))
+    for _ in range(40):
+        assert not faults.watch(all_at(6.9), all_at(6.9), 0.05)
+    for seen in (6.9, 6.9, 6.8, 4.0, 1.9, 0.9, 0.2, 0.0, 0.0):
+        faults.skip(all_at(seen))
+    ramp = (2.3, 0.0), (4.6, 0.0), (6.9, 0.4), (6.9, 2.5), (6.9, 5.0), (6.9, 6.5)
+    for told, seen in ramp:
+        assert not faults.watch(all_at(told), all_at(seen), 0.05)
+
+
+def test_a_runaway_is_found_behind_a_stall_during_which_it_never_stopped() -> None:
+    faults = WheelFaults(Kinematics(DriveConfig()), 3200, FeedbackConfig(fault_time=0.1))
+    found = ""
+    for _ in range(10):
+        for _ in range(4):
+            found = found or faults.watch(all_at(2.0), all_at(9.0), 0.05)
+        faults.skip(all_at(9.0))
+    assert "turns faster than commanded" in found
 
 
 @each("wheel", range(4))
