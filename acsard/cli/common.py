@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import sys
 from collections.abc import Callable, Mapping
@@ -64,15 +65,28 @@ def count(text: str) -> int:
     return number
 
 
-def seconds(text: str) -> float:
-    """Parse a duration from 1 to 600 s, as an argparse type.
+def between(least: float, most: float, units: str) -> Callable[[str], float]:
+    """Return an argparse type for a number from `least` to `most`.
 
-    The limit is 600 s because all measured values stay in memory: 60 MB after 600 s at 100 Hz.
+    `units` is the unit in the error message, such as "seconds".
     """
-    value = float(text)
-    if not 1.0 <= value <= 600.0:
-        raise argparse.ArgumentTypeError(f"{text} is not a number of seconds from 1 to 600")
-    return value
+
+    def number(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not least <= value <= most:
+            words = f"{text} is not a number of {units} from {least:g} to {most:g}"
+            raise argparse.ArgumentTypeError(words)
+        return value
+
+    return number
+
+
+seconds = between(1.0, 600.0, "seconds")
+"""Argparse type for the duration of a measurement. The limit is 600 s because all measured values
+stay in memory: 60 MB after 600 s at 100 Hz."""
 
 
 def whole(units: str, most: int, hint: str = "") -> Callable[[str], int]:

@@ -16,7 +16,7 @@ from typing import Any
 import zenoh
 
 from acsard.calibration.log_table import HEADER, KEYS, row
-from acsard.cli.common import count
+from acsard.cli.common import between, count
 from acsard.cli.connection import (
     MANY,
     add_bus,
@@ -58,9 +58,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-n", type=count, metavar="N", help="end after N messages of each robot")
     parser.add_argument(
         "--timeout",
-        type=float,
+        type=between(0.01, 86400, "seconds"),
         metavar="S",
-        help="end with exit code 1 if nothing is printed for S seconds",
+        help="end with exit code 1 if nothing is printed for S seconds (0.01 to 86400)",
     )
     add_bus(parser, MANY)
 
