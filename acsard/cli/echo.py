@@ -75,7 +75,7 @@ def main(args: argparse.Namespace) -> int:
         for key in args.topic:
             if key not in KEYS:
                 raise UsageError(f"{key} cannot be in a log; --csv takes {', '.join(KEYS)}")
-        with connected(args) as robot, silence_explained(robot, topic) as heard:
+        with connected(args) as robot, silence_explained(robot, topic, args.timeout) as heard:
             return _record(robot, args.topic, args.n, args.timeout, heard)
     if len(args.topic) > 1:
         raise UsageError(
@@ -94,7 +94,7 @@ def main(args: argparse.Namespace) -> int:
         elif robot.where.tls and (why := robot.whoami().silence):
             print(f"acsard: {why}. Waiting.", file=sys.stderr)
             unexplained = ""  # the reason for the silence has just been printed
-        with silence_explained(robot, unexplained) as heard:
+        with silence_explained(robot, unexplained, args.timeout) as heard:
             return _print(samples, short_form, quota, bool(many), args.timeout, heard)
 
 

@@ -177,6 +177,8 @@ def _silent(key: str) -> str:
         return f"only the simulator publishes {key}"
     if row.urdf:
         return f"{key} is published only if urdf in [ros] of the robot's acsard.toml names a file"
+    if row.key == "battery":
+        return f"{key} is published only while the board reports the battery's voltage or charge"
     return _unpublished(key, row)
 
 
