@@ -703,7 +703,7 @@ def test_the_last_word_without_a_screen_is_of_a_robot_that_stands(shared: Daemon
             until(lambda: (bus.state()["linear"] or 0.0) > 0.2, 5.0, "moving")
         terminal.press("\x03")
         assert program.ended(5.0) == 0
-        until(lambda: "left: the robot stands; " in terminal.screen, 2.0, "the last word")
+        until(lambda: "left: the robot stands; ready: " in terminal.screen, 2.0, "the last word")
     assert "forward +0.00 m/s" in terminal.screen.partition("left: ")[2]
 
 
