@@ -14,7 +14,8 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
+from copy import copy
 from decimal import Decimal
 from importlib import import_module
 from typing import NoReturn
@@ -71,6 +72,30 @@ try:  acsard run                (start the robot on the built-in simulator)
 
 
 class _Parser(argparse.ArgumentParser):
+    _intermixed = False
+    """True while argparse parses the options first, and the arguments without a name after them."""
+
+    def parse_known_args(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
+    ) -> tuple[argparse.Namespace, list[str]]:
+        """Parse the words, and report unknown ones with the help of the innermost subcommand.
+
+        Argparse leaves over the arguments that follow an option between two arguments, such as
+        `cal.csv` in `export 1 --csv cal.csv`. If words are left over, they are parsed once more
+        with `parse_known_intermixed_args`, which some Pythons build on this method.
+        """
+        if self._intermixed:
+            return super().parse_known_args(args, namespace)
+        found, unknown = super().parse_known_args(args, copy(namespace))
+        if unknown and self._subparsers is None:
+            self._intermixed = True
+            found, unknown = self.parse_known_intermixed_args(args, namespace)
+            self._intermixed = False
+        if unknown:
+            text = f"unrecognized arguments: {' '.join(unknown)}"
+            self.error(f"{text}; `{self.prog} --help` lists the options")
+        return found, unknown
+
     def _check_value(self, action: argparse.Action, value: object) -> None:
         try:
             super()._check_value(action, value)
@@ -111,11 +136,7 @@ def main(argv: list[str] | None = None) -> int:
     code = int(Exit.OK)
     try:
         try:
-            whole = parser(words[:1])
-            args, unknown = whole.parse_known_args(words)
-            if unknown:
-                text = f"unrecognized arguments: {' '.join(unknown)}"
-                whole.error(f"{text}; `acsard {args.verb} --help` lists the options")
+            args = parser(words[:1]).parse_args(words)
             code = int(args.main(args))
         except AcsardError as error:
             print(f"acsard: {lines(str(error))}", file=sys.stderr)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Sequence
 
 from acsard.cli.connection import MANY, add_bus, connected_to_many
@@ -48,6 +49,9 @@ def main(args: argparse.Namespace) -> int:
     if len(args.values) != len(wanted):
         form = " ".join(["acsard call", args.service, *(name.upper() for name in wanted)])
         raise UsageError(f"write: {form}")
+    for name, value in zip(wanted, args.values, strict=True):
+        if not math.isfinite(value):
+            raise UsageError(f"{name.upper()} = {value}: the number must be finite; correct it")
     if args.service != "stop" and (ids := named(args.id or "")):
         raise UsageError(for_one(args.service, args.values, ids))
     with connected_to_many(args) as (robot, many):

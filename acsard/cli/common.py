@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
+import re
 import sys
 from collections.abc import Callable, Mapping
 
@@ -64,15 +66,28 @@ def count(text: str) -> int:
     return number
 
 
-def seconds(text: str) -> float:
-    """Parse a duration from 1 to 600 s, as an argparse type.
+def between(least: float, most: float, units: str) -> Callable[[str], float]:
+    """Return an argparse type for a number from `least` to `most`.
 
-    The limit is 600 s because all measured values stay in memory: 60 MB after 600 s at 100 Hz.
+    `units` is the unit in the error message, such as "seconds".
     """
-    value = float(text)
-    if not 1.0 <= value <= 600.0:
-        raise argparse.ArgumentTypeError(f"{text} is not a number of seconds from 1 to 600")
-    return value
+
+    def number(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not least <= value <= most:
+            words = f"{text} is not a number of {units} from {least:g} to {most:g}"
+            raise argparse.ArgumentTypeError(words)
+        return value
+
+    return number
+
+
+seconds = between(1.0, 600.0, "seconds")
+"""Argparse type for the duration of a measurement. The limit is 600 s because all measured values
+stay in memory: 60 MB after 600 s at 100 Hz."""
 
 
 def whole(units: str, most: int, hint: str = "") -> Callable[[str], int]:
@@ -113,22 +128,42 @@ def tables(
     return given
 
 
+OPTIONS = {
+    "mcu.port": "--port",
+    "mcu.baud_rate": "--baud-rate",
+    "robot.id": "--id",
+    "ros.namespace": "--namespace",
+    "record.directory": "--record",
+    "bus.listen": "--listen",
+    "bus.connect": "--connect",
+    "control.rate": "--rate",
+    "bus.tls": "--tls",
+}
+"""Maps each configuration key that an option can set to the name of the option."""
+
+
 def load(path: str | None, options: Mapping[str, object] | None = None) -> tuple[str, Config]:
     """Return the path of the configuration and the configuration itself.
 
-    `path` is the value of --config, or None. `options` maps dotted keys, such as "mcu.port", to
-    values that override the file; None leaves a key as it is. If the configuration has problems,
-    this prints each of them and raises `MendableError`.
+    `path` is the value of --config, or None. `options` maps dotted keys of `OPTIONS` to values that
+    override the file; None leaves a key as it is. If the configuration has problems, this prints
+    each of them with the file or the option that it is in, and raises `MendableError`.
     """
     where, text = find(path)
     given = tables(options or {}, by_environment())
+    typed = {key: OPTIONS[key] for key, value in (options or {}).items() if value is not None}
     try:
         return where, configuration.parse(text, given)
     except ConfigError as error:
-        for problem in error.problems:
-            print(f"{where}: {problem}", file=sys.stderr)
+        places = [typed.get(re.split(r"[ :\[]", one)[0], where) for one in error.problems]
+        for place, problem in zip(places, error.problems, strict=True):
+            others = [f"{key} is from {name}" for key, name in typed.items() if key in problem]
+            note = f" ({', '.join(others)})" if others and place == where else ""
+            print(f"{place}: {problem}{note}", file=sys.stderr)
         count = many(len(error.problems), "problem")
-        raise ExitError(Exit.BAD_CONFIG, f"{count} in {where}") from None
+        raise ExitError(
+            Exit.BAD_CONFIG, f"{count} in {' and '.join(dict.fromkeys(places))}"
+        ) from None
 
 
 def recorded(config: Config) -> Config:

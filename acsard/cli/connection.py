@@ -5,7 +5,9 @@ explains why no message arrives.
 from __future__ import annotations
 
 import argparse
+import math
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from threading import Event, Thread
@@ -135,21 +137,27 @@ def require_asked(key: str) -> None:
 
 @contextmanager
 def explained(
-    look: Callable[[], str], ceased: Callable[[], str] | None = None, after_s: float = FIRST_S
+    look: Callable[[], str],
+    ceased: Callable[[], str] | None = None,
+    after_s: float = FIRST_S,
+    timeout_s: float = math.inf,
 ) -> Iterator[Callable[[], None]]:
     """Print why no messages arrive, and yield a function that the caller calls for each message.
 
-    A separate thread prints on standard error, so the caller never waits.
+    A separate thread prints on standard error, so the caller does not wait while it receives.
 
     Args:
         look: is called if no message arrives in the first `after_s` s, and returns the reason.
         ceased: is called if no further message arrives for `after_s` s, and returns the reason. If
             it is None, only the silence before the first message is explained.
         after_s: shortest silence that is explained, s.
+        timeout_s: silence after which the caller ends the context, s. If no message has arrived by
+            then, the reason is printed before the context ends.
 
     A reason that is "" is not printed.
     """
-    come, end = Event(), Event()
+    come, end, looked = Event(), Event(), Event()
+    began_s = time.monotonic()
 
     def say(found: str) -> bool:
         if found and not come.is_set():
@@ -157,7 +165,10 @@ def explained(
         return bool(found)
 
     def tell() -> None:
-        told = not come.wait(after_s) and say(look())
+        try:
+            told = not come.wait(min(after_s, timeout_s)) and say(look())
+        finally:
+            looked.set()
         while ceased is not None and not end.wait(after_s):
             if come.is_set():
                 come.clear()
@@ -168,18 +179,27 @@ def explained(
     Thread(target=tell, name="waiting", daemon=True).start()
     try:
         yield come.set
+        if time.monotonic() - began_s >= timeout_s:
+            looked.wait()
     finally:
         end.set()
         come.set()
 
 
-def silence_explained(robot: Client, key: str = "") -> AbstractContextManager[Callable[[], None]]:
+def silence_explained(
+    robot: Client, key: str = "", timeout_s: float | None = None
+) -> AbstractContextManager[Callable[[], None]]:
     """Print why no message arrives on a key, and later whether the connection was lost.
 
     The context yields a function that the caller calls for each message. If `key` is "", only a
-    lost connection is reported. The texts go to standard error.
+    lost connection is reported. The texts go to standard error. If the caller ends the context
+    after a silence of `timeout_s` s, the text is printed before.
     """
-    return explained(lambda: _none_yet(robot, key) if key else "", lambda: _ceased(robot))
+    return explained(
+        lambda: _none_yet(robot, key) if key else "",
+        lambda: _ceased(robot),
+        timeout_s=math.inf if timeout_s is None else timeout_s,
+    )
 
 
 def _none_yet(robot: Client, key: str) -> str:

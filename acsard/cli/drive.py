@@ -6,8 +6,11 @@ from __future__ import annotations
 
 import argparse
 import sys
+from typing import get_args
 
+from acsard.cli.common import between
 from acsard.cli.connection import add_bus, connected, require_one
+from acsard.core.config.settings import AngularSpeed, LinearSpeed
 from acsard.core.messages.permissions import COMMAND_ROLE, has
 from acsard.host.errors import NoAnswerError, NotPermittedError, UsageError
 from acsard.top import terminal
@@ -18,13 +21,16 @@ from acsard.top.keyboard import Keyboard, Ride
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.epilog = "\n".join(HELP)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    for name, speed, unit in (("--linear", 0.5, "M/S"), ("--angular", 1.0, "RAD/S")):
+    for name, speed, setting in (("--linear", 0.5, LinearSpeed), ("--angular", 1.0, AngularSpeed)):
+        _, meta = get_args(setting)
+        unit = meta.extra["unit"]
         parser.add_argument(
             name,
-            type=float,
+            type=between(meta.ge, meta.le, unit),
             default=speed,
-            metavar=unit,
-            help="speed at the start; keys change it during the drive (default: %(default)s)",
+            metavar=unit.upper(),
+            help=f"speed at the start, from {meta.ge:g} to {meta.le:g} {unit}; keys change it "
+            "during the drive (default: %(default)s)",
         )
     parser.add_argument(
         "--source",

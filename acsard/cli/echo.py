@@ -16,7 +16,7 @@ from typing import Any
 import zenoh
 
 from acsard.calibration.log_table import HEADER, KEYS, row
-from acsard.cli.common import count
+from acsard.cli.common import between, count
 from acsard.cli.connection import (
     MANY,
     add_bus,
@@ -58,9 +58,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-n", type=count, metavar="N", help="end after N messages of each robot")
     parser.add_argument(
         "--timeout",
-        type=float,
+        type=between(0.01, 86400, "seconds"),
         metavar="S",
-        help="end with exit code 1 if nothing is printed for S seconds",
+        help="end with exit code 1 if nothing is printed for S seconds (0.01 to 86400)",
     )
     add_bus(parser, MANY)
 
@@ -75,7 +75,7 @@ def main(args: argparse.Namespace) -> int:
         for key in args.topic:
             if key not in KEYS:
                 raise UsageError(f"{key} cannot be in a log; --csv takes {', '.join(KEYS)}")
-        with connected(args) as robot, silence_explained(robot, topic) as heard:
+        with connected(args) as robot, silence_explained(robot, topic, args.timeout) as heard:
             return _record(robot, args.topic, args.n, args.timeout, heard)
     if len(args.topic) > 1:
         raise UsageError(
@@ -94,7 +94,7 @@ def main(args: argparse.Namespace) -> int:
         elif robot.where.tls and (why := robot.whoami().silence):
             print(f"acsard: {why}. Waiting.", file=sys.stderr)
             unexplained = ""  # the reason for the silence has just been printed
-        with silence_explained(robot, unexplained) as heard:
+        with silence_explained(robot, unexplained, args.timeout) as heard:
             return _print(samples, short_form, quota, bool(many), args.timeout, heard)
 
 

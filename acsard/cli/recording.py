@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 
@@ -43,6 +44,7 @@ from acsard.recording.replay_text import (
 from acsard.recording.series import NothingRecordedError, in_words, search
 from acsard.recording.time_span import (
     EXAMPLES,
+    TIMES,
     WHOLE,
     Offset,
     Span,
@@ -80,10 +82,25 @@ left out and named; the exit code stays 0.
 """
 
 
+_MISNAMED = {
+    ("mcap", ".csv"): "add --csv to write a table, or let the name end in .mcap",
+    ("csv", ".mcap"): "leave out --csv to write MCAP, or let the name end in .csv",
+    ("csv", ".html"): "let the name end in .csv; `acsard recording report` writes HTML",
+    ("rosbag2", ".csv"): "write --csv in place of --rosbag2 for a table, or leave out .csv for the "
+    "name of a directory",
+    ("rosbag2", ".mcap"): "leave out --rosbag2 to write one MCAP file, or leave out .mcap for the "
+    "name of a directory",
+    ("html", ".csv"): "let the name end in .html; `acsard recording export --csv` writes a table",
+    ("html", ".mcap"): "let the name end in .html; `acsard recording export` writes MCAP",
+    ("html", ".txt"): "let the name end in .html; `acsard recording show` prints text",
+}
+"""Maps a format and the suffix of another one to the advice for the operator who typed it."""
+
+
 def add_options(parser: argparse.ArgumentParser) -> None:
     _directory(parser, None)
     _own_config(parser, None)
-    _times(parser, None)
+    _times(parser, None, TIMES)
     actions = parser.add_subparsers(title="subcommands", metavar="SUBCOMMAND")
     shown = actions.add_parser(
         "show",
@@ -157,7 +174,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     for action in (recover, exported, report):
         action.add_argument("--force", action="store_true", help="overwrite an existing file")
     for action in (shown, exported, report):
-        _times(action, argparse.SUPPRESS)
+        _times(action, argparse.SUPPRESS, f"{EXAMPLES} (not with FILE `all`)")
     for action in (shown, replay, recover, exported, report):
         _directory(action, argparse.SUPPRESS)
     # `replay` and `export` are left out, because their own option --config has another meaning: the
@@ -195,7 +212,7 @@ def _directory(parser: argparse.ArgumentParser, default: object) -> None:
     )
 
 
-def _times(parser: argparse.ArgumentParser, default: object) -> None:
+def _times(parser: argparse.ArgumentParser, default: object, examples: str) -> None:
     for option, name in (("--from", "begin"), ("--to", "end")):
         parser.add_argument(
             option,
@@ -203,7 +220,7 @@ def _times(parser: argparse.ArgumentParser, default: object) -> None:
             default=default,
             type=_when,
             metavar="TIME",
-            help=f"for example {EXAMPLES}",
+            help=f"for example {examples}",
         )
 
 
@@ -380,6 +397,7 @@ def main_recover(args: argparse.Namespace) -> int:
 
 def main_export(args: argparse.Namespace) -> int:
     kind: Kind = args.kind
+    _require_suffix(args.new, kind)
     parts, code = _files_to_write(args), Exit.OK
     other = None if args.config is None else load(args.config)[1]
     for recording, part in parts:
@@ -398,6 +416,7 @@ def main_export(args: argparse.Namespace) -> int:
 
 
 def main_report(args: argparse.Namespace) -> int:
+    _require_suffix(args.new, "html")
     try:
         from plotly.offline import get_plotlyjs
     except ImportError:
@@ -422,6 +441,14 @@ def main_report(args: argparse.Namespace) -> int:
 def _refuse_times(args: argparse.Namespace, subcommand: str) -> None:
     if args.begin is not None or args.end is not None:
         raise UsageError(f"{subcommand} takes a whole recording: leave out --from and --to")
+
+
+def _require_suffix(new: str | None, kind: Kind | Literal["html"]) -> None:
+    """Raise `UsageError` if the name of the file to write has the suffix of another format."""
+    suffix = Path(new or "").suffix.lower()
+    if mend := _MISNAMED.get((kind, suffix)):
+        form = "a directory" if kind == "rosbag2" else f"{kind.upper()}, not {suffix}"
+        raise UsageError(f"nothing is written to {new}, because it would become {form}: {mend}")
 
 
 def _files_to_write(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
@@ -453,8 +480,9 @@ def _range(args: argparse.Namespace) -> tuple[float, float]:
     """Return the times of --from and --to, s since 1970; infinite for an option that is missing."""
     if any(isinstance(when, Offset) for when in (args.begin, args.end)):
         raise UsageError(
-            "--from and --to in seconds count from the beginning of one recording: either name "
-            f"that recording, or write a time, for example {EXAMPLES}"
+            "--from and --to in seconds count from the beginning of one recording, but "
+            "`acsard recording` and FILE `all` search all recordings: either name one recording, "
+            f"as in `acsard recording show 12 --from 30`, or write a time, for example {TIMES}"
         )
     try:
         return resolve(args.begin, args.end, time.time())

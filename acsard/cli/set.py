@@ -26,7 +26,7 @@ from acsard.client import Client
 from acsard.core.config.live import flat, live
 from acsard.core.config.lowered import TABLE, lowered, stays
 from acsard.core.config.settings import LimitsConfig
-from acsard.core.config.validation import show
+from acsard.core.config.validation import finite, show
 from acsard.core.formatting import json_line, lines
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.schema import ServiceReply
@@ -97,11 +97,17 @@ def main(args: argparse.Namespace) -> int:
 def pairs(words: Sequence[str]) -> dict[str, Plain]:
     """Return the settings in the words KEY VALUE KEY VALUE ...
 
-    A value is read as TOML; a bare word is a string. Raises `UsageError` if a value is missing.
+    A value is read as TOML; a bare word is a string. Raises `UsageError` if a value is missing, or
+    if it contains NaN or infinity.
     """
     if len(words) % 2:
         raise UsageError("give pairs of KEY VALUE, for example acsard set limits.linear_speed 0.8")
-    return {key: _value(word) for key, word in zip(words[::2], words[1::2], strict=True)}
+    given = list(zip(words[::2], words[1::2], strict=True))
+    settings = {key: _value(word) for key, word in given}
+    for key, word in given:
+        if not finite(settings[key]):
+            raise UsageError(f"{key} = {word}: a number must be finite; write one like 0.8")
+    return settings
 
 
 def _value(word: str) -> Plain:

@@ -86,6 +86,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
+    for option in ("name", "days", "hours"):
+        if getattr(args, option) is not None and not args.invite:
+            raise UsageError(
+                f"--{option} is for a new token: add --invite ROLE, or leave --{option} out"
+            )
     try:
         import aiohttp  # noqa: F401
         import segno  # noqa: F401

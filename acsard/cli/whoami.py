@@ -1,6 +1,6 @@
 """Ask the robot for the role of this client: viewer, operator or maintainer. Over TLS the
-certificate decides; on the robot's own machine every client is maintainer. The exit code is 77 if
-the client has no role.
+certificate decides; on the robot's own machine every client is maintainer. The exit code is 69 if
+no daemon answers, and 77 if none answers this client's certificate, which then may have no role.
 """
 
 from __future__ import annotations
@@ -25,4 +25,6 @@ def main(args: argparse.Namespace) -> int:
         print(msgspec.json.encode(us).decode())
     else:
         print(f"{us.words()}\nsender {us.sender}")
-    return int(Exit.OK if us.role else Exit.NO_PERMISSION)
+    if us.role:
+        return int(Exit.OK)
+    return int(Exit.NO_PERMISSION if us.certificate else Exit.UNREACHABLE)

@@ -56,10 +56,10 @@ class Moment(NamedTuple):
 When = Offset | TimeOfDay | Moment
 """A time that a person typed."""
 
-EXAMPLES = (
-    '14:05, 14:05:30, today, "yesterday 14:05", "2026-11-21 14:05", 2026-11-21, "2 h ago", or a '
-    "number of seconds after the beginning of the recording"
-)
+TIMES = '14:05, 14:05:30, today, "yesterday 14:05", "2026-11-21 14:05", 2026-11-21 or "2 h ago"'
+"""Examples of a time that may be in any recording."""
+
+EXAMPLES = f"{TIMES}; for one recording also a number of seconds after its beginning"
 
 _CLOCK = re.compile(r"(\d\d):(\d\d)(?::(\d\d(?:\.\d+)?))?")
 _AGO = re.compile(r"(\d+(?:\.\d+)?) ?(s|min|h|d)\w* ago")

@@ -11,6 +11,7 @@ from rich.text import Text
 from acsard.core.formatting import printable
 from acsard.core.messages.schema import RobotState
 from acsard.core.messages.short_texts import place, speeds
+from acsard.core.motion.modes import Mode
 from acsard.top.text import MODES, flow
 
 HELP = (
@@ -89,6 +90,13 @@ def parting(seen: Teleop, width: int) -> list[str]:
         what = "reports no speed"
     why = f"{printable(seen.state.mode)}: {reason(seen.state)}"
     return _words([f"left: the robot {what}", why], width, measured(seen.state))
+
+
+def released(seen: Teleop) -> bool:
+    """Return whether the robot stands and no longer follows the source of this drive."""
+    if seen.state is None or moves(seen.state):
+        return False
+    return seen.state.mode != Mode.DRIVING or seen.state.source != seen.source
 
 
 def moves(state: RobotState) -> bool:

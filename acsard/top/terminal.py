@@ -26,7 +26,7 @@ from acsard.core.values import AcsardError
 from acsard.host import clock
 from acsard.host.terminal_modes import one_by_one
 from acsard.terminal.output import has_screen, plain
-from acsard.top.drive_screen import HELP, Teleop, lines, moves, news, parting
+from acsard.top.drive_screen import HELP, Teleop, lines, moves, news, parting, released
 from acsard.top.feed import Feed
 from acsard.top.fleet_table import Roster, table
 from acsard.top.keyboard import Ride
@@ -85,13 +85,14 @@ def drive(ride: Ride) -> None:
 def part(ride: Ride) -> None:
     """On a terminal, print a last report when the robot has stopped, or after 2 s at the latest.
 
-    Without the wait, the report would say that the robot still moves.
+    Without the wait, the report would say that the robot still moves, or that the source of this
+    drive still commands it. The daemon follows a source until its timeout, 0.25 s by default.
     """
     left = clock.steady_s()
     while os.isatty(0) and os.isatty(1):
         ride.take()
         seen, took = ride.seen(), clock.steady_s() - left
-        rests = seen.state is not None and seen.age < took and not moves(seen.state)
+        rests = seen.age < took and released(seen)
         # A robot usually stops within 2 s, by its own deceleration ramp.
         if rests or took > 2.0:
             print("\n".join(parting(seen, output_size().columns)), flush=True)

@@ -213,6 +213,13 @@ def test_echo_shows_commands_of_others_whatever_they_send(shared: Daemon, bus: B
 def test_echo_of_silence_ends_with_1_after_its_timeout(shared: Daemon) -> None:
     ended = tool(shared, "echo", "cmd/nobody", "--timeout", "0.3")
     assert (ended.code, ended.out) == (1, "")
+    assert "but no program sends on the Zenoh key cmd/nobody now" in ended.err
+    ended = tool(shared, "echo", "battery", "--timeout", "0.1")
+    assert (ended.code, ended.out) == (1, "")
+    assert "battery is published only while the board reports the battery's " in ended.err
+    ended = tool(shared, "echo", "imu", "--csv", "--timeout", "0.1")
+    assert ended.code == 1
+    assert "but no program sends on the Zenoh key imu now" in ended.err
 
 
 @pytest.mark.slow
@@ -342,6 +349,16 @@ def test_a_robot_of_another_id_is_not_reached_and_that_is_reported(shared: Daemo
     assert (ended.code, ended.out) == (69, "")
     assert "other" in ended.err
     assert "Robots here: acsar; use --id acsar" in ended.err
+    ended = tool(shared, "whoami", "--id", "other")
+    assert ended.code == 69
+    assert "no daemon answers as 'other'" in ended.out
+
+
+@each("endpoint", ["tcp/127.0.0.1", "tls/robot.local", "tcp/[::1]"])
+def test_an_address_without_its_port_is_not_taken_for_a_missing_daemon(endpoint: str) -> None:
+    ended = typed("get", "odom", "--connect", endpoint)
+    assert (ended.code, ended.out) == (2, "")
+    assert f"{endpoint} is not an endpoint, because its port is missing" in ended.err
 
 
 @each("robot_id", ["a/b*", "", "**", "robot 1"])
@@ -431,7 +448,7 @@ def test_call_set_pose_sets_it(shared: Daemon, bus: Bus, pose: tuple[str, ...]) 
 
 def test_call_set_pose_with_a_pose_that_is_none_is_refused(shared: Daemon, bus: Bus) -> None:
     before = bus.state()
-    ended = tool(shared, "call", "set_pose", "nan", "0", "0")
+    ended = tool(shared, "call", "set_pose", "1e7", "0", "0")
     assert ended.code == 1
     assert bus.state()["x"] == before["x"]
 
@@ -686,7 +703,7 @@ def test_the_last_word_without_a_screen_is_of_a_robot_that_stands(shared: Daemon
             until(lambda: (bus.state()["linear"] or 0.0) > 0.2, 5.0, "moving")
         terminal.press("\x03")
         assert program.ended(5.0) == 0
-        until(lambda: "left: the robot stands; " in terminal.screen, 2.0, "the last word")
+        until(lambda: "left: the robot stands; ready: " in terminal.screen, 2.0, "the last word")
     assert "forward +0.00 m/s" in terminal.screen.partition("left: ")[2]
 
 

@@ -289,7 +289,7 @@ def test_a_question_that_nobody_answers_in_time_is_a_timeout(
         unanswered.clear()
 
 
-@pytest.mark.parametrize("endpoint", ["127.0.0.1:7448", ""])
+@pytest.mark.parametrize("endpoint", ["127.0.0.1:7448", "", "tcp/127.0.0.1", "tcp/[::1]"])
 def test_what_is_no_endpoint_is_a_value_error(endpoint: str) -> None:
     with pytest.raises(UsageError, match="write it like") as error, connect(endpoint):
         pass

@@ -177,7 +177,7 @@ def test_of_a_daemon_on_another_machine_only_what_it_says_of_itself_is_reported(
     ("options", "words"),
     [
         (("--connect", "robot"), "robot is not an endpoint"),
-        (("--connect", "tcp/127.0.0.1"), "tcp/127.0.0.1 is not an endpoint"),
+        (("--connect", "tcp/127.0.0.1"), "tcp/127.0.0.1 is not an endpoint, because its port"),
         (("--connect", "tcp/127.0.0.1:99999"), "tcp/127.0.0.1:99999 is not an endpoint"),
         (("--id", "a/b"), "'a/b' is not a robot's id"),
         (("--id", "*"), "names several robots"),

@@ -79,7 +79,7 @@ def _value(
         item = kind.item_type.cls
         made = [build(item, table, f"{where}[{i}]", problems) for i, table in enumerate(raw)]
         return None if None in made else tuple(made)
-    if not _finite(raw):
+    if not finite(raw):
         value = None
     else:
         try:
@@ -91,10 +91,10 @@ def _value(
     return value
 
 
-def _finite(raw: object) -> bool:
+def finite(raw: object) -> bool:
     """Return whether all numbers are finite. TOML allows inf and nan, and msgspec accepts them."""
     if isinstance(raw, list):
-        return all(_finite(item) for item in raw)
+        return all(finite(item) for item in raw)
     return not isinstance(raw, float) or math.isfinite(raw)
 
 

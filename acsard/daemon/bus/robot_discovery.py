@@ -177,18 +177,15 @@ def _silent(key: str) -> str:
         return f"only the simulator publishes {key}"
     if row.urdf:
         return f"{key} is published only if urdf in [ros] of the robot's acsard.toml names a file"
+    if row.key == "battery":
+        return NO_BATTERY
     return _unpublished(key, row)
 
 
-NO_BATTERY = (
-    "battery has no value before the board has reported one, and most boards report none "
-    "(deploy/firmware/README.md)"
-)
+NO_BATTERY = "battery has a value only while the board reports the battery's voltage or charge"
 
 
 def _unpublished(key: str, row: Topic) -> str:
-    if row.key == "battery":
-        return NO_BATTERY
     match row.rate:
         case "on change":
             return (

@@ -110,7 +110,12 @@ def reachable(endpoint: str) -> str:
 
 def no_endpoint(text: str) -> UsageError:
     """Return the error for a text that is not an endpoint."""
-    return UsageError(f'{text} is not an endpoint; write it like "tcp/127.0.0.1:7448"')
+    lack = ", because its port is missing" if _lacks_port(text) else ""
+    return UsageError(f'{text} is not an endpoint{lack}; write it like "tcp/127.0.0.1:7448"')
+
+
+def _lacks_port(endpoint: str) -> bool:
+    return endpoint.startswith(("tcp/", TLS)) and not re.search(r":\d+(?=$|[?#])", endpoint)
 
 
 PATIENT = {"connect/timeout_ms": -1, "connect/exit_on_failure": False}
@@ -162,7 +167,7 @@ def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
         CertificateError: a certificate is missing or unusable.
         UnreachableError: no daemon or router answers at the endpoint.
     """
-    if "/" not in endpoint:
+    if "/" not in endpoint or _lacks_port(endpoint):
         raise no_endpoint(endpoint)
     settings = _base("client") | {
         "connect/endpoints": [endpoint],

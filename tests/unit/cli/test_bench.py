@@ -1,4 +1,4 @@
-"""Tests of the durations that `acsard bench` and `acsard accuracy` take."""
+"""Tests of the durations and speeds that options take."""
 
 from __future__ import annotations
 
@@ -6,13 +6,39 @@ import argparse
 
 import pytest
 
+from acsard.cli import main, parser
 from acsard.cli.common import seconds
+from acsard.host.errors import Exit
 from tests.each import each
 
 
-@each("text", ["0", "0.5", "-1", "inf", "nan", "600.1", "86400"])
+@each("text", ["0", "0.5", "-1", "inf", "nan", "600.1", "86400", "ten"])
 def test_a_duration_is_from_a_second_to_ten_minutes(text: str) -> None:
     assert seconds("1") == 1.0
     assert seconds("600") == 600.0
     with pytest.raises(argparse.ArgumentTypeError):
         seconds(text)
+
+
+@each(
+    ("option", "allowed"),
+    [
+        ("echo odom --timeout", "seconds from 0.01 to 86400"),
+        ("drive --linear", "m/s from 0 to 10"),
+        ("drive --angular", "rad/s from 0 to 50"),
+    ],
+)
+@each("text", ["-1", "nan", "inf", "1e308", "1e400", "fast"])
+def test_a_number_out_of_its_range_is_refused_with_the_range(
+    option: str, allowed: str, text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main([*option.split(), text])
+    assert ended.value.code == Exit.USAGE
+    assert f"{text} is not a number of {allowed}" in capsys.readouterr().err
+
+
+def test_a_number_of_the_range_is_taken() -> None:
+    drive = parser(["drive"]).parse_args(["drive", "--linear", "10", "--angular", "0"])
+    assert (drive.linear, drive.angular) == (10.0, 0.0)
+    assert parser(["echo"]).parse_args(["echo", "odom", "--timeout", "0.01"]).timeout == 0.01

@@ -6,6 +6,7 @@ import pytest
 
 from acsard.cli import main
 from acsard.host.errors import Exit
+from tests.each import each
 
 
 @pytest.mark.parametrize(
@@ -24,3 +25,13 @@ def test_what_is_not_for_many_says_why_and_what_to_type_instead(
     assert "only stop can be called on several robots at once" in told
     assert "a person must look at each" in told
     assert all(one in told for one in instead)
+
+
+@each("text", ["nan", "inf", "-1e400"])
+@each("name", ["X", "Y", "YAW"])
+def test_a_number_that_is_not_finite_is_refused_with_its_name(
+    name: str, text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    values = [text if name == one else "0" for one in ("X", "Y", "YAW")]
+    assert main(["call", "set_pose", "--", *values]) == Exit.USAGE
+    assert f"{name} = {float(text)}: the number must be finite" in capsys.readouterr().err

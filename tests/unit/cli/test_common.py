@@ -8,8 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from acsard.cli.common import load, recorded
+from acsard.cli import main, parser
+from acsard.cli.common import OPTIONS, load, recorded
 from acsard.cli.connection import require_asked, require_followed, robot_address
+from acsard.cli.run import options
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config
 from acsard.host import config_file
@@ -132,6 +134,51 @@ def test_every_problem_is_printed_with_the_file_it_is_in(
     assert len(lines) == text.count("\n")
     assert all(line.startswith(f"{places.option}: ") for line in lines)
     assert lines[0].startswith(f"{places.option}: a = 1: unknown key")
+
+
+@each(
+    ("words", "place"),
+    [
+        ("run --baud-rate 1234", "--baud-rate: mcu.baud_rate = 1234: expected"),
+        ("run --id a/b", '--id: robot.id = "a/b": expected'),
+        ("run --listen foo", '--listen: bus.listen = "foo": not an endpoint'),
+        ("run --listen tcp/0.0.0.0:1", '--listen: bus.listen = "tcp/0.0.0.0:1": this endpoint'),
+        ("run --connect foo", '--connect: bus.connect = "foo": not an endpoint'),
+        ("run --namespace /", '--namespace: ros.namespace = "/": expected'),
+        ("run --port=", '--port: mcu.port = "": expected'),
+        ("bench --rate 5000", "--rate: control.rate = 5000.0: expected"),
+    ],
+)
+def test_a_value_of_an_option_is_blamed_on_the_option_and_not_on_the_file(
+    words: str, place: str, places: Places, capsys: pytest.CaptureFixture[str]
+) -> None:
+    places.here.write_text('[robot]\nid = "r1"\n')
+    assert main(words.split()) == Exit.BAD_CONFIG
+    told = capsys.readouterr().err
+    assert told.startswith(place)
+    assert told.endswith(f"acsard: 1 problem in {place.partition(':')[0]}\n")
+
+
+def test_problems_of_the_file_and_of_an_option_are_told_apart(
+    places: Places, capsys: pytest.CaptureFixture[str]
+) -> None:
+    places.here.write_text("[control]\nrate = 5\n")
+    assert main(["run", "--id", "a/b"]) == Exit.BAD_CONFIG
+    told = capsys.readouterr().err
+    assert '--id: robot.id = "a/b"' in told
+    assert "acsard.toml: control.rate = 5" in told
+    assert "acsard: 2 problems in " in told
+    places.here.write_text("[control]\nrate = 100\n")
+    assert main(["run", "--baud-rate", "9600"]) == Exit.BAD_CONFIG
+    told = capsys.readouterr().err
+    assert "acsard.toml: control.rate = 100: " in told
+    assert " (mcu.baud_rate is from --baud-rate)" in told
+
+
+def test_every_key_that_run_can_set_has_the_name_of_its_option() -> None:
+    known = parser(["run"])
+    for key in options(known.parse_args(["run"])):
+        assert known.parse_args(["run", OPTIONS[key], "1"])
 
 
 def asked(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.cli import main
+from acsard.cli import main, parser
 from acsard.host import errors
 from acsard.host.errors import (
     WORDS,
@@ -69,5 +69,34 @@ def test_an_unknown_option_names_the_help_that_lists_the_known_ones(
     with pytest.raises(SystemExit) as ended:
         main(["recording", "show", "--stops"])
     assert ended.value.code == Exit.USAGE
-    told = "unrecognized arguments: --stops; `acsard recording --help` lists the options"
+    told = "unrecognized arguments: --stops; `acsard recording show --help` lists the options"
     assert told in capsys.readouterr().err
+
+
+@each(
+    ("between", "behind"),
+    [
+        ("recording export 1 --csv cal.csv", "recording export 1 cal.csv --csv"),
+        ("recording report 1 --force x.html", "recording report 1 x.html --force"),
+        ("recording recover 1 --force x.mcap", "recording recover 1 x.mcap --force"),
+        ("call set_pose --json 1 -2 3", "call set_pose 1 -2 3 --json"),
+        ("call set_pose 1 --id r1 -2 --json 3", "call set_pose 1 -2 3 --id r1 --json"),
+        ("set limits.linear_speed --json 0.8", "set limits.linear_speed 0.8 --json"),
+        ("set rates.state 5 --id r1 log.level info", "set rates.state 5 log.level info --id r1"),
+        ("echo imu -n 1 wheel_states --csv", "echo imu wheel_states --csv -n 1"),
+    ],
+)
+def test_an_option_may_stand_between_two_arguments(between: str, behind: str) -> None:
+    known = parser(between.split()[:1])
+    assert known.parse_args(between.split()) == known.parse_args(behind.split())
+
+
+def test_one_word_too_many_is_named_behind_an_option_too(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["recording", "export", "1", "--csv", "a.csv", "b.csv"])
+    assert ended.value.code == Exit.USAGE
+    told = capsys.readouterr().err
+    assert "usage: acsard recording export " in told
+    assert "unrecognized arguments: b.csv; `acsard recording export --help` lists" in told

@@ -10,6 +10,8 @@ from msgspec.structs import replace
 
 from acsard.cli import main
 from acsard.core.config.settings import Config
+from acsard.host.errors import Exit
+from tests.each import each
 from tests.scenarios.taped import Tape, recorded_world
 from tests.scenarios.world import World
 
@@ -54,19 +56,48 @@ def test_the_newest_becomes_a_file_beside_you_with_a_name_of_its_own(
     assert [path.name for path in here.iterdir()] == [name]
 
 
+@each(
+    ("verb", "words", "mend"),
+    [
+        ("export", "7 drive.csv", "add --csv to write a table"),
+        ("export", "7 drive.mcap --csv", "leave out --csv to write MCAP"),
+        ("export", "7 drive.html --csv", "`acsard recording report` writes HTML"),
+        ("export", "7 drive.mcap --rosbag2", "leave out --rosbag2 to write one MCAP file"),
+        ("export", "7 drive.CSV --rosbag2", "write --csv in place of --rosbag2"),
+        ("report", "7 drive.csv", "let the name end in .html"),
+        ("report", "7 drive.mcap", "let the name end in .html"),
+        ("report", "7 drive.txt", "let the name end in .html"),
+    ],
+)
+def test_a_name_with_the_suffix_of_another_format_is_refused(
+    verb: str, words: str, mend: str, where: Path, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["recording", verb, *words.split(), "--directory", str(where)]) == Exit.USAGE
+    assert mend in capsys.readouterr().err
+    assert not [*here.iterdir()]
+
+
+@pytest.mark.slow
+def test_a_name_without_a_known_suffix_is_taken(where: Path, here: Path) -> None:
+    assert export(where, "7", "drive") == 0
+    assert export(where, "7", "drive.txt", "--csv") == 0
+    assert export(where, "7", "drive.d", "--rosbag2") == 0
+    assert {path.name for path in here.iterdir()} == {"drive", "drive.txt", "drive.d"}
+
+
 @pytest.mark.slow
 def test_a_number_and_a_name_are_taken_and_what_is_there_stays(
     where: Path, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert export(where, "7", "mine.mcap") == 0
-    before = (here / "mine.mcap").read_bytes()
-    assert export(where, "7", "mine.mcap") == 1
+    assert export(where, "7", "mine") == 0
+    before = (here / "mine").read_bytes()
+    assert export(where, "7", "mine") == 1
     assert capsys.readouterr().err == (
-        "acsard: cannot write mine.mcap: this path exists already; --force overwrites it\n"
+        "acsard: cannot write mine: this path exists already; --force overwrites it\n"
     )
-    assert (here / "mine.mcap").read_bytes() == before
-    assert export(where, "7", "mine.mcap", "--csv", "--force") == 0
-    assert (here / "mine.mcap").read_bytes().startswith(b"t [s],")
+    assert (here / "mine").read_bytes() == before
+    assert export(where, "7", "mine", "--csv", "--force") == 0
+    assert (here / "mine").read_bytes().startswith(b"t [s],")
 
 
 def test_a_part_of_it_by_seconds(where: Path, here: Path) -> None:

@@ -74,7 +74,7 @@ def test_nothing_is_overwritten_without_force(tmp_path: Path) -> None:
 
 
 def test_a_recording_never_goes_not_even_by_force(tmp_path: Path) -> None:
-    new = tmp_path / "other.mcap"
+    new = tmp_path / "other"
     shutil.copy(QUIET, new)
     code, _, err = report(QUIET, new, "--force")
     assert code == 1

@@ -9,7 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from acsard.cli import main
 from acsard.core.config.settings import Config
+from acsard.recording.time_span import TIMES
+from tests.each import each
 from tests.scenarios.taped import Tape, recorded_world
 from tests.scenarios.world import START, World
 from tests.system.typed import typed
@@ -294,8 +297,29 @@ def test_seconds_need_one_recording(ring: Ring) -> None:
     assert names[-1] in err
     assert "the seconds of --from and --to count from the beginning of this recording" in err
     assert "this is the newest of 30 recordings; `acsard recording` lists all" in err
-    code, _, err = recording(where, "show", "all", "--from", "0.1")
-    assert (code, "name that recording, or write a time" in err) == (2, True)
+
+
+@each("words", ["--from 1", "--to 1", "--from 1 --to 14:05", "export all x.mcap --from 30 --to 60"])
+def test_seconds_are_refused_for_all_recordings_and_not_recommended(
+    words: str, tmp_path: Path
+) -> None:
+    code, _, err = recording(tmp_path, *words.split())
+    assert (code, "either name one recording, as in " in err) == (2, True)
+    assert err.endswith(f", or write a time, for example {TIMES}")
+    assert "second" not in TIMES
+
+
+@each(
+    ("verb", "words"), [("", "-h"), ("show", "also a number of seconds"), ("export", "FILE `all`")]
+)
+def test_the_help_says_where_seconds_are_a_time(
+    verb: str, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main(["recording", *verb.split(), "--help"])
+    told = " ".join(capsys.readouterr().out.split())
+    assert words in told
+    assert ("number of seconds" in told) == bool(verb)
 
 
 def test_a_recording_without_a_step_in_the_range_says_so(ring: Ring) -> None:

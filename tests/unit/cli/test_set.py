@@ -52,6 +52,13 @@ def test_a_key_without_a_value_is_told_how_to_write_it() -> None:
         pairs(["limits.linear_speed"])
 
 
+@each("word", ["nan", "-inf", "1e400", "[1, inf]"])
+def test_a_number_that_is_not_finite_is_refused_with_its_key(word: str) -> None:
+    words = rf"^limits\.linear_speed = {re.escape(word)}: a number must be finite"
+    with pytest.raises(UsageError, match=words):
+        pairs(["rates.state", "5", "limits.linear_speed", word])
+
+
 def test_the_help_and_the_ros_page_say_what_write_does_not_write(
     capsys: pytest.CaptureFixture[str],
 ) -> None:

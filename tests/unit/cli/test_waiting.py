@@ -65,6 +65,18 @@ def test_who_leaves_leaves_nobody_behind() -> None:
     await_end()
 
 
+def test_a_silence_that_ends_with_the_timeout_is_explained_before_it_ends(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def look() -> str:
+        time.sleep(0.05)
+        return "it is published only when it changes"
+
+    with explained(look, after_s=NEVER_S, timeout_s=0.01):
+        time.sleep(0.02)
+    assert capsys.readouterr().err == "acsard: it is published only when it changes\n"
+
+
 def told(lines: int, capsys: pytest.CaptureFixture[str]) -> str:
     """Return everything on standard error as soon as it has this many lines."""
     said, end = "", time.monotonic() + 10.0

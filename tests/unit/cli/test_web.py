@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 
 from acsard.cli import main
+from acsard.host.errors import Exit
 from acsard.machine.authority import Authority
+from tests.each import each
 
 
 def test_an_invitation_that_nobody_could_follow_names_the_file_that_was_read(
@@ -79,6 +81,17 @@ def test_how_long_a_token_lasts_is_whole_and_said_once(
     with pytest.raises(SystemExit):
         main(["web", "--invite", "viewer", *words])
     assert hint in capsys.readouterr().err
+
+
+@each("option", ["--name phone", "--days 3", "--hours 3"])
+@each("doing", ["", "--tokens", "--revoke phone"])
+def test_the_options_of_an_invitation_need_one(
+    option: str, doing: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["web", *doing.split(), *option.split()]) == Exit.USAGE
+    name = option.split()[0]
+    told = f"{name} is for a new token: add --invite ROLE, or leave {name} out"
+    assert told in capsys.readouterr().err
 
 
 def test_a_second_robot_of_the_same_user_has_tokens_of_its_own(told: Callable[..., str]) -> None:

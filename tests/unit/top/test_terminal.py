@@ -1,12 +1,16 @@
-"""Tests of keyboard driving without a screen: when a report is due, and where the help is."""
+"""Tests of the reports of keyboard driving: when each is due, and where the help is."""
 
 from __future__ import annotations
 
+from typing import cast
+
+import pytest
 from msgspec.structs import replace
 
 from acsard.core.messages.schema import RobotState
-from acsard.top.drive_screen import HELP
-from acsard.top.terminal import NO_END, News, Page
+from acsard.top.drive_screen import HELP, Teleop
+from acsard.top.keyboard import Ride
+from acsard.top.terminal import NO_END, News, Page, part
 from tests.unit.top.screens import STATE
 from tests.unit.top.test_drive_screen import SEEN
 
@@ -48,3 +52,31 @@ def test_a_file_has_the_help_once() -> None:
     page = Page()
     assert page.with_help(["news"], NO_END) == [*HELP, "news"]
     assert page.with_help(["news"] * 1000, NO_END) == ["news"] * 1000
+
+
+class Ended:
+    """A drive that has ended: each look at the robot sees its next state, and then the last."""
+
+    def __init__(self, *states: RobotState) -> None:
+        self.states = list(states)
+
+    def take(self) -> None:
+        if len(self.states) > 1:
+            self.states.pop(0)
+
+    def seen(self) -> Teleop:
+        return replace(SEEN, state=self.states[0], age=0.0)
+
+
+def test_the_last_report_waits_until_the_robot_no_longer_follows_the_drive(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("os.isatty", lambda _: True)
+    moving = replace(STATE, source="teleop", reason="driving: commanded by teleop")
+    still = replace(moving, linear=0.0, angular=0.0, wheels=[0.0] * 4)
+    ready = replace(still, mode="ready", reason="waiting for a command", source="")
+    part(cast(Ride, Ended(moving, moving, still, still, ready)))
+    assert "left: the robot stands; ready: waiting for a command" in capsys.readouterr().out
+    other = replace(still, reason="driving: commanded by nav", source="nav")
+    part(cast(Ride, Ended(still, still, other, ready)))
+    assert "left: the robot stands; driving: commanded by nav" in capsys.readouterr().out

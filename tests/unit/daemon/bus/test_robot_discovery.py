@@ -101,7 +101,7 @@ def test_a_lost_connection_is_reported_before_all_other_reasons() -> None:
         ("events", "`acsard get events` prints its last value"),
         ("odom", "is published only while the microcontroller answers"),
         ("json/tf", "is published only while the microcontroller answers"),
-        ("battery", "has no value before the board has reported one"),
+        ("battery", "only while the board reports the battery's voltage or charge"),
         ("diagnostics", "lacks the permission to read it"),
     ],
 )
