@@ -479,16 +479,14 @@ class Robot:
         return tuple([self._answer(r, inputs.now, events) for r in inputs.requests])
 
     def _answer(self, request: Request, now: Instant, events: list[Event]) -> Answer:
-        before = self._life.mode, self._life.latches
+        before = self._life.mode
         try:
             message = self._obey(request, now)
         except RefusedError as refusal:
             return Answer(request.id, False, str(refusal))
         asked = (request.verb, request.by, request.asked_ns)
         if asked != self._asked or request.asked_ns is None:
-            # A stop of a stopped robot is a new latch, which the next `clear` must name.
-            after = self._life.mode, self._life.latches
-            news = after != before or request.verb == "set"
+            news = self._life.mode is not before or request.verb == "set"
             events.append(Event(request.verb, message, by=request.by, news=news))
         self._asked = asked
         return Answer(request.id, True, message)

@@ -11,6 +11,7 @@ import pytest
 from acsard.core.incoming.commands import Arrival, Via
 from acsard.core.incoming.queries import Query
 from acsard.core.messages.keys_and_roles import SERVICES, VERBS
+from acsard.core.messages.schema import Events
 from acsard.core.messages.signature import public_name
 from acsard.core.motion.event_throttle import BURST
 from acsard.core.values import NS_PER_S, Event, EventName
@@ -101,6 +102,29 @@ def test_no_stop_is_reported_behind_the_clear_that_released_it(world: World) -> 
         *["stop"] * (BURST + 1),
         "clear",
     ]
+
+
+def test_no_clear_is_reported_behind_the_stop_that_came_after_it(world: World) -> None:
+    for _ in range(BURST):
+        call(world, "stop", signed("joe"))
+        world.run(0.05)
+        call(world, "clear", signed("ann"))
+        world.run(0.05)
+    call(world, "clear", signed("ann"))
+    call(world, "stop", signed("joe"))
+    world.run(5.0)
+    names = [event.name for event in world.events if event.name in ("stop", "clear")]
+    assert (names[-1], counted(told(world, "stop"))) == ("stop", BURST + 1)
+
+
+def test_a_client_that_repeats_a_stop_pushes_no_other_row_out_of_the_events(world: World) -> None:
+    call(world, "deactivate", signed("ann"))
+    for _ in range(25):
+        call(world, "stop", signed("joe"))
+        world.run(1.0)
+    events = world.loop.report.current("events", world.loop._look)
+    assert isinstance(events, Events)
+    assert "deactivate" in {row.name for row in events.events}
 
 
 def test_ros_says_less_of_who_calls_and_the_log_says_so(world: World) -> None:

@@ -130,9 +130,12 @@ class Followed:
             priority = self._witness.priority
             if self._keeper.who == who:
                 self._go_on(at_ns)
-            elif priority[who[0]] > priority[self._keeper.who[0]]:
+            elif (wish.fresh or not sample.clock) and priority[who[0]] > priority[
+                self._keeper.who[0]
+            ]:
                 # If a sender of higher priority gets the robot, also one that must send a zero, the
-                # first of the others to come gets the robot behind it.
+                # first of the others to come gets the robot behind it. The daemon may refuse this
+                # command nevertheless.
                 self._keeper = None
         self._arrived[at_ns] = None if at_ns in self._arrived else found
         if len(self._arrived) > KEPT:

@@ -87,8 +87,9 @@ class PoseWitness:
         # Nobody knows the heading as well as these rates say at ten lines a second, or from lines
         # so frequent that their speeds are a count or none.
         self._drifts = sure and (self._seldom or (fast and coarse))
-        # A board that is asked more often than it computes speeds repeats its counts.
-        self._drifts |= (counts or 3200) < 200 and fast and rate > (250.0 if told else 100.0)
+        # A board that is asked more often than it computes speeds repeats its counts. Neither the
+        # place nor the heading is known then, and the daemon warns if it knows the counts.
+        self._drifts |= (counts or 3200) < 200 and fast
         self._true: deque[tuple[int, Pose]] = deque(maxlen=400)
         self._anchor: tuple[Pose, Pose] | None = None
         self._gyro = bool(rates.get("gyro"))

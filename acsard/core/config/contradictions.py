@@ -32,10 +32,11 @@ LEAST_WRAP_PERIODS = 2
 ambiguous if they change by half of their range between two feedback lines, because a turn in the
 other direction could cause the same counts. With two periods, one lost line does no harm."""
 
-FEW_COUNTS, FASTEST_HZ = 200, 250.0
+FEW_COUNTS, FASTEST_HZ = 200, 100.0
 """Below `FEW_COUNTS` encoder counts per turn, plain lines at more than `FASTEST_HZ` give a wrong
-pose. A board computes its speeds over 4 ms or more, and repeats its last speeds if it is asked
-sooner. The simulated robot's distances were up to 29 % too long at 300 Hz."""
+pose. A board repeats its last speeds if it is asked again too soon, and the daemon cannot always
+tell a repeated count from a new one. Of the simulated robot with 16 to 96 counts, distances were up
+to 20 % too short at 200 Hz and up to 29 % too long at 300 Hz."""
 
 MOST_VOLTS = 99.99
 """Highest voltage that a status line can express, V."""
@@ -117,8 +118,8 @@ def _count_warnings(config: Config) -> list[str]:
     if coarse and config.rate_hz > FASTEST_HZ:
         found.append(
             f"control.rate = {config.rate_hz:g} with mcu.encoder_counts = {mcu.encoder_counts}: "
-            "lines follow each other so soon that a board repeats counts, and distances may be "
-            f"30 % too long; write control.rate = {FASTEST_HZ:g} or less"
+            "lines follow each other so soon that a board repeats counts, and distances may be up "
+            f"to 30 % wrong; write control.rate = {FASTEST_HZ:g} or less"
         )
     return found
 

@@ -57,7 +57,7 @@ KEPT = 0.95
 """Largest share of the error of the host's time that is carried to the next line. If the whole
 error were carried and the clocks differed by 0.5 %, the carried error would grow for ever."""
 
-REPEATED = 0.75
+REPEATED = 0.65
 """Limit for a line with unchanged speeds, as a share of the time over which the firmware last
 counted. A line that follows sooner may be a repetition of the previous line, because firmware that
 is asked again too soon has no new counts."""
@@ -96,8 +96,6 @@ class WholeCounts:
         self._run = 0
         """Number of lines with recovered counts since the last line without them."""
         self._before: Motors = (0.0, 0.0, 0.0, 0.0)
-        self._rested = 0.0
-        """The host's time for the previous line, s, if all its speeds were 0. Otherwise 0."""
         self.covers_gap = False
         """Whether the counts of the last line include those of the missing line before it."""
         self._cover = 0.0
@@ -129,13 +127,11 @@ class WholeCounts:
         """
         self.covers_gap = False
         before, self._before = self._before, speeds
-        rested, self._rested = self._rested, 0.0
         a, b, c, d = speeds
         fastest = max(a, b, c, d, -a, -b, -c, -d)
         if fastest <= ROUNDING:
             # The line does not show the firmware's time, so the host's time is the best available.
             self.pause()
-            self._rested = own
             return speeds if fastest == 0.0 else None
         want = own + self._apart
         number, shown = self._number(speeds, fastest, want)
@@ -150,9 +146,6 @@ class WholeCounts:
             if self.covers_gap:
                 number, shown, want = longer, proved, want + gap
         period = number * self.angle / fastest
-        if want < period:
-            # If the line before was a repetition of zeros, its time belongs to this line.
-            want = min(period, want + rested)
         if (
             self.believed
             and speeds == before

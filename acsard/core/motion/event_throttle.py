@@ -28,6 +28,8 @@ class _Held:
 
     def __init__(self) -> None:
         self.count, self.news, self._level = 0, False, 0
+        self.number = 0
+        """The number of the last event, counted over all names."""
         self._kinds: Counter[str] = Counter()
         self._by: Counter[str] = Counter()
 
@@ -45,9 +47,7 @@ class _Held:
             what = f"{what or f'{self.count} times'}; the last"
         text = ": ".join(part for part in (what, last.text) if part)
         level, by = LEVELS[self._level], ", ".join(self._by)
-        # A flood of news is one row of `events` for all its lines.
-        news = self.news and self.count == last.count
-        return Event(last.name, text, level, by, count=self.count, news=news)
+        return Event(last.name, text, level, by, count=self.count, news=self.news)
 
 
 class EventThrottle:
@@ -55,6 +55,8 @@ class EventThrottle:
 
     def __init__(self) -> None:
         self._held: dict[EventName, _Held] = {}
+        self._number = 0
+        """Number of all events so far."""
         self._free_ns: dict[EventName, int] = {}
         """For each event name, the end of the time that its lines have used up, monotonic ns. Each
         written line uses up one second. The lines of a burst use up seconds in advance."""
@@ -64,21 +66,25 @@ class EventThrottle:
         if not (events or self._held):
             return ()
         for event in events:
-            self._held.setdefault(event.name, _Held()).add(event)
+            held = self._held.setdefault(event.name, _Held())
+            held.add(event)
+            self._number += 1
+            held.number = self._number
         told = [name for name, held in self._held.items() if self._may(name, held.news, now_ns)]
-        if "clear" in told and "stop" in self._held and "stop" not in told:
-            # The log must not say that a stop came behind this release.
-            told.insert(0, "stop")
-            self._free_ns["stop"] += NS_PER_S
+        if "stop" in told or "clear" in told:
+            # The log must not end with a `clear` that came before a stop, or the other way round.
+            told += [name for name in ("stop", "clear") if name in self._held and name not in told]
+            told.sort(key=lambda name: self._held[name].number)
         return tuple([self._held.pop(name).line() for name in told])
 
     def _may(self, name: EventName, news: bool, now_ns: int) -> bool:
         """Return whether a line of this name may be written now; if so, count it as written.
 
-        If `news` is true, the line may be one of the `BURST` lines that are written at once.
+        If `news` is true, the line may be one of the `BURST` lines that are written at once. So may
+        a stop of a stopped robot, because its time matters too.
         """
-        free_ns = self._free_ns.get(name, now_ns)
-        if free_ns > now_ns + (BURST - 1 if news else 0) * NS_PER_S:
+        free_ns, at_once = self._free_ns.get(name, now_ns), news or name == "stop"
+        if free_ns > now_ns + (BURST - 1 if at_once else 0) * NS_PER_S:
             return False
         self._free_ns[name] = max(free_ns, now_ns) + NS_PER_S
         return True

@@ -303,11 +303,16 @@ class WheelFaults:
             side.forget()
 
     def skip(self, seen: WheelSpeeds) -> None:
-        """Leave out a line that waited while the board may have stopped the motors."""
+        """Leave out a line that waited while the board may have stopped the motors.
+
+        Healthy wheels then start again from the speeds that they report. A side with a wheel that
+        is suspected already gets no such excuse.
+        """
         self.pushed, speeds = "", seen.as_tuple()
         for side in self._sides:
             front, rear = side.wheels
-            side.expected.slow_down(speeds[front], speeds[rear])
+            if not any(witness.suspected for witness in side.witnesses):
+                side.expected.slow_down(speeds[front], speeds[rear])
 
     def watch(self, commanded: WheelSpeeds | None, seen: WheelSpeeds, dt: float) -> str:
         """Compare the wheel speeds in a line with their commands. The caller must then call `look`.

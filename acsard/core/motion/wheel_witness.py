@@ -72,7 +72,9 @@ class Expected:
     def slow_down(self, front: float, rear: float) -> None:
         """Expect no more than these reported speeds, because the motors may have been stopped."""
         most = faster(front, rear)
-        self.speed, self._slow = (min(most, old, key=abs) for old in (self.speed, self._slow))
+        self.speed, self._slow = (
+            min(most, old, key=abs) if most * old > 0.0 else 0.0 for old in (self.speed, self._slow)
+        )
 
     def follow(self, commanded: float, front: float, rear: float, dt: float, lag: float) -> None:
         """Update the expected speeds with a line, `dt` s after the one before.
@@ -117,7 +119,7 @@ class Witness:
         self._seen, self._begins = 0.0, True
         self.evidence: dict[FaultKind, float] = dict.fromkeys(FAULTS, 0.0)
         """Seconds for which the wheel has shown each fault."""
-        self._suspected = False
+        self.suspected = False
         # Infinity lets the first line count as approaching the command. With 0, a wheel that was
         # already too fast would never count as slowing down: slow motors latched "runaway" that
         # way.
@@ -182,8 +184,8 @@ class Witness:
             stuck = min(abs(seen - goal), abs(seen - command)) > SLACK + 0.4 * fastest
         wrong = wrong and not nearing
         bad = wrong or stuck
-        if bad or self._suspected:
-            self._suspected = bad
+        if bad or self.suspected:
+            self.suspected = bad
             signs = dead and wrong, against and wrong, fast and wrong, stuck
             for kind, sign in zip(FAULTS, signs, strict=True):
                 self.evidence[kind] = self.evidence[kind] + min(dt, most) if sign else 0.0

@@ -74,27 +74,6 @@ def test_a_line_that_repeats_the_one_before_turns_no_wheel() -> None:
     assert found.turned(one, 0.005) == (found.angle, 0.0, found.angle, 0.0)
 
 
-@each("rolled", [8.0, 18.0, 23.0])
-@each("times", [
-    (0.0063, 0.004, 0.0031, 0.0085, 0.0029, 0.0083, 0.0029, 0.004),
-    (0.0107, 0.0057, 0.0032, 0.0116, 0.0042, 0.0074, 0.0045, 0.0031),
-])  # fmt: skip
-def test_counts_behind_repeated_zeros_belong_to_their_time_too(
-    rolled: float, times: tuple[float, ...]
-) -> None:
-    """Firmware that is asked again within 4.1 ms repeats its line, and a count takes longer."""
-    found, turned, at, sampled, whole, speed = WholeCounts(20), 0.0, 0.0, 0.0, 0, 0.0
-    for own in times * 50:
-        at += own
-        if at - sampled > 0.0041:
-            before, whole = whole, int(rolled * at / found.angle)
-            speed = round((whole - before) * found.angle / (at - sampled), 2)
-            sampled = at
-        angles = found.turned((speed, speed, speed, speed), own)
-        turned += angles[0] if angles else speed * own
-    assert turned / found.angle == pytest.approx(whole, rel=0.02)
-
-
 def test_the_other_wheels_choose_between_two_numbers_of_counts() -> None:
     found = WholeCounts(96)
     true = [round(n * found.angle / 0.0139, 2) for n in (3, 3, 2, -3)]

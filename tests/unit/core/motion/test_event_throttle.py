@@ -99,12 +99,12 @@ def test_after_a_rest_a_burst_is_told_in_full_again() -> None:
 
 def test_news_takes_along_what_waited() -> None:
     tally = EventThrottle()
-    stop = Event("stop", "stopped", by="joe")
-    again = Event("stop", "stopped", by="ann", news=False)
-    assert len(tally.lines([stop], 0)) == 1
+    first = Event("activate", "active", by="joe")
+    again = Event("activate", "active", by="ann", news=False)
+    assert len(tally.lines([first], 0)) == 1
     assert tally.lines([again], 10 * MS) == ()
-    (line,) = tally.lines([stop], 20 * MS)
-    assert (line.text, line.by, line.count) == ("2 times; the last: stopped", "ann, joe", 2)
+    (line,) = tally.lines([first], 20 * MS)
+    assert (line.text, line.by, line.count) == ("2 times; the last: active", "ann, joe", 2)
 
 
 def test_names_do_not_wait_for_each_other() -> None:

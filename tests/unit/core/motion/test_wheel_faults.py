@@ -99,6 +99,20 @@ def test_a_board_that_stopped_during_a_stall_has_no_dead_wheels_behind_it() -> N
         assert not faults.watch(all_at(told), all_at(seen), 0.05)
 
 
+@each("own", [-4.0, -10.0])
+def test_wheels_that_run_backwards_are_found_although_stalls_repeat(own: float) -> None:
+    """The board goes on, because its driver ignores it. Each stall makes six lines wait."""
+    faults, found = WheelFaults(Kinematics(DriveConfig()), 3200, FeedbackConfig()), ""
+    for _ in range(6):
+        for line in range(60):
+            told = min(10.0, 0.4 * line)
+            seen = own + 0.1 * (line % 2)
+            found = found or faults.watch(all_at(told), all_at(seen), 0.01)
+        for _ in range(27):
+            faults.skip(all_at(own))
+    assert "turns against its command" in found or "turns faster than commanded" in found
+
+
 def test_a_runaway_is_found_behind_a_stall_during_which_it_never_stopped() -> None:
     faults = WheelFaults(Kinematics(DriveConfig()), 3200, FeedbackConfig(fault_time=0.1))
     found = ""
