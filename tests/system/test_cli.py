@@ -216,7 +216,7 @@ def test_echo_of_silence_ends_with_1_after_its_timeout(shared: Daemon) -> None:
     assert "but no program sends on the Zenoh key cmd/nobody now" in ended.err
     ended = tool(shared, "echo", "battery", "--timeout", "0.1")
     assert (ended.code, ended.out) == (1, "")
-    assert "battery is published only while the board reports the battery's " in ended.err
+    assert "battery has a value only while the board reports the battery's " in ended.err
     ended = tool(shared, "echo", "imu", "--csv", "--timeout", "0.1")
     assert ended.code == 1
     assert "but no program sends on the Zenoh key imu now" in ended.err
