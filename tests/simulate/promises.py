@@ -445,8 +445,11 @@ class Witness:
         if mode == "fault" != self.mode:
             self.counts["fault"] += 1
             recent = [k for k, last_ns in self.troubles.items() if at_ns - last_ns < 4 * NS]
-            if "pushed" in recent and self.last == ZERO and self.rested:
-                recent.remove("pushed")  # a hand turns wheels that were at rest: never a fault
+            bounded = "is over feedback.wheel_speed" in reason
+            if "pushed" in recent and self.last == ZERO and self.rested and not bounded:
+                # A hand that turns wheels at rest is no fault, unless they seem to turn faster than
+                # any wheel can. With coarse encoders, one count more is enough for that.
+                recent.remove("pushed")
             # Echoes pass the lines that a stalled adapter holds, and contradict them.
             caused = not set(recent) <= HARMLESS or {"echo", "stalls"} <= set(recent)
             if DRIVER in reason.partition(";")[0]:
