@@ -507,7 +507,7 @@ class Run:
                 self._board()
                 self.inputs.replaced()
             self.product.plug(new)
-            self.inputs.plugged()
+            self.inputs.plugged(self.true_ns)
             self.witness.first, self._rest = True, b""
             self._begins += new
             if self.witness.blocked_ns is not None:

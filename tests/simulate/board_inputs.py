@@ -43,6 +43,9 @@ SILENT_NS, EXCUSE_NS = NS // 2, NS // 10
 """An input that is not reported for the first time counts as pressed. Behind a stall of the host
 the daemon waits for the second time, because the lines of that time come with it."""
 
+FORGET_NS = 3 * NS
+"""Least time behind a plugging after which the daemon forgets an input that no line reports."""
+
 STOPPED = {"stopped", "fault", "shutdown"}
 """Modes of a robot that is stopped: a fault and the end of the daemon come before a stop."""
 
@@ -337,6 +340,8 @@ class Inputs:
         self.battery = _Mean(self._witness.config.get("battery", {}), self._emptied)
         self._mode = ""
         self._looked_ns = self._stepped_ns = 0
+        self._plugged_ns = 0
+        """True time at which a board was last plugged in."""
         self._due_ns: int | None = None
         """A line must leave until then, because an input was pressed."""
         self._fresh = self._latches = self._doubtful = False
@@ -373,9 +378,10 @@ class Inputs:
         self._came.clear()
         self._held = b""
 
-    def plugged(self) -> None:
+    def plugged(self, true_ns: int) -> None:
         """Note that a board was plugged in: it must report the inputs that the robot needs."""
         self.estop.awaited = self.bumpers.awaited = True
+        self._plugged_ns = true_ns
 
     @property
     def limiting(self) -> bool:
@@ -473,6 +479,9 @@ class Inputs:
     def _silence(self, known: _Input, decided_ns: int, offset: int, calm_ns: int) -> None:
         """Take a silence: it counts as a press, at the latest when the host has had time."""
         reported_ns, witness = known.reported_ns or 0, self._witness
+        if known.awaited and decided_ns + offset > self._plugged_ns + FORGET_NS:
+            # The daemon may have forgotten the input, because another board may lack it.
+            known.counted_ns, known.pressed_ns = 0, None
         latest_ns = max(reported_ns + SILENT_NS, calm_ns + EXCUSE_NS)
         early = decided_ns < latest_ns + 2 * witness.period_ns + MARGIN_NS
         if early or not known.counted_ns:  # an input that never was reported is not silent

@@ -294,10 +294,23 @@ def test_an_input_that_perhaps_never_was_reported_is_not_silent() -> None:
     bench.inputs.cleared(3 * NS)
 
 
+@pytest.mark.parametrize(("at", "finding"), [(3.9, True), (4.2, False)])
+def test_an_input_that_no_line_reports_behind_a_plugging_may_be_forgotten(
+    at: float, finding: bool
+) -> None:
+    bench = Bench()
+    bench.step(1.0, OK, "driving", MOVES)
+    bench.inputs.plugged(NS)
+    bench.step(1.7, b"", "stopped", RESTS)
+    promise = "an emergency stop that is pressed stops the robot"
+    with pytest.raises(BrokenError, match=promise) if finding else nullcontext():
+        bench.step(at, b"", "ready")
+
+
 def test_a_robot_waits_for_its_inputs_behind_each_plugging() -> None:
     bench = Bench(estop="required")
     bench.step(1.0, OK, "ready")
-    bench.inputs.plugged()
+    bench.inputs.plugged(NS)
     bench.step(1.1, b"", "waiting")
     with pytest.raises(BrokenError, match="a robot waits for its inputs"):
         bench.step(1.2, b"", "ready")

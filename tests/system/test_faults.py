@@ -94,11 +94,16 @@ def one_robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[FarPee
 
 
 @pytest.fixture
-def far(one_robot: tuple[FarPeer, Daemon]) -> tuple[FarPeer, Daemon]:
-    """Provide `one_robot` at rest, so that lines of two commanders are not confused."""
-    peer = one_robot[0]
-    until(lambda: [h.line for h in peer.lines[-1:]] == [ZERO_TEXT], 5.0, "at rest")
-    return one_robot
+def far(one_robot: tuple[FarPeer, Daemon]) -> Iterator[tuple[FarPeer, Daemon]]:
+    """Provide `one_robot` at rest, so that lines of two commanders are not confused.
+
+    After the test, print what the daemon has logged meanwhile. pytest shows it if the test failed.
+    """
+    peer, daemon = one_robot
+    began = len(daemon.err)
+    until(lambda: [h.line for h in peer.lines[-1:]] == [ZERO_TEXT], 5.0, f"at rest\n{daemon}")
+    yield one_robot
+    print("\n".join(daemon.err[began:]))
 
 
 def last_put(program: Program) -> float:
