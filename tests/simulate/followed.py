@@ -95,6 +95,8 @@ class Followed:
         """The last command that was followed of the sender that keeps the robot."""
         self._going_ns = 0
         """Arrival of the last command of that sender, followed or not. It was never silent."""
+        self._goes_ns = 0
+        """The same for the commands since the last step, of which a full buffer may drop some."""
         self._rests_ns: dict[Who, int] = {}
         """Arrival of the newest zero of each sender, by the robot's clock."""
         self._zero_ns: dict[Who, int] = {}
@@ -147,8 +149,9 @@ class Followed:
         """Note a command of the sender that keeps the robot, unless it was silent before."""
         assert self._keeper is not None
         timeout_ns = self._witness.timeout[self._keeper.who[0]]
-        if at_ns - self._going_ns < timeout_ns - self._witness.period_ns:
-            self._going_ns = max(self._going_ns, at_ns)
+        went_ns = max(self._going_ns, self._goes_ns)
+        if at_ns - went_ns < timeout_ns - self._witness.period_ns:
+            self._goes_ns = max(self._goes_ns, at_ns)
         else:
             self._keeper = None
 
@@ -239,8 +242,9 @@ class Followed:
             self.forget()
         elif self._count <= HELD:
             self._sure.update(self._waiting)
+            self._going_ns = max(self._going_ns, self._goes_ns)
         self._waiting.clear()
-        self._count = 0
+        self._count = self._goes_ns = 0
         found = None if followed_ns is None else self._arrived.get(followed_ns)
         if found is not None:
             self._first_keeps(true_ns, decided_ns, found)

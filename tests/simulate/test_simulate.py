@@ -39,7 +39,7 @@ from tests.simulate.pairs import OURS, Pair, Trace
 from tests.simulate.plan import KINDS, Plan, _rare_events, made
 from tests.simulate.plugging import Plugging
 from tests.simulate.pose import PoseWitness
-from tests.simulate.product import Disk, Product, Seen, problems
+from tests.simulate.product import HELD, Disk, Product, Seen, problems
 from tests.simulate.promises import ZERO, BrokenError, Witness
 from tests.simulate.reasons import Reasons, kind_of
 from tests.simulate.reports import Echo, HalfDuplex, Reports, judge_pose
@@ -1401,11 +1401,12 @@ def followed_in_turn(
     *sent: tuple[float, str, float, float],
     late: Collection[float] = (),
     refused: Collection[float] = (),
+    flood: int = 0,
 ) -> None:
     """Have the robot follow each command of two `signed` senders: time, sender, speed, by.
 
     The commands that arrive at the times in `late` took 1 s. The robot does not follow those that
-    arrive at the times in `refused`.
+    arrive at the times in `refused`; before each of them, `flood` other messages arrive.
     """
     witness, followed_ns = witnessed(), None
     followed = Followed(witness)
@@ -1416,6 +1417,8 @@ def followed_in_turn(
         one = Message(sent_ns, at_ns, v, 0.0, sent_ns, number, "")
         found = sample(sender, one, PLAIN["config"], 0)
         wish = witness.command(sender, one, found, at_ns)
+        for _ in range(flood * (at_s in refused)):
+            followed.command(sender, one, found, at_ns, None)
         followed.command(sender, one, found, at_ns, wish)
         followed_ns = followed_ns if at_s in refused else at_ns
         followed.step(at_ns + 1, at_ns + 1, followed_ns, "driving", "up")
@@ -1435,6 +1438,16 @@ def test_a_sender_that_goes_on_keeps_the_robot_although_its_commands_are_refused
     expected = nullcontext() if silent else pytest.raises(BrokenError, match="first of equal")
     with expected:
         followed_in_turn(*sent, refused=[4.2])
+
+
+@pytest.mark.parametrize(("flood", "finding"), [(HELD - 1, True), (HELD, False)])
+def test_a_flood_may_displace_the_commands_of_the_sender_that_goes_on(
+    flood: int, finding: bool
+) -> None:
+    sent = [(4.0, "a", 0.3, 0.0), (4.2, "a", 0.3, 0.0), (4.4, "b", 0.3, 0.0)]
+    expected = pytest.raises(BrokenError, match="first of equal") if finding else nullcontext()
+    with expected:
+        followed_in_turn(*sent, refused=[4.2], flood=flood)
 
 
 @pytest.mark.parametrize("released", [True, False])
