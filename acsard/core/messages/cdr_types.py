@@ -16,8 +16,8 @@ SIZES = {"d": 8, "f": 4, "q": 8, "Q": 8, "i": 4, "I": 4, "B": 1, "?": 1}
 """Size and alignment of a number in CDR, in bytes, by its code in the struct module."""
 
 Build = Callable[[Iterator[object]], object]
-"""Function that builds a struct. Its argument yields the values of the struct's fields in order,
-with the fields of each nested struct in place of that struct."""
+"""Function that builds a struct. Its argument is an iterator over the values of the struct's fields
+in order. In place of a nested struct, the iterator yields the values of that struct's fields."""
 
 Limit = tuple[float, float]
 """Least and greatest value of a number."""

@@ -1,8 +1,8 @@
 """The table of all keys below `acsard/<id>/`: direction, type, rate, meaning and required roles.
 
-A key that is not in the table does not exist. The bus declares its keys from this table, `acsard
-topics` and the README list it, and the query `topics` answers with it. `permissions.py` derives the
-permissions of the roles from it.
+A key that is not in the table does not exist. The bus declares its keys from this table. `acsard
+topics`, the README and the answer to the query `topics` show the table. `permissions.py` derives
+the permissions of the roles from it.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ class Topic(Struct, frozen=True):
     subscribe: Role | None = None
     """Lowest role that may subscribe to the key. None means that no client may subscribe."""
     query: Role | Literal["<role>"] | None = None
-    """Lowest role that may query the key. `<role>` means the role that the key ends with. None
-    means that no client may query it."""
+    """Lowest role that may query the key. `<role>` means the role at the end of the queried key.
+    None means that no client may query it."""
     local: bool = False
     """True for a key that only programs on the robot's own machine may use."""
     latched: bool = False
@@ -132,8 +132,8 @@ DESCRIPTION = "robot_description"
 
 WHOAMI = "whoami/<role>"
 """Pattern of the keys with which a client finds out its role. There is one key for each role.
-Zenoh's access rules let a client query only the keys of its own role and of lower roles. So an
-answer on a key proves that the client has at least this role."""
+Zenoh's access rules let a client query only the keys of its own role and of lower roles. So a
+client that gets an answer on a key has at least the role of that key."""
 
 
 def whoami_key(role: str) -> str:
@@ -266,7 +266,10 @@ def offered(config: Config) -> tuple[Topic, ...]:
 
 
 def published(config: Config) -> tuple[Topic, ...]:
-    """Return the rows of the keys on which this daemon publishes, the simulator's gyro included."""
+    """Return the rows of the keys on which this daemon publishes.
+
+    With the built-in simulator, they include the key of the simulated gyro.
+    """
     own = config.mcu.simulated
     return tuple(t for t in offered(config) if t in PUBLISHED or (own and t.key == IMU))
 

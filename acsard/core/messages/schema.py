@@ -1,8 +1,8 @@
 """The types of the messages on the bus, with the unit of each field.
 
 A type has the name and the fields of its ROS 2 counterpart if there is one. A field means the same
-in msgpack, JSON and CDR. Unknown fields are refused, so a command with a misspelt axis is an error.
-If the field were ignored, the command would mean zero speed.
+in msgpack, JSON and CDR. Unknown fields are refused, so a command with a misspelled axis is an
+error. If such a field were ignored, the speed on that axis would be zero without an error.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ class TwistStamped(Message, frozen=True):
 
 
 class Pose(Message, frozen=True):
-    """Pose: `position` in m, and `orientation`."""
+    """A pose: `position` in m, and `orientation` as a rotation."""
 
     position: Vector3
     orientation: Quaternion
@@ -184,7 +184,7 @@ class JointState(Message, frozen=True):
 class Imu(Message, frozen=True):
     """An inertial measurement in `header.frame_id`: rad/s and m/s2, each with its 3x3 covariance.
 
-    A covariance whose first element is -1 marks a quantity that is not measured.
+    If the first element of a covariance is -1, the quantity is not measured.
     """
 
     header: Header
@@ -227,7 +227,10 @@ class Battery(Message, frozen=True):
     percentage: Float32 | None = None
     """State of charge, 0 to 1."""
     power_supply_status: Annotated[Byte, one_of(range(5))] = 0
-    """0 unknown, 1 charging, 2 discharging, 3 not charging, 4 full, as derived from `current`."""
+    """0 unknown, 1 charging, 2 discharging, 3 not charging, 4 full.
+
+    The daemon derives the value from the sign of `current`, so it never sends 4.
+    """
     power_supply_health: Annotated[Byte, one_of(range(9))] = 0
     """Always 0, unknown."""
     power_supply_technology: Annotated[Byte, one_of(range(9))] = 0
@@ -264,7 +267,11 @@ class SourceState(Message, frozen=True):
     name: str
     priority: int
     age: float | None
-    """Seconds since the last accepted command of the source; null before the first one."""
+    """Seconds since the last accepted command of the source.
+
+    It is null before the first command, and after an event that requires a zero from each sender,
+    until the next command is accepted.
+    """
     waits_for: str
     """The condition that the source waits for before it drives, in words; empty if it drives."""
 
@@ -288,7 +295,7 @@ class Latency(Message, frozen=True):
 class RobotState(Message, frozen=True):
     """Summary of the robot: mode and reason, pose (m, rad), twist (m/s, rad/s), wheels (rad/s).
 
-    Without feedback the speeds are unknown: `linear` and `angular` are null, `wheels` is empty.
+    Without feedback the speeds are unknown: `linear` and `angular` are null, and `wheels` is empty.
     """
 
     stamp: Time
@@ -311,7 +318,7 @@ class RobotState(Message, frozen=True):
     certificate_expiry: str = ""
     """Remaining validity of the bus's TLS certificate, in words; empty without TLS.
 
-    The text begins with "valid" as long as at least 30 days of validity remain.
+    The text begins with "valid" while at least 30 days remain.
     """
     latencies: dict[str, Latency] = {}
     """Latencies of the daemon by name (`daemon/latencies.py`). They are up to one second old."""
@@ -327,8 +334,8 @@ class RobotState(Message, frozen=True):
     sender: str = ""
     """Public name of the selected sender of `source`; empty while no sender is selected.
 
-    The selected sender may still have to send a zero before it drives. It is also given while a
-    latch keeps the robot from driving.
+    A selected sender does not always drive. It may still have to send a zero first, or a latch may
+    keep the robot from driving.
     """
     effective_track: str = ""
     """Effective track divided by the wheel separation, in words.
@@ -346,7 +353,8 @@ class RobotState(Message, frozen=True):
     latch_file_error: str = ""
     """Reason why a stop would not survive a restart, in words.
 
-    It is empty if a stop would survive, and with the built-in simulator.
+    The text is empty if a stop would survive. It is also empty if the daemon keeps no latch file,
+    as with the built-in simulator.
     """
     feedback_age: float | None = None
     """Seconds since the last valid feedback line; null before the first one."""
@@ -366,8 +374,8 @@ class RobotState(Message, frozen=True):
     settings_differ: str = ""
     """Settings in force that differ from the daemon's configuration file, in words; else empty.
 
-    If the daemon could not start again with that file, the text gives the reason. A setting that a
-    speed limit lowers is not listed.
+    If the daemon could not start again with that file, the text gives the reason. A speed limit
+    lowers a setting only for a time, so such a difference is not listed.
     """
     speed_limit: str = ""
     """The speed limit that lowers `limits.linear_speed` at present, with its sender, in words.
@@ -392,7 +400,10 @@ class GatewayState(Message, frozen=True):
     connections: Annotated[int, Meta(ge=0, lt=1 << 16)]
     """Number of connections from the network at present."""
     full: Annotated[int, Meta(ge=0, lt=1 << 31)]
-    """Number of checks that found all connections in use. There are four checks a second."""
+    """Number of checks since the gateway's start that found all connections in use.
+
+    The gateway checks four times a second.
+    """
     certificate_ends: Annotated[int, Meta(ge=0, lt=1 << 62)] = 0
     """Time at which the first of the TLS certificates expires, wall-clock ns since 1970; 0 if the
     library to read certificates is missing."""
@@ -440,15 +451,15 @@ class LogEvent(Message, frozen=True):
     count: int
     """Number of occurrences that this row stands for.
 
-    Repetitions with pauses of less than a minute are counted in the same row.
+    An event that repeats within a minute is counted in the same row.
     """
 
 
 class Events(Message, frozen=True):
     """The last events, oldest first.
 
-    An event that repeats is one row, with the time of its last repetition. When it repeats, its row
-    moves to the end.
+    An event and its repetitions share one row, which has the time of the last repetition. Each
+    repetition moves the row to the end.
     """
 
     stamp: Time
@@ -456,7 +467,7 @@ class Events(Message, frozen=True):
     total: int
     """Number of events since the start, with each repetition counted.
 
-    If `total` has grown by N since the last message, new events are among the last N rows.
+    If `total` has grown by N since the last message, all new events are among the last N rows.
     """
     events: list[LogEvent]
 
@@ -480,8 +491,11 @@ class Release(Message, frozen=True):
     """Payload of the services `clear` and `activate`."""
 
     latch: LatchNumber | None = None
-    """Number of the latch to release, as in `RobotState.latch`. If it is null, the call is refused
-    for 2 s after the latch."""
+    """Number of the latch to release, as in `RobotState.latch`.
+
+    If it is null, the call is refused for 2 s after a stop, after a `deactivate` and after the
+    start of the daemon, because the client may not know of the latch yet.
+    """
 
 
 class Settings(Message, frozen=True):
