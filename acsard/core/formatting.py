@@ -18,7 +18,7 @@ def printable(text: str) -> str:
 
 
 def lines(text: str) -> str:
-    """Return a text with each of its lines made `printable`."""
+    """Return a text of several lines, with `printable` applied to each line."""
     return "\n".join(map(printable, text.split("\n")))
 
 

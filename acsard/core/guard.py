@@ -40,8 +40,8 @@ HALTED = ("stopped", "fault", "shutdown")
 
 MARGIN_NS = 300_000_000
 """Extra time, ns, in which the guard still passes lines that move a wheel after the computed end of
-a ramp to rest. It equals the board's watchdog time: a board that receives no line for longer stops
-the motors by itself."""
+a ramp to rest. This time equals the board's watchdog time: a board that receives no line for longer
+stops the motors by itself."""
 
 
 class Memory(Struct, frozen=True):

@@ -399,10 +399,10 @@ class Robot:
         return "", ""
 
     def _keep_away(self, now_ns: int) -> None:
-        """Reduce the chosen command to its motion away from the pressed bumpers.
+        """Reduce the chosen command to the part that leads away from the pressed bumpers.
 
-        If no part of the command leads away from them, each sender must send a zero again. Without
-        this rule, the robot would drive against the obstacle as soon as the bumper is released.
+        If no part of the command does, each sender must send a zero again. Without this rule, the
+        robot would drive against the obstacle as soon as the bumper is released.
         """
         twist = self._choice.twist
         if twist is None:

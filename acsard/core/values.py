@@ -167,10 +167,10 @@ class Answer(Struct, frozen=True):
 
 
 class Refusal(Struct, frozen=True):
-    """A refused message of a client. It increments the counter `command_<reason>`, or
-    `commands_of_new_senders` for the reason `unproven`.
+    """A message of a client that was refused.
 
-    `source` and `sender` are "" if they are unknown.
+    The robot counts it as `command_<reason>`, or as `commands_of_new_senders` for the reason
+    `unproven`. `source` and `sender` are "" if they are unknown.
     """
 
     reason: str
@@ -298,7 +298,7 @@ class SourceStatus(Struct, frozen=True):
     """A command source.
 
     `age_s` is the time since the last accepted command of the source. It is None if no command was
-    accepted since the last event that required each sender to send a zero.
+    accepted since each sender was last required to send a zero, for example after a `clear`.
     """
 
     name: str
@@ -330,7 +330,7 @@ class RoutersStatus(Struct, frozen=True):
     connected: tuple[str, ...] = ()
     missing: tuple[str, ...] = ()
     peers: tuple[str, ...] = ()
-    """Connected endpoints that are not routers and so forward nothing."""
+    """Connected endpoints that are peers, not routers, so they do not forward messages."""
 
 
 class GyroSample(Struct, frozen=True, omit_defaults=True):

@@ -424,5 +424,5 @@ RULES: tuple[Rule, ...] = (
     _ros_problems,
     *named_faults.RULES,
 )
-"""All rules between keys. A rule that reads an invalid key is skipped. So that few checks are lost,
-each rule reads only few keys."""
+"""All rules about combinations of keys. A rule that reads an invalid key is skipped as a whole.
+Therefore each rule checks one thing and reads only a few keys."""

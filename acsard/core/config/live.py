@@ -25,7 +25,7 @@ WHEN: dict[When, str] = {
     "raised": "raised at any time, lowered only while the robot stands",
     "rest": "only while the robot stands",
 }
-"""When a setting may change, in words. The reasons are:
+"""When a setting may change, in words. The reasons for the restrictions are:
 
 - "raised": With a lower deceleration, a robot that drives could not stop in time.
 - "rest": A lower `limits.wheel_speed` reduces the speed without a ramp. After a change in

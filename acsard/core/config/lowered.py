@@ -1,4 +1,4 @@
-"""Keeps the limits that `acsard set` has lowered in force, even if the daemon restarts.
+"""Keeps the limits that `acsard set` has lowered, so that a restart does not raise them again.
 
 A limit is lowered if its value is below the value in the configuration file. Lowered decelerations
 are not kept, because a robot with a lower deceleration brakes more softly, which is not safer. A
@@ -24,7 +24,7 @@ def stays(key: str) -> bool:
 
 
 def lowered(file: LimitsConfig, now: LimitsConfig) -> dict[str, float]:
-    """Return the values in `now` of the limits that are below those in `file`, by dotted key."""
+    """Return the limits that are lower in `now` than in `file`: values in `now` by dotted key."""
     return {
         TABLE + name: getattr(now, name)
         for name in file.__struct_fields__
@@ -74,5 +74,5 @@ def _applied(config: Config, wishes: Mapping[str, object]) -> tuple[Config, list
 
 
 def _rank(name: str, value: float) -> float:
-    """Return a number that orders values of a limit: the more a value allows, the larger it is."""
+    """Return a number by which values of a limit are compared: larger means that more is allowed."""
     return math.inf if name.endswith("_jerk") and value == 0.0 else value

@@ -49,8 +49,8 @@ def _reach(config: Config) -> _Reach:
     sides = (drive.left_wheel_radius_multiplier, drive.right_wheel_radius_multiplier)
     half_track = drive.wheel_separation * drive.wheel_separation_multiplier / 2
     # The limit of the wheel speed is the same for both sides. If the wheels of one side are larger,
-    # the rims of that side are faster. The mean of both rim speeds bounds the linear speed, and
-    # also the turn rate times half of the track.
+    # the rims of that side are faster. The mean of both rim speeds bounds the linear speed. Divided
+    # by half of the track, the mean bounds the turn rate.
     rim = limits.wheel_speed * drive.wheel_radius * sum(sides) / 2
     fastest_rim = limits.linear_speed + limits.angular_speed * half_track
     wished = fastest_rim / (drive.wheel_radius * min(sides))

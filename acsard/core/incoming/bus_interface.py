@@ -79,9 +79,9 @@ _decoder = Decoder(GatewayState)
 
 
 class GatewayFollower:
-    """Counts the gateway's starts, and how often a check found all of its connections in use.
+    """Counts the starts of the TLS gateway, and the checks that found all connections in use.
 
-    The TLS gateway reports its own counts, which begin at 0 after each of its restarts.
+    The gateway reports its own count of such checks, which begins at 0 after each start.
     """
 
     def __init__(self) -> None:
@@ -96,7 +96,7 @@ class GatewayFollower:
         try:
             report = _decoder.decode(arrival.encoding, arrival.payload)
         except DecodeError:
-            return None  # only local programs may put on this key, so this is not an attack
+            return None  # only local programs may put on this key, so ignoring it is harmless
         last = self._last
         if report.opened != last.opened:
             counters["gateway_opened"] += 1

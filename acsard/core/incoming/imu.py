@@ -35,7 +35,7 @@ MOST_WHO = 64
 """Largest number of characters of a sender's name in an error message."""
 
 UNKNOWN = [0.0] * 9
-"""Covariance for a sample without one. sensor_msgs/Imu defines zeros as "unknown"."""
+"""Covariance to use if a sample contains none. In sensor_msgs/Imu, zeros mean "unknown"."""
 
 
 class _Reading(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -63,7 +63,10 @@ class GyroFollower:
     def receive(
         self, arrival: Arrival, counters: MutableMapping[str, int], events: list[Event]
     ) -> GyroSample | None:
-        """Return the turn rate in a sample, or None after counting and reporting its refusal."""
+        """Return the turn rate in a sample, or None if the sample is refused.
+
+        A refusal is counted in `counters` and reported in `events`.
+        """
         try:
             sample = reading(arrival)
             anew = self._follow(claimed_identity(arrival).sender, arrival.arrived_ns)

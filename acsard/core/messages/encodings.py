@@ -38,8 +38,8 @@ _text = msgspec.json.Encoder()
 class DecodeError(AcsardError):
     """Error for a payload that cannot be decoded.
 
-    `reason` is the kind of the error in one word. The name of the counter for such errors ends with
-    it, as in `command_malformed`.
+    `reason` is the kind of the error. It is also the end of the name of the counter for such
+    errors: the reason "malformed" is counted as `command_malformed`.
     """
 
     def __init__(self, reason: str, text: str) -> None:

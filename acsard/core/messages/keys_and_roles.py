@@ -37,7 +37,7 @@ class Topic(Struct, frozen=True):
     """The key below the robot's id, with placeholders such as `<source>`."""
     direction: Direction
     type: str
-    """Type of the message, in words if it is not a type of `MESSAGES`."""
+    """Type of the message: its name in `MESSAGES`, or a description if it has no such name."""
     rate: str
     """How often the daemon publishes or accepts a message, in words; "" for a query."""
     note: str
@@ -51,7 +51,7 @@ class Topic(Struct, frozen=True):
     local: bool = False
     """True for a key that only programs on the robot's own machine may use."""
     latched: bool = False
-    """True for a key whose last message a new subscriber receives at once."""
+    """True for a key whose last message each new subscriber receives immediately."""
     simulated: bool = False
     """True for a key that exists only with the built-in simulator."""
     gyro: bool = False
@@ -123,7 +123,7 @@ PLAIN_SERVICES = tuple(
 """The services that can be called without a payload."""
 
 IMU = "imu"
-"""Key on which a gyro's samples arrive. The simulator publishes those of its own gyro on it."""
+"""Key on which a gyro's samples arrive, also the samples of the simulated gyro."""
 
 SPEED_LIMIT = "speed_limit"
 """Key on which a client, such as Nav2's speed filter, lowers the robot's highest speed."""
@@ -275,7 +275,7 @@ def published(config: Config) -> tuple[Topic, ...]:
 
 
 def full_key(robot_id: str, key: str) -> str:
-    """Return the key on the bus for a key below a robot's id."""
+    """Return the key on the bus, such as `acsard/acsar/state` for the key `state`."""
     return f"{ROOT}/{robot_id}/{key}"
 
 

@@ -80,7 +80,7 @@ class Header(Message, frozen=True):
 
 
 class Vector3(Message, frozen=True):
-    """Three components in the unit of the field that holds them."""
+    """A vector. The field that contains it defines the unit."""
 
     x: float = 0.0
     y: float = 0.0
@@ -125,14 +125,14 @@ class PoseStamped(Message, frozen=True):
 
 
 class PoseWithCovariance(Message, frozen=True):
-    """A pose with its 6x6 covariance, row major, (x, y, z, roll, pitch, yaw), m and rad."""
+    """A pose and its 6x6 covariance: row major; x, y, z in m; roll, pitch, yaw in rad."""
 
     pose: Pose
     covariance: Covariance
 
 
 class TwistWithCovariance(Message, frozen=True):
-    """A twist with its 6x6 covariance, row major, m/s and rad/s."""
+    """A twist and its 6x6 covariance: row major; linear x, y, z in m/s; angular ones in rad/s."""
 
     twist: Twist
     covariance: Covariance
@@ -197,7 +197,7 @@ class Imu(Message, frozen=True):
 
 
 class SpeedLimit(Message, frozen=True):
-    """A limit that lowers the robot's highest speed, as nav2_msgs/SpeedLimit; 0.0 lifts it."""
+    """A limit on the robot's speed, as in nav2_msgs/SpeedLimit. 0.0 lifts the limit."""
 
     header: Header
     percentage: bool
@@ -269,8 +269,8 @@ class SourceState(Message, frozen=True):
     age: float | None
     """Seconds since the last accepted command of the source.
 
-    It is null before the first command, and after an event that requires a zero from each sender,
-    until the next command is accepted.
+    It is null if no command was accepted since each sender was last required to send a zero, for
+    example since the start or a `clear`.
     """
     waits_for: str
     """The condition that the source waits for before it drives, in words; empty if it drives."""
@@ -366,8 +366,8 @@ class RobotState(Message, frozen=True):
     bumpers: list[bool] | None = None
     """Whether each bumper counts as pressed, in the order of the board, 1 to 4 values.
 
-    Null if the board has never reported its bumpers. If it no longer reports them, each value is
-    true.
+    Null if the board has never reported its bumpers. While it no longer reports them, each value is
+    true, because the bumpers then count as pressed.
     """
     battery: BatterySummary | None = None
     """The battery; null if the board has never reported its voltage or its charge."""
