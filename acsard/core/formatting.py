@@ -96,7 +96,7 @@ _ROUGH = (
 
 
 def rough(seconds: float | None, finest: float = 1.0) -> str:
-    """Format a duration or an age with at least two digits, in at most 7 characters ("1.5 min").
+    """Format a duration or an age with at least two digits, in at most 7 characters ("2.5 min").
 
     None and infinity become "never". NaN, negative values and values of 1e9 s or more become "?".
     `finest` is the size of the smallest unit to use, s.

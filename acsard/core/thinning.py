@@ -161,8 +161,8 @@ class Band:
 class Place(NamedTuple):
     """A pose in the odom frame, m and rad, at the time `t`, s.
 
-    `new` is True if the robot did not drive from the previous place to this one. For example, a
-    client has set the pose.
+    `new` is True if the robot did not drive from the previous place to this one, for example
+    because a client has set the pose.
     """
 
     t: float

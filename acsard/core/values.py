@@ -286,8 +286,8 @@ class Wait(Struct, frozen=True):
     It is 0 below the smallest of these values, and for other conditions."""
     kept: str = ""
     """Name of a source whose speeds have no effect, because `self.source` controls the robot and
-    sends only zeros; "" without one. If both senders belong to the same source, the text is
-    "another sender of NAME"."""
+    sends only zeros; "" if there is no such source. If both senders belong to the same source, the
+    text is "another sender of NAME"."""
     ros: bool = False
     """Whether the sender that must send a zero uses ROS."""
     shared: bool = False
@@ -512,9 +512,9 @@ class Outputs(Struct, frozen=True):
     """Why the robot moves or does not, in words."""
     link: str
     source: str
-    """The source whose command the robot follows, "" without one."""
+    """The source whose command the robot follows, "" if it follows no command."""
     command_ns: int | None
-    """Monotonic arrival time of the command that the robot follows, ns; None without one."""
+    """Monotonic arrival time of the command that the robot follows, ns; None without a command."""
     status_changed: bool
     """Whether `mode`, `reason`, `link`, `source` or the battery's level changed in this step."""
     events: tuple[Event, ...] = ()
@@ -586,12 +586,12 @@ class Snapshot(Struct, frozen=True):
     """The last value of each field of the board's status lines, as text, by name. `age_s` is the
     age of the last status line, s. Empty if the board has sent no status line."""
     check: str = "plain"
-    """The checksum that the serial lines carry, in words; "plain" without one."""
+    """The checksum that the serial lines carry, in words; "plain" without a checksum."""
     encoders: tuple[int, ...] = ()
     """Configured encoder counts per wheel revolution, in `WHEELS` order. 0 if none is configured,
     or if the board does not compute its speeds as a whole number of counts divided by a time."""
     sender: str = ""
-    """The sender whose command the robot follows, "" without one."""
+    """The sender whose command the robot follows, "" if it follows no command."""
     routers: RoutersStatus = RoutersStatus()
     recording: Recording = Recording()
     latch_file: str | None = None

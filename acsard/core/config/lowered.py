@@ -34,7 +34,7 @@ def lowered(file: LimitsConfig, now: LimitsConfig) -> dict[str, float]:
 
 
 def with_lowered(config: Config, kept: Mapping[str, float]) -> tuple[Config, list[Event]]:
-    """Apply the limits that were lowered before the restart to `config`, as it is in the file.
+    """Apply the limits that were lowered before the restart to `config`, which is from the file.
 
     Return a pair: the new configuration, and the events that report applied and dropped limits.
     `kept` contains the lowered limits by dotted key. A limit is applied only if it is below the
@@ -74,5 +74,5 @@ def _applied(config: Config, wishes: Mapping[str, object]) -> tuple[Config, list
 
 
 def _rank(name: str, value: float) -> float:
-    """Return a number by which values of a limit are compared: larger means that more is allowed."""
+    """Return a number to compare values of a limit: a larger number means that more is allowed."""
     return math.inf if name.endswith("_jerk") and value == 0.0 else value

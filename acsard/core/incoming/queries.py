@@ -304,9 +304,10 @@ def most_bytes(topic: str) -> int:
 
 
 def _echo(asked: Attachment | None, wall_ns: int) -> bytes:
-    """Return the attachment by which rmw_zenoh matches a reply with its request, b"" without one.
+    """Return the attachment by which rmw_zenoh matches a reply with its request.
 
-    `asked` is the attachment of the request, and `wall_ns` is the time of the reply.
+    `asked` is the attachment of the request. If it is None, the result is b"". `wall_ns` is the
+    time of the reply.
     """
     return b"" if asked is None else Attachment(asked.sequence, wall_ns, asked.gid).pack()
 

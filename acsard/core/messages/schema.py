@@ -246,7 +246,7 @@ class Battery(Message, frozen=True):
 
 
 class BatterySummary(Message, frozen=True):
-    """The battery in short. A value that the board does not report now is null."""
+    """A summary of the battery. A value that the board does not report now is null."""
 
     volts: float | None
     percent: float | None
