@@ -406,8 +406,9 @@ class Latch(Struct, frozen=True):
     """One latch: a stop, a fault or the robot being switched off."""
 
     number: int
-    """Identifies the latch across restarts: the time at which it was set, ms since 1970, or a
-    larger number if an earlier latch has one as large. JavaScript represents it exactly."""
+    """Identifies the latch, also after a restart. The number is the time at which the latch was
+    set, ms since 1970. It is larger if an earlier latch already has that number or a larger one.
+    JavaScript represents the number exactly."""
     at_ns: int
     """Wall-clock time at which the latch was set, ns since 1970."""
     by: str
@@ -441,12 +442,12 @@ class Latches(Struct, frozen=True):
 
     @property
     def next(self) -> Latch | None:
-        """The latch that `clear` releases next: the fault if there is one, else the stop."""
+        """The latch that `clear` releases next: the fault, else the stop, else None."""
         return self.fault or self.stop
 
     @property
     def in_force(self) -> Latch | None:
-        """The latch that decides the mode: the fault, else the stop, else `inactive`."""
+        """The latch that decides the mode: the fault, else the stop, else `inactive`, else None."""
         return self.next or self.inactive
 
     def after_restart(self) -> Latches:
@@ -485,7 +486,7 @@ class Inputs(Struct, frozen=True):
     missed: int = 0
     """Number of control periods without a step since the previous step."""
     events: tuple[Event, ...] = ()
-    """Events that other parts of the daemon report, to be logged with those of the robot."""
+    """Events of other parts of the daemon, to be logged together with the robot's events."""
     at_once: bool = False
     shutting_down: bool = False
     """Whether the daemon is going down. The robot then ramps to zero and stays there."""
@@ -512,9 +513,10 @@ class Outputs(Struct, frozen=True):
     """Why the robot moves or does not, in words."""
     link: str
     source: str
-    """The source whose command the robot follows, "" if it follows no command."""
+    """The source that the arbiter has selected, "" if it has selected none. The source may still
+    have to send a zero, or a latch may keep the robot from driving."""
     command_ns: int | None
-    """Monotonic arrival time of the command that the robot follows, ns; None without a command."""
+    """Monotonic arrival time of the selected command, ns; None if no sender may drive."""
     status_changed: bool
     """Whether `mode`, `reason`, `link`, `source` or the battery's level changed in this step."""
     events: tuple[Event, ...] = ()
@@ -586,12 +588,12 @@ class Snapshot(Struct, frozen=True):
     """The last value of each field of the board's status lines, as text, by name. `age_s` is the
     age of the last status line, s. Empty if the board has sent no status line."""
     check: str = "plain"
-    """The checksum that the serial lines carry, in words; "plain" without a checksum."""
+    """Whether the serial lines carry a checksum, in words, such as "plain" or "checked"."""
     encoders: tuple[int, ...] = ()
     """Configured encoder counts per wheel revolution, in `WHEELS` order. 0 if none is configured,
     or if the board does not compute its speeds as a whole number of counts divided by a time."""
     sender: str = ""
-    """The sender whose command the robot follows, "" if it follows no command."""
+    """The sender that the arbiter has selected, "" if it has selected none."""
     routers: RoutersStatus = RoutersStatus()
     recording: Recording = Recording()
     latch_file: str | None = None
