@@ -282,7 +282,8 @@ def _fits(pattern: str, chunk: str) -> bool:
 def refused(query: Query, why: str, wall_ns: int) -> Reply | None:
     """Return the reply that refuses a query, or None if the client could not read a reply.
 
-    A ROS client receives no error replies of Zenoh, so its response says that the call failed.
+    A ROS client does not receive error replies of Zenoh. Therefore it gets a normal response, which
+    says that the call failed.
     """
     if query.via == "native":
         return Reply(query.ticket, query.topic, why.encode(), "text/plain", ok=False)

@@ -23,10 +23,10 @@ _PLACE = re.compile("<[A-Za-z]+>")
 Direction = Literal["out", "in", "query", "service"]
 """Direction of a key.
 
-- out: the daemon publishes on it.
-- in: clients put on it.
-- query: the daemon answers queries for it, also queries with a wildcard.
-- service: a query for it calls a service. The query must name the exact key.
+- out: the daemon publishes on the key.
+- in: clients put messages on the key.
+- query: the daemon answers queries for the key, including queries with a wildcard.
+- service: a query for exactly this key calls a service.
 """
 
 
@@ -299,7 +299,7 @@ def source_keys(sources: Iterable[str], certificate: str = "") -> list[str]:
 
 
 def unknown(key: str) -> bool:
-    """Return whether no row of the table of keys matches a key.
+    """Return True if no row of the table of keys matches `key`.
 
     Keys below `json/` and all keys of commands always count as known.
     """

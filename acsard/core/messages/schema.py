@@ -39,8 +39,8 @@ LatchNumber = Annotated[int, Meta(ge=0, lt=1 << 53)]
 """Number of a latch. It is below 2^53, so JavaScript represents it exactly."""
 
 FEW = Meta(max_length=64)
-"""Limit of 64 items for a list or a map, so that a huge one is refused quickly. No robot has as
-many joints."""
+"""Limit of 64 items for a list or a map, so that a huge message is refused quickly. No robot has
+more than 64 joints."""
 
 
 def one_of(values: Iterable[object]) -> Meta:
@@ -256,8 +256,8 @@ class BatterySummary(Message, frozen=True):
     level: Annotated[str, one_of(get_args(BatteryLevel))]
     """Level according to the thresholds in `[battery]`; `ok` if none is set.
 
-    `unknown` means that the board no longer reports the battery, or does not report the quantity (V
-    or %) that the thresholds use.
+    `unknown` means that the board does not report the quantity (V or %) that the thresholds use, or
+    has reported it only for a few seconds so far.
     """
 
 
@@ -327,7 +327,8 @@ class RobotState(Message, frozen=True):
     encoder_counts: list[int] = []
     """Configured encoder counts per wheel turn, in the order of `wheels`.
 
-    0 means that the counts are not configured, or that the reported speeds are not whole counts.
+    0 means that the counts are not configured, or that the board does not compute the reported
+    speeds from whole counts.
     """
     wheel_fault: str = ""
     """The wheel that the odometry leaves out, or the side that slips, in words; else empty."""
@@ -590,4 +591,4 @@ MESSAGES: dict[str, type[Message]] = {
     )
 }
 """The types of complete messages, by name, without the types that are only parts of a message. A
-query of the key `schema/<Type>` returns the schema of each."""
+query of the key `schema/<Type>` returns the JSON Schema of a type."""
