@@ -37,7 +37,7 @@ Where to look: each package may import only the packages below it in this list.
     recording/       the black box: writes the steps to MCAP files, deletes old files, reads the
                      files, and replays them
     terminal/        prints tables and output of all tools with the library rich; asks the person
-                     beside the robot questions, at a terminal or through a program that uses JSON
+                     near the robot questions, at a terminal or through a program that uses JSON
     host/            the parts that every process uses: clock, timers, threads and the mailboxes
                      between them, child processes, files, rate limits, systemd, logs, errors
     checkup/         `acsard mcu check`: one module for each check of the board

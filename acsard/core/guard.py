@@ -68,8 +68,8 @@ class Guard:
     def __init__(self, stop: bytes, config: Config, memory: Memory | None = None) -> None:
         """Start with `memory`, or with an empty `Memory` if it is None.
 
-        `stop` is the line that replaces a forbidden one: zeros without a checksum, which an MCU
-        obeys in any state.
+        `stop` is the line that the guard sends instead of a forbidden line. It contains zeros and
+        no checksum, and an MCU obeys it in any state.
         """
         self._stop = stop
         memory = memory or Memory()

@@ -152,9 +152,9 @@ class Robot:
         self._bumpers = Bumpers(config.safety)
         self._battery = Battery(config.battery, any(why.startswith(EMPTY) for why in causes))
         self._unreported = {name: why for why in causes if (name := _input(why))}
-        """The causes of the latches from before the start of the daemon that came from an input of
-        the board, by the input's key in `REPORTS`. A `clear` is refused until the board has
-        reported the input."""
+        """Maps inputs of the board, as keys of `REPORTS`, to the causes of latches from before the
+        start of the daemon. A `clear` is refused until the board has reported each of these
+        inputs."""
         self._answered = UnansweredLines(config.mcu.reply_period)
         self._tally = EventThrottle()
         self._asked: tuple[str, str, int | None] = ("", "", None)

@@ -258,7 +258,7 @@ def includes(expression: str, key: str) -> bool:
 
 
 def _fits(pattern: str, chunk: str) -> bool:
-    """Return whether one part of a key expression includes `chunk`, one part of a key.
+    """Return whether `pattern`, a chunk of a key expression, matches `chunk`, a chunk of a key.
 
     In the pattern, `$*` matches any characters.
     """
