@@ -1,8 +1,8 @@
 """acsard: the hardware interface daemon of a four-wheel differential-drive robot.
 
-One process, the daemon, drives the robot with one asyncio event loop. It exchanges lines with a
-microcontroller on a serial port, and messages with clients on a Zenoh bus. It runs a control step
-every 10 ms. A second process, the gateway, terminates TLS connections from the network.
+One process, the daemon, drives the robot with one asyncio event loop. The daemon exchanges lines
+with a microcontroller on a serial port, and messages with clients on a Zenoh bus. It runs a control
+step every 10 ms. A second process, the gateway, terminates TLS connections from the network.
 
       one task, every 10 ms (earlier if a new command or feedback has arrived)
 
@@ -29,14 +29,15 @@ Where to look: each package may import only the packages below it in this list.
                      other machines, the serial ports, the system service
     client/          follows and drives a robot from Python, synchronously or with asyncio; its
                      follower and commander have the rules and time limits that all tools use
-    daemon/          the daemon's process: control loop, latch file, shutdown
+    daemon/          the daemon's process: control loop, shutdown, and the file that keeps a stop
+                     or a fault latched over a restart
     daemon/gateway/  `acsard gateway`: the process that terminates TLS connections
     daemon/bus/      the Zenoh sessions: subscriptions, publications, replies, access rules
     daemon/serial/   the serial port
     recording/       the black box: writes the steps to MCAP files, deletes old files, reads the
                      files, and replays them
     terminal/        prints tables and output of all tools with the library rich; asks the person
-                     beside the robot questions, at a terminal or through a program that uses JSON
+                     near the robot questions, at a terminal or through a program that uses JSON
     host/            the parts that every process uses: clock, timers, threads and the mailboxes
                      between them, child processes, files, rate limits, systemd, logs, errors
     checkup/         `acsard mcu check`: one module for each check of the board
@@ -61,10 +62,11 @@ Three invariants hold, and each is tested:
 
 1. Nothing in `core/` does I/O, and in the daemon only `host/clock.py` reads a clock.
 2. A wheel speed grows only in a step with a fresh command, a live link and the mode `driving`.
-   Otherwise it only falls. Without a link the commanded speed is zero at once. The guard checks
-   this rule with code of its own, and also checks that each ramp ends in time.
-3. No line is kept to be sent later. If the serial port cannot take a line now, the line is dropped,
-   and the next line supersedes it.
+   In every other step it stays the same or falls. Without a link the commanded speed is zero
+   immediately. The guard checks this rule with its own code, and also checks that each ramp to
+   rest ends in time.
+3. No line for the board is queued. If the serial port cannot take a line now, the daemon drops
+   that line, and the next line replaces it.
 """
 
 __version__ = "0.1.0"

@@ -1,6 +1,7 @@
-"""Formats texts and values for people; pure.
+"""Formats texts and values for people to read. The functions do no I/O.
 
-Untrusted text must pass `printable`, `lines` or `json_line` before it is written to a terminal.
+Before untrusted text is written to a terminal, it must go through `printable`, `lines` or
+`json_line`.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ def printable(text: str) -> str:
 
 
 def lines(text: str) -> str:
-    """Return a text with each of its lines made `printable`."""
+    """Return a text of several lines, with `printable` applied to each line."""
     return "\n".join(map(printable, text.split("\n")))
 
 
@@ -38,16 +39,17 @@ _ABOVE_ASCII = re.compile(r"[^\x00-\x7e]")
 
 
 def json_line(text: str) -> str:
-    """Escape the unprintable characters of a JSON text; the JSON value stays the same."""
+    """Escape the unprintable characters in a JSON text without changing the value it encodes."""
     return _ABOVE_ASCII.sub(
         lambda m: m[0] if m[0].isprintable() or ord(m[0]) > 0xFFFF else f"\\u{ord(m[0]):04x}", text
     )
 
 
 def many(count: int, one: str, more: str = "") -> str:
-    """Return a count with its noun: `no lines`, `1 line`, `2 lines`, `2 changes of who drives`.
+    """Return a count with its noun, such as `no lines`, `1 line` or `2 changes of mode`.
 
-    `one` is the noun in the singular. `more` is its plural if that does not just add an "s".
+    `one` is the noun in the singular, such as `line` or `change of mode`. `more` is the plural. It
+    may be omitted if the plural only adds an "s" to the noun.
     """
     noun, of, rest = one.partition(" of ")
     return f"{count or 'no'} {one if count == 1 else more or f'{noun}s{of}{rest}'}"
@@ -94,7 +96,7 @@ _ROUGH = (
 
 
 def rough(seconds: float | None, finest: float = 1.0) -> str:
-    """Format a duration or an age with two digits or more, in at most 7 characters.
+    """Format a duration or an age with at least two digits, in at most 7 characters ("2.5 min").
 
     None and infinity become "never". NaN, negative values and values of 1e9 s or more become "?".
     `finest` is the size of the smallest unit to use, s.

@@ -13,9 +13,9 @@ bytes in the same way as the MCU, and passes a line only if all of these conditi
   the last fresh command is older than the longest ramp to rest, or if a stop, a fault or a shutdown
   began longer ago than the longest stop takes. `MARGIN_NS` is added to each of these two durations.
 
-Otherwise the guard replaces the line with the stop line, and the robot latches a fault. The guard
-keeps the times of the last fresh command and of the last stop in its `Memory`. A recording stores
-the `Memory`, so that a replay makes the same decisions.
+If a condition does not hold, the guard replaces the line with the stop line, and the robot latches
+a fault. The guard keeps the times of the last fresh command and of the last stop in its `Memory`. A
+recording stores the `Memory`, so that the guard makes the same decisions in a replay.
 """
 
 from __future__ import annotations
@@ -39,12 +39,13 @@ HALTED = ("stopped", "fault", "shutdown")
 """Modes in which the robot brakes at the stop deceleration."""
 
 MARGIN_NS = 300_000_000
-"""Time by which a ramp to rest may end later than computed, ns. It is the board's watchdog time: if
-no line arrives for longer, the board has stopped the motors by itself."""
+"""Extra time, ns, in which the guard still passes lines that move a wheel after the computed end of
+a ramp to rest. This time equals the board's watchdog time: a board that receives no line for longer
+stops the motors by itself."""
 
 
 class Memory(Struct, frozen=True):
-    """Everything that a guard remembers from one line to the next."""
+    """The state that a guard keeps from one line to the next."""
 
     last: bytes = b""
     """The last line that was written to the serial port; empty before the first one."""
@@ -55,17 +56,21 @@ class Memory(Struct, frozen=True):
     """Monotonic time at which the mode became one of `HALTED`, ns. None in any other mode."""
     ramp_ns: int = 0
     """Duration of a ramp from full speed to rest, ns. If the limits have changed since the robot
-    was last at rest, the longest duration that any of these limits gave is kept."""
+    was last at rest, this is the longest duration under any of these limits."""
     stop_ramp_ns: int = 0
     """Duration of a stop from full speed, ns. If the limits have changed since the robot was last
-    at rest, the longest duration that any of these limits gave is kept."""
+    at rest, this is the longest duration under any of these limits."""
 
 
 class Guard:
     """Checks each line to the board, and replaces a forbidden line with the stop line (zeros)."""
 
     def __init__(self, stop: bytes, config: Config, memory: Memory | None = None) -> None:
-        """Start. `stop` is the stop line without a checksum, which an MCU obeys in any state."""
+        """Start with `memory`, or with an empty `Memory` if it is None.
+
+        `stop` is the line that the guard sends instead of a forbidden line. It contains zeros and
+        no checksum, and an MCU obeys it in any state.
+        """
         self._stop = stop
         memory = memory or Memory()
         self._last = memory.last
@@ -76,8 +81,8 @@ class Guard:
     def use(self, config: Config) -> None:
         """Use `config` from now on.
 
-        Until the robot is at rest, the longer of the ramp times of the old and the new
-        configuration applies, because a moving robot may still brake by its previous limits.
+        Until the robot is at rest, a ramp may take the longer of two times: the time under the old
+        limits and the time under the new ones. A moving robot may still brake by the old limits.
         """
         self._require_check = config.mcu.link_check == "require"
         self._most = int(config.limits.wheel_speed * 100 + 1)
@@ -87,7 +92,7 @@ class Guard:
 
     @property
     def memory(self) -> Memory:
-        """The memory with which another `Guard` can continue the checks of this `Guard`."""
+        """The state with which another `Guard` can continue the checks of this one."""
         return Memory(self._last, self._commanded_ns, self._halted_ns, *self._longest)
 
     def left(self, line: bytes) -> None:
@@ -96,7 +101,10 @@ class Guard:
         self._note_limits()
 
     def check(self, outputs: Outputs) -> tuple[bytes | None, str]:
-        """Return the line to send, if any, and why the guard replaced it ("" if it did not)."""
+        """Return a pair: the line to send, and why the guard replaced it with the stop line.
+
+        The line is None if `outputs` has no line. The reason is "" if the guard did not replace it.
+        """
         if outputs.mode == "driving":
             if self._commanded(outputs):
                 self._commanded_ns = outputs.now.mono_ns
@@ -172,11 +180,11 @@ class Guard:
 
 
 def _ramp_ns(config: Config, *, stop: bool) -> int:
-    """Return the time that the robot needs at its limits from the highest speed to rest, ns.
+    """Return the time that the robot needs to brake from its highest speed to rest, ns.
 
-    If `stop` is true, the stop decelerations apply. Each axis, linear or angular, starts at its own
-    speed limit, or at its speed with all wheels at `limits.wheel_speed` if that is lower. Both axes
-    reach rest together, so the slower one decides. The jerk limits only affect acceleration.
+    If `stop` is true, the stop decelerations apply. The result is the longer of the braking times
+    of the linear and the angular axis. Each axis starts at its speed limit, or at its speed with
+    all wheels at `limits.wheel_speed` if that is lower. The jerk limits do not affect braking.
     """
     limits, drive = config.limits, config.drive
     sides = drive.left_wheel_radius_multiplier + drive.right_wheel_radius_multiplier

@@ -2,9 +2,9 @@
 
 A step updates the odometry with the feedback, chooses one command, checks that the mode allows it,
 limits this command, converts it to wheel speeds and reports. A step does no I/O: its inputs are
-time, bytes and commands, and its outputs are decisions. Only a step changes the memory of `Robot`,
-except that the control loop adds to `counters`. The control loop reads and writes the port, and
-`core/guard.py` checks each line before it is written.
+time, bytes and commands, and its outputs are decisions. Only `step` changes the state of a `Robot`,
+with one exception: the control loop also adds to `counters`. The control loop reads and writes the
+port, and `core/guard.py` checks each line before it is written.
 """
 
 from __future__ import annotations
@@ -64,20 +64,20 @@ from acsard.core.values import (
 )
 
 MAX_DT = 0.05
-"""Longest time for which one step accelerates the robot, s, so that the speed does not jump after a
-stall of the process. If 1.5 control periods are longer, that time applies instead."""
+"""One step accelerates the robot for at most this time, s, so that the speed does not jump after a
+stall of the process. If 1.5 control periods are longer than this, the bound is 1.5 periods."""
 
 UNHEARD_S = WATCHDOG_S - 0.05
 """If no line was written to the port for this time, s, the next speeds start from rest, because the
-MCU has stopped the motors after `WATCHDOG_S`. The 0.05 s are there because the clock of the MCU may
-run a little fast."""
+MCU has stopped the motors after `WATCHDOG_S`. The margin of 0.05 s allows for an MCU whose clock
+runs a little fast."""
 
 REPORTS = {
     "estop": "its emergency stop",
     "bumpers": "its bumpers",
     "driver": "its motor drivers",
 }
-"""Names of the inputs for the words "wait until the board has reported ..."."""
+"""Maps each input of the board to the words that follow "wait until the board has reported"."""
 
 HALTED = (Mode.STOPPED, Mode.FAULT, Mode.SHUTDOWN)
 """Modes in which the robot brakes at the stop deceleration."""
@@ -85,14 +85,15 @@ HALTED = (Mode.STOPPED, Mode.FAULT, Mode.SHUTDOWN)
 NS_PER_MS = 1_000_000
 
 MAX_TEXT = 200
-"""Largest number of characters of a refusal's text, which may quote a message of any client."""
+"""Largest number of characters of a refusal's text in `state`. The text may quote a message from a
+client, which can be long."""
 
 
 class Robot:
     """The state of one robot: its link to the board, its pose, its mode and its command sources."""
 
     def __init__(self, config: Config, latches: Latches = Latches()) -> None:  # noqa: B008
-        """Start in the mode that `latches` require, with the lowered limits that they contain."""
+        """Start in the mode that the latches require, with the limits in `latches.lowered`."""
         self._file_limits = config.limits
         config, self._first_events = with_lowered(config, latches.lowered)
         self.config = config
@@ -120,26 +121,28 @@ class Robot:
         self._choice = Choice()
         self._speeds = STILL
         self._computed = self._written = STILL
-        """Wheel speeds in the last computed line, and in the last line written to the port. The
-        wheels follow the latter, also after a press whose zeros cannot be written yet."""
+        """Wheel speeds in two lines: `_computed` is for the last computed line, `_written` for the
+        last line that was written to the port. The wheels follow `_written`, even if the emergency
+        stop was pressed and the line of zeros could not be written yet."""
         self._made_of: tuple[int | None, Mode] | None = (None, self._life.mode)
         """The command and the mode for which the last line was computed. The command is represented
         by its arrival time, monotonic ns, or None without a command. After a press of the emergency
-        stop or a bumper, the whole value is None, so that a new line is due at once."""
+        stop or a bumper, the whole pair is None, so that a new line is due immediately."""
         self._made_ns = 0
         """Monotonic time at which the last line was computed, ns."""
         self._made = self._said = (self._limiter.state, 0)
         """Two states of the limiter, each with its monotonic time, ns. `_made` belongs to the last
         computed line, and `_said` to the last line written to the port. If a line was not written,
-        `_settle` sets `_made` back to `_said`. After a press or without a link, both are zero."""
+        `_settle` sets `_made` back to `_said`. After a press of the emergency stop or a bumper, and
+        without a link, both are the state of a robot at rest."""
         self._status = ("", "", "", "")
         self._battery_level = ""
         """The level of the battery in the previous step, "" before the board's first report."""
         self.counters: Counter[str] = Counter()
         """Counters since the start of the daemon. `commands` counts accepted commands, and
-        `command_<reason>` refused ones. `commands_of_new_senders` counts the commands of senders
-        whose delay is still being checked. Other counters count events. The control loop adds the
-        counters of the port and of the bus."""
+        `command_<reason>` counts refused commands. `commands_of_new_senders` counts the commands of
+        senders whose delays are not proved yet. Other counters count events. The control loop adds
+        the counters of the port and of the bus."""
         self._refused = ""
         self._refused_ns: int | None = None
         self._sanity = Sanity(config.feedback)
@@ -149,20 +152,22 @@ class Robot:
         self._bumpers = Bumpers(config.safety)
         self._battery = Battery(config.battery, any(why.startswith(EMPTY) for why in causes))
         self._unreported = {name: why for why in causes if (name := _input(why))}
-        """The causes of latches from before the start of the daemon, by the input that the board
-        must report before a `clear` (a key of `REPORTS`)."""
+        """Maps inputs of the board, as keys of `REPORTS`, to the causes of latches from before the
+        start of the daemon. A `clear` is refused until the board has reported each of these
+        inputs."""
         self._answered = UnansweredLines(config.mcu.reply_period)
         self._tally = EventThrottle()
         self._asked: tuple[str, str, int | None] = ("", "", None)
-        """Verb, client and arrival time of the last request. A call `stop` reaches the robot twice
-        (for the stop and for the reply), and this value prevents a second log line."""
+        """Verb, client and arrival time of the last request. A call of `srv/stop` reaches the robot
+        as two requests: the first stops the robot, and the second leads to the reply. Because of
+        this value, only the first one is logged."""
         self._told = CommandEvents(self._life.mode)
         self._port_trouble = ""
         self._linked_once = False
         self._arbiter.require_neutral()
 
     def snapshot(self, now_ns: int) -> Snapshot:
-        """Return the values for `state` and `diagnostics`. This is too slow for every step."""
+        """Return the values for `state` and `diagnostics`. It is too slow to call in every step."""
         session, since, silent = self.session, self._refused_ns, self.session.silent(now_ns)
         counters = {"lines": session.good_lines} | self._odometry.missed()
         counters |= {f"line_{reason}": count for reason, count in session.rejects.items() if count}
@@ -199,7 +204,8 @@ class Robot:
 
     @property
     def travelled(self) -> float:
-        """Distance since the daemon's start by the odometry, forwards plus backwards, m."""
+        """Distance driven since the daemon started, m, according to the odometry. Forward and
+        backward motion both add to it."""
         return self._odometry.travelled
 
     def step(self, inputs: Inputs) -> Outputs:
@@ -238,7 +244,7 @@ class Robot:
         level = battery.level if battery else ""
         another = status != self._status or level != self._battery_level
         self._status, self._battery_level = status, level
-        # In all other steps neither the mode nor the sender that drives can have changed.
+        # If both are false, neither the mode nor the sender that drives can have changed.
         if another or news:
             events += self._told.changes(self._life.mode, self._choice, status[1])
         # Pass the arguments by position: seventeen keyword arguments take three times as long.
@@ -262,7 +268,7 @@ class Robot:
     # The outcome of the previous line.
 
     def _settle(self, inputs: Inputs) -> None:
-        """Undo the effect of the last line on the limiter if it was not written to the port."""
+        """Undo the last line's effect on the limiter if that line was not written to the port."""
         if inputs.guard_trip:
             # The guard has replaced the line with STOP.
             self._limiter.cut()
@@ -376,7 +382,11 @@ class Robot:
         self._life.hold(*held, now.mono_ns)
 
     def _awaited_report(self) -> tuple[str, str]:
-        """Return the cause of a kept latch that the board has not reported yet, and what to do."""
+        """Return a pair: why a latch from before the start cannot be cleared yet, and what to do.
+
+        The reason is the cause of the latch. It applies until the board has reported the input of
+        this cause. Both texts are "" if no latch waits for a report.
+        """
         reported = {
             "estop": self._estop.use == "off" or bool(self._estop.state),
             "bumpers": self._bumpers.use == "off" or bool(self._bumpers.state),
@@ -389,10 +399,10 @@ class Robot:
         return "", ""
 
     def _keep_away(self, now_ns: int) -> None:
-        """Reduce the chosen command to its motion away from the pressed bumpers.
+        """Reduce the chosen command to the part that leads away from the pressed bumpers.
 
-        If no part of the command leads away from them, each sender must send a zero again. Without
-        this rule, the robot would drive against the obstacle as soon as the bumper is released.
+        If no part of the command does, each sender must send a zero again. Without this rule, the
+        robot would drive against the obstacle as soon as the bumper is released.
         """
         twist = self._choice.twist
         if twist is None:
@@ -406,7 +416,10 @@ class Robot:
             self._choice = replace(self._choice, twist=away)
 
     def _board(self, now_ns: int) -> dict[str, str]:
-        """Return the fields of the last status line and its age, s, as text; empty without one."""
+        """Return the last value of each field of the status lines as text, by name.
+
+        `age_s` is the age of the last status line, s. The result is empty before the first line.
+        """
         status_ns = self.session.status_ns
         if status_ns is None:
             return {}
@@ -414,9 +427,11 @@ class Robot:
         return shown(self.session.status) | {"age_s": f"{age_s:.1f}"}
 
     def _plausible(self, line: Feedback, now: Instant, events: list[Event]) -> list[Feedback]:
-        """Return the lines that may change the odometry now: `line`, with lines held back, or none.
+        """Return the feedback lines that the odometry may use now, the oldest first.
 
-        An impossible line is rejected. A line that fills a gap waits until others confirm it.
+        An impossible `line` is rejected. If `line` covers a long time with a speed that nothing
+        else confirms, it is held back. It is returned together with the later line that confirms
+        it, or dropped if later lines contradict it.
         """
         why = self._sanity.impossible(line)
         if self._sanity.warning is not None:
@@ -443,11 +458,11 @@ class Robot:
         checks = self._odometry.checks
         wheels = checks.wheels
         # While the emergency stop counts as pressed, the motors may have no power, so wheels that
-        # ignore the speeds are no sign of a fault.
+        # do not follow the commanded speeds are not a sign of a fault.
         pressed = self._estop.why or self._estop.pressed_now
         if self.session.lateness.step_s > UNHEARD_S and not pressed:
-            # The board may have stopped the motors since the last line, so the lines that waited
-            # say nothing about the wheels.
+            # This computer was late, and the board may have stopped the motors meanwhile. So the
+            # feedback lines that waited to be read say nothing about faults of the wheels.
             fault = ""
             wheels.skip(line.speeds)
         else:
@@ -552,9 +567,9 @@ class Robot:
         now_ns = inputs.now.mono_ns
         heard: Sequence[Command | Refusal] = inputs.commands
         if inputs.refusals:
-            # Process commands and refusals in the order of arrival, because an unreadable message
-            # cancels only the zeros that arrived before it. The refusal of a lost message has the
-            # arrival time 0, so it comes first.
+            # Process commands and refusals in the order of arrival. An unreadable message may have
+            # commanded motion, so it cancels the zeros that arrived before it, and only those. The
+            # refusal of a lost message has the arrival time 0, so it is processed first.
             heard = sorted([*heard, *inputs.refusals], key=lambda one: one.arrived_ns)
         for one in heard:
             if isinstance(one, Refusal):
@@ -573,8 +588,8 @@ class Robot:
 
     def _refuse(self, refusal: Refusal, now_ns: int, events: list[Event]) -> None:
         events.append(refused(refusal))
-        # Every sender that stamps its commands is unproven at first, so do not show this as a
-        # refusal.
+        # Every sender that stamps its commands is unproven at first. This is normal, so `state`
+        # must not show it as a refusal.
         if refusal.reason == "unproven":
             self.counters["commands_of_new_senders"] += 1
             return
@@ -629,7 +644,10 @@ class Robot:
 
 
 def _input(why: str) -> str:
-    """Return the input of the board that this cause of a latch is about, or ""."""
+    """Return the key in `REPORTS` of the input that caused a latch, "" if no input did.
+
+    `why` is the cause of the latch, in words.
+    """
     if why in (PRESSED, SILENT):
         return "estop"
     if why == DRIVER_FAULT:

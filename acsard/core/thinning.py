@@ -1,8 +1,8 @@
 """Containers that thin out curves, bands and paths while data arrives.
 
 A curve is a value over time, a band is a state over time, and a path is a series of poses. Times
-are in s and never decrease. Each container holds a bounded number of entries. When it is full, it
-merges neighbouring entries and halves its resolution. A curve keeps every peak.
+are in s and never decrease. Each container holds a bounded number of entries. A full container
+merges neighboring entries and halves its resolution. A curve keeps every peak.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class _Bin(NamedTuple):
     low: Point
     high: Point
     breaks: bool = False
-    """True if the curve is interrupted after this bin."""
+    """True if the curve has a gap after this bin."""
 
 
 class Curve:
@@ -50,7 +50,7 @@ class Curve:
         """Width of a bin, s. It doubles when the curve has too many bins."""
 
     def add(self, t: float, value: float | None) -> None:
-        """Add the value at time `t`, s. None, NaN and infinity interrupt the curve."""
+        """Add the value at the time `t`, s. None, NaN or infinity makes a gap in the curve."""
         bins = self._bins
         if value is None or not math.isfinite(value):
             if bins:
@@ -68,7 +68,7 @@ class Curve:
             self._bins = bins = list(_halved(bins))
 
     def points(self) -> list[Point]:
-        """Return the points to draw, in order; NaN marks an interruption."""
+        """Return the points to draw, in order. A point with the value NaN marks a gap."""
         found: list[Point] = []
         for _, low, high, breaks in self._bins:
             found += [low] if low == high else sorted((low, high))
@@ -78,7 +78,7 @@ class Curve:
 
 
 def _merged(one: _Bin, other: _Bin) -> _Bin:
-    """Merge two bins. An interruption between them is too short to be visible, so it is dropped."""
+    """Merge two bins. A gap between them would be too short to see, so it is dropped."""
     low = other.low if other.low.value < one.low.value else one.low
     high = other.high if other.high.value > one.high.value else one.high
     return _Bin(one.number, low, high, other.breaks)
@@ -98,7 +98,10 @@ def _halved(bins: list[_Bin]) -> Iterator[_Bin]:
 
 
 class Span(NamedTuple):
-    """A time span, s, in which the state is `kind`; `words` is the reason of the state."""
+    """A time span, from `begin` to `end`, s, in which the state is `kind`.
+
+    `words` is the reason of the state.
+    """
 
     begin: float
     end: float
@@ -109,17 +112,21 @@ class Span(NamedTuple):
 class Band:
     """A state over time, as time spans.
 
-    If there are too many spans, short spans are merged with their neighbours.
+    If there are too many spans, short spans are merged with their neighbors.
     """
 
     def __init__(self, ranks: Sequence[str], most: int = MOST_SPANS) -> None:
-        """Create an empty band. When spans are merged, the kind earlier in `ranks` wins."""
+        """Create an empty band.
+
+        `ranks` lists the kinds of state. Of two spans that are merged, the kind that comes first in
+        `ranks` is kept.
+        """
         self._rank = {kind: at for at, kind in enumerate(ranks)}
         self._most, self._least = most, FIRST_WIDTH
         self._spans: list[Span] = []
 
     def add(self, t: float, kind: str, words: str = "") -> None:
-        """Record that the state is `kind` from time `t` on; "" means that there is no state."""
+        """Record that the state is `kind` from `t` s onward; "" means that there is no state."""
         spans = self._spans
         if spans:
             last = spans[-1] = spans[-1]._replace(end=max(t, spans[-1].end))
@@ -154,7 +161,8 @@ class Band:
 class Place(NamedTuple):
     """A pose in the odom frame, m and rad, at the time `t`, s.
 
-    `new` is True if the robot did not drive here from the previous place.
+    `new` is True if the robot did not drive from the previous place to this one, for example
+    because a client has set the pose.
     """
 
     t: float
@@ -165,9 +173,10 @@ class Place(NamedTuple):
 
 
 class Track:
-    """A thinned path.
+    """A path that keeps only some of its places.
 
-    Each place of the path is less than `2 * self.stride` m away from a place that is kept.
+    Each place that was added is less than `2 * self.stride` m away from one that is kept, unless it
+    is too old.
     """
 
     def __init__(

@@ -31,9 +31,9 @@ class AcsardError(Exception):
 
 
 class Instant(Struct, frozen=True, gc=False):
-    """One moment as the time of two clocks.
+    """One moment, as two clocks show it.
 
-    The monotonic clock serves for ages and periods, the wall clock for stamps.
+    Ages and periods are computed from the monotonic clock. Stamps come from the wall clock.
     """
 
     mono_ns: int
@@ -86,7 +86,7 @@ class PoseCovariance(Struct, frozen=True, gc=False):
 class TwistVariances(Struct, frozen=True, gc=False):
     """Variances of the twist that one feedback line gives, in base_link.
 
-    The unit is m2/s2, but rad2/s2 for `angular`.
+    `linear` and `lateral` are in m2/s2, `angular` is in rad2/s2.
     """
 
     linear: float
@@ -106,8 +106,8 @@ class Command(Struct, frozen=True):
 
     - source: one of `commands.sources`, such as `app` for the key `cmd/app`.
     - sender: public name of the program that sent the command, as far as it is known.
-    - arrived_ns: monotonic time of arrival, ns. The age is computed from it alone.
-    - stamp_ns: time of sending, ns, by a clock that is not synchronized with the daemon's.
+    - arrived_ns: monotonic time of arrival, ns. The command's age is computed from this time alone.
+    - stamp_ns: time of sending, ns, by a clock that is not synchronized with the daemon's clock.
     - clock: name of the clock that gave `stamp_ns`.
     """
 
@@ -118,19 +118,19 @@ class Command(Struct, frozen=True):
     clock: str = ""
     sender: str = ""
     cancelled: bool = False
-    """Whether the sender requested a speed that the robot cannot follow, such as one along y, so
-    that `twist` is zero. Such a command is not the zero that a sender must send first."""
+    """Whether `twist` is zero only because the robot cannot make the requested motion, for example
+    a motion along y. Such a command does not count as the zero that a sender must send first."""
     sequence: int | None = None
-    """Number that the sender gave to this command, or None. Gaps between the numbers of a sender
-    mean lost commands."""
+    """Number that the sender gave to this command, or None. A gap in the numbers of a sender means
+    that commands were lost."""
     shared: bool = False
-    """Whether several programs may have the same `sender`, because the program has stated neither a
-    sender id nor a GID. The daemon then knows only the session that stamped the command, which may
-    be that of a router or a bridge, or only the key."""
+    """Whether several programs may have the same `sender`, because the command contains neither a
+    sender id nor a GID. Then `sender` names only the Zenoh session that stamped the command, which
+    may be the session of a router or a bridge, or only the key."""
     ros: bool = False
     """Whether the command came from ROS. ROS tools do not send a zero command by themselves."""
     stamp_replaced: bool = False
-    """Whether Zenoh replaced the stamp because the sender's clock is ahead of the daemon's."""
+    """Whether Zenoh replaced the stamp, because the sender's clock is ahead of the daemon's."""
     steady: bool = False
     """Whether the sender declares that the clock of its stamps is never adjusted."""
 
@@ -142,18 +142,18 @@ Plain = bool | int | float | str | list[float | str]
 
 
 class Request(Struct, frozen=True):
-    """A service call or a stop. `id` identifies the caller; 0 if no caller waits for an answer."""
+    """A service call or a stop. `id` is the ticket of the query to answer, 0 without a query."""
 
     verb: Verb
     id: int = 0
     pose: Pose | None = None
     asked_ns: int | None = None
     """Monotonic time at which the request arrived, ns. None means the time of the control step that
-    serves the request. A `clear` needs this time, because it must not undo a later stop."""
+    serves the request. A `clear` needs this time, because it must not release a later stop."""
     by: str = ""
     """Name of the client that sent the request, as `core/incoming/commands.py` forms it."""
     settings: dict[str, Plain] = {}
-    """The new values of the settings that `set` changes, by the keys of `core/config/live.py`."""
+    """The new values of the settings that `set` changes, by dotted key ("limits.linear_speed")."""
     latch: int | None = None
     """Number of the latch that `clear` or `activate` releases; None if the client names none."""
 
@@ -167,10 +167,10 @@ class Answer(Struct, frozen=True):
 
 
 class Refusal(Struct, frozen=True):
-    """A refused message of a client. It increments the counter `command_<reason>`, or
-    `commands_of_new_senders` for the reason `unproven`.
+    """A message of a client that was refused.
 
-    `source` and `sender` are "" if they are unknown.
+    The robot counts it as `command_<reason>`, or as `commands_of_new_senders` for the reason
+    `unproven`. `source` and `sender` are "" if they are unknown.
     """
 
     reason: str
@@ -216,7 +216,8 @@ class Event(Struct, frozen=True):
     by: str = ""
     """Name of the client that caused the event, "" if no client did."""
     kind: str = ""
-    """A detail such as a reason or a change. Repeated events are counted separately by kind."""
+    """A detail, such as the reason of a refusal. A log line that combines several events counts
+    them by kind."""
     count: int = 1
     """Number of occurrences that this event stands for."""
     news: bool = True
@@ -243,7 +244,10 @@ class Estimate(Struct, frozen=True, gc=False):
 
 
 class Wait(Struct, frozen=True):
-    """The condition that a command source waits for (`arbiter_text.py` makes a sentence of it)."""
+    """The condition that a command source waits for before it drives the robot.
+
+    `arbiter_text.py` makes a sentence of it.
+    """
 
     what: Literal[
         "nothing",
@@ -258,29 +262,32 @@ class Wait(Struct, frozen=True):
         "senders",
     ]
     source: str = ""
-    """The source that the condition `what` names, "" if it names none.
+    """The source that the condition `what` is about; "" for each condition that is not listed here.
 
-    - neutral, proof, late, stalled: The waiting source itself. It must send a zero, must show that
-      its delays are steady, sends its commands too late, or has sent none since the daemon stood
-      still.
+    - neutral: The waiting source, which must send a zero.
+    - proof: The waiting source, which must show that its delays are steady.
+    - late: The waiting source, whose commands arrive too late.
+    - stalled: The waiting source, which has sent no command since the daemon stood still.
     - zeros: The source that controls the robot, but sends only zeros.
     - higher, equal: The source that controls the robot with a higher or an equal priority.
     """
     seconds: float = 0.0
     """A duration, s, whose meaning depends on `what`.
 
-    - neutral: A sender with a shared identity must send no speed for this time after its zero.
+    - neutral: After its zero, a sender with a shared identity must send no speed for this time.
     - proof: The delays of the commands must be steady for this time.
     - late: The commands arrive with a delay that is longer than this time.
     """
     senders: int = 0
     """Number of senders that wait while the robot follows another sender of the same source."""
     lasts: float = 0.0
-    """Time for which the source has sent speeds without a zero (`neutral`) or only zeros (`zeros`),
-    s. The time is rounded down to one of a few values, so that it seldom changes."""
+    """How long the source has sent speeds without a zero (`neutral`) or only zeros (`zeros`), s.
+    The time is rounded down to one of a few values, so that the reason of the mode seldom changes.
+    It is 0 below the smallest of these values, and for other conditions."""
     kept: str = ""
     """Name of a source whose speeds have no effect, because `self.source` controls the robot and
-    sends only zeros. It is "another sender of NAME" if both senders belong to the same source."""
+    sends only zeros; "" if there is no such source. If both senders belong to the same source, the
+    text is "another sender of NAME"."""
     ros: bool = False
     """Whether the sender that must send a zero uses ROS."""
     shared: bool = False
@@ -291,7 +298,7 @@ class SourceStatus(Struct, frozen=True):
     """A command source.
 
     `age_s` is the time since the last accepted command of the source. It is None if no command was
-    accepted since the senders last had to return to neutral.
+    accepted since each sender was last required to send a zero, for example after a `clear`.
     """
 
     name: str
@@ -301,17 +308,17 @@ class SourceStatus(Struct, frozen=True):
 
 
 class WheelsStatus(Struct, frozen=True):
-    """Wheel faults, slip and slow wheels. Without any of these, only `differ` has a value."""
+    """Wheel faults, slip and slow wheels. If there are none, every field but `differ` is empty."""
 
     text: str = ""
     """Description of the faults and the slip, "" if there are none."""
     left_out: tuple[str, ...] = ()
     """The names of the wheels that the odometry ignores."""
     slipping: tuple[str, ...] = ()
-    """The sides that slip, `left` and `right`, now or within the last half second."""
+    """Each side, `left` or `right`, whose wheels slip or slipped within the last half second."""
     differ: tuple[float, float] = (0.0, 0.0)
-    """Learned fraction by which the front wheel rolls farther than the rear wheel: first for the
-    left side, then for the right side."""
+    """Learned fraction by which the front wheel rolls farther than the rear wheel, for the left
+    side and for the right side. 0.01 means 1 % farther."""
     slow: tuple[str, ...] = ()
     """Wheels that are slower than commanded, each with its share of the expected speed, such as
     "front_left 60%"."""
@@ -323,7 +330,7 @@ class RoutersStatus(Struct, frozen=True):
     connected: tuple[str, ...] = ()
     missing: tuple[str, ...] = ()
     peers: tuple[str, ...] = ()
-    """Connected endpoints that are not routers and so forward nothing."""
+    """Connected endpoints that are peers, not routers, so they do not forward messages."""
 
 
 class GyroSample(Struct, frozen=True, omit_defaults=True):
@@ -385,7 +392,7 @@ class BatteryStatus(Struct, frozen=True, gc=False):
 
     level: BatteryLevel
     reported_ns: int | None = None
-    """Monotonic time of the last report, ns."""
+    """Monotonic time of the last report, ns; None while the board does not report its battery."""
     volts: float | None = None
     percent: float | None = None
     """State of charge, 0 to 100."""
@@ -399,8 +406,9 @@ class Latch(Struct, frozen=True):
     """One latch: a stop, a fault or the robot being switched off."""
 
     number: int
-    """Identifies the latch across restarts: the time at which it was set, ms since 1970, or a
-    larger number if an earlier latch has one as large. JavaScript represents it exactly."""
+    """Identifies the latch, also after a restart. The number is the time at which the latch was
+    set, ms since 1970. It is larger if an earlier latch already has that number or a larger one.
+    JavaScript represents the number exactly."""
     at_ns: int
     """Wall-clock time at which the latch was set, ns since 1970."""
     by: str
@@ -410,8 +418,8 @@ class Latch(Struct, frozen=True):
     kept: bool = False
     """True if the latch was set before the daemon's last start."""
     earlier: tuple[Latch, ...] = ()
-    """The earlier causes of the same stop, the newest first. Each is the latch that the next cause
-    replaced, and has no earlier causes of its own."""
+    """The earlier causes of the same stop, the newest first. Each of them is a latch that a later
+    cause replaced. The field `earlier` of such a latch is empty."""
 
     @property
     def causes(self) -> tuple[Latch, ...]:
@@ -434,12 +442,12 @@ class Latches(Struct, frozen=True):
 
     @property
     def next(self) -> Latch | None:
-        """The latch that `clear` releases next: the fault if there is one, else the stop."""
+        """The latch that `clear` releases next: the fault, else the stop, else None."""
         return self.fault or self.stop
 
     @property
     def in_force(self) -> Latch | None:
-        """The latch that decides the mode: the fault, else the stop, else `inactive`."""
+        """The latch that decides the mode: the fault, else the stop, else `inactive`, else None."""
         return self.next or self.inactive
 
     def after_restart(self) -> Latches:
@@ -454,9 +462,9 @@ class Latches(Struct, frozen=True):
 class Inputs(Struct, frozen=True):
     """The complete input of one control step.
 
-    If `tick` is true, the step computes the line of a control period. If `at_once` is true, it may
-    compute an extra line for a new command or mode. `opened` counts how often the serial port was
-    opened: a new number means a new session with the board.
+    If `tick` is true, the step computes the line of a control period. If `at_once` is true, the
+    step may compute an extra line for a new command or mode. `opened` is the number of times that
+    the serial port was opened: a new number means a new session with the board.
     """
 
     now: Instant
@@ -478,13 +486,13 @@ class Inputs(Struct, frozen=True):
     missed: int = 0
     """Number of control periods without a step since the previous step."""
     events: tuple[Event, ...] = ()
-    """Events that other parts of the daemon report, to be logged with those of the robot."""
+    """Events of other parts of the daemon, to be logged together with the robot's events."""
     at_once: bool = False
     shutting_down: bool = False
     """Whether the daemon is going down. The robot then ramps to zero and stays there."""
     late_ns: int = 0
-    """Time from the start of the previous step to the writing of its line, ns. A time below 1 ms,
-    which is usual unless the process stalls, counts as 0."""
+    """Time from the start of the previous step until its line was written, ns. A time below 1 ms
+    counts as 0. Longer times mean that the process has stalled."""
 
 
 class Outputs(Struct, frozen=True):
@@ -505,9 +513,10 @@ class Outputs(Struct, frozen=True):
     """Why the robot moves or does not, in words."""
     link: str
     source: str
-    """The source whose command the robot follows, "" without one."""
+    """The source that the arbiter has selected, "" if it has selected none. The source may still
+    have to send a zero, or a latch may keep the robot from driving."""
     command_ns: int | None
-    """Monotonic arrival time of the command that the robot follows, ns; None without one."""
+    """Monotonic arrival time of the selected command, ns; None if no sender may drive."""
     status_changed: bool
     """Whether `mode`, `reason`, `link`, `source` or the battery's level changed in this step."""
     events: tuple[Event, ...] = ()
@@ -516,7 +525,8 @@ class Outputs(Struct, frozen=True):
     """Whether there is a reason for an extra line: since the last computed line, the command or the
     mode has changed, or the emergency stop or a bumper was pressed."""
     latches: Latches = Latches()
-    """The latches in force after the step. A new object means that a latch or a limit changed."""
+    """The latches in force after the step. A new object means that a latch or a lowered limit has
+    changed."""
 
 
 class Spread(Struct, frozen=True):
@@ -575,14 +585,15 @@ class Snapshot(Struct, frozen=True):
     battery: BatteryStatus | None = None
     """The battery, None if the board has never reported it."""
     board: dict[str, str] = {}
-    """The fields of the board's last status line, by name, as text."""
+    """The last value of each field of the board's status lines, as text, by name. `age_s` is the
+    age of the last status line, s. Empty if the board has sent no status line."""
     check: str = "plain"
-    """The checksum that the serial lines carry, in words; "plain" without one."""
+    """Whether the serial lines carry a checksum, in words, such as "plain" or "checked"."""
     encoders: tuple[int, ...] = ()
     """Configured encoder counts per wheel revolution, in `WHEELS` order. 0 if none is configured,
     or if the board does not compute its speeds as a whole number of counts divided by a time."""
     sender: str = ""
-    """The sender whose command the robot follows, "" without one."""
+    """The sender that the arbiter has selected, "" if it has selected none."""
     routers: RoutersStatus = RoutersStatus()
     recording: Recording = Recording()
     latch_file: str | None = None

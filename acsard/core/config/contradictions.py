@@ -28,15 +28,16 @@ from acsard.core.config.wire_time import (
 from acsard.core.values import ROOT, WHEELS
 
 LEAST_WRAP_PERIODS = 2
-"""Shortest allowed time, in control periods, until the encoder counts become ambiguous. They are
-ambiguous if they change by half of their range between two feedback lines, because a turn in the
-other direction could cause the same counts. With two periods, one lost line does no harm."""
+"""Shortest allowed time, in control periods, in which a wheel at full speed changes its encoder
+count by half of the count's range. After such a change the direction is ambiguous: a turn in the
+other direction gives the same count. With two periods, one lost line does no harm."""
 
 FEW_COUNTS, FASTEST_HZ = 200, 100.0
-"""Below `FEW_COUNTS` encoder counts per turn, plain lines at more than `FASTEST_HZ` give a wrong
-pose. A board repeats its last speeds if it is asked again too soon, and the daemon cannot always
-tell a repeated count from a new one. Of the simulated robot with 16 to 96 counts, distances were up
-to 20 % too short at 200 Hz and up to 29 % too long at 300 Hz."""
+"""An encoder with fewer than `FEW_COUNTS` counts per turn gives a wrong pose if plain lines are
+sent at more than `FASTEST_HZ`. A board repeats its last speeds if it is asked again too soon, and
+the daemon cannot always tell a repeated count from a new one. With 16 to 96 counts, the simulated
+robot measured distances that were up to 20 % too short at 200 Hz and up to 29 % too long at 300
+Hz."""
 
 MOST_VOLTS = 99.99
 """Highest voltage that a status line can express, V."""
@@ -147,9 +148,9 @@ def _wire_problems(config: Config) -> list[str]:
 
 
 def _shorter_lines(mcu: McuConfig, rate: float) -> str:
-    """Return the end of an error message, which names a setting that makes the lines shorter.
+    """Return the end of an error message that advises a setting which makes the lines shorter.
 
-    The result is "" if no setting makes them short enough.
+    The result is "" if no setting makes the lines short enough for `rate`, Hz.
     """
     fixes = ((True, "mcu.encoder_counts = 0"), (False, 'mcu.link_check = "off"'))
     for check, fix in fixes:
@@ -160,7 +161,7 @@ def _shorter_lines(mcu: McuConfig, rate: float) -> str:
 
 
 def _count_problems(config: Config) -> list[str]:
-    """Find encoder counts that wrap too soon, so that a motion looks like its opposite."""
+    """Find encoder counts that wrap so soon that forward motion could look like backward motion."""
     counts, fastest = config.mcu.encoder_counts, config.feedback.wheel_speed / math.tau
     lasts = LEAST_WRAP_PERIODS / config.rate_hz
     if fastest * counts * lasts <= FIELD / 2:
@@ -232,7 +233,11 @@ def _battery_problems(config: Config) -> list[str]:
 def _repeated(
     noun: str, names: dict[str, str], part: Callable[[str], str] = lambda name: name
 ) -> list[str]:
-    """Return a line for each name whose `part` an earlier name has too. `names` has them by key."""
+    """Return an error line for each name that repeats an earlier one.
+
+    `names` maps keys of the configuration to names. Two names count as the same if `part` returns
+    the same text for both.
+    """
     first: dict[str, str] = {}
     found = []
     for key, name in names.items():
@@ -268,7 +273,7 @@ def _bumper_problems(config: Config) -> list[str]:
 
 
 def _reachability_problems(config: Config) -> list[str]:
-    """Find a configuration in which no client, or no client over TLS, could reach the daemon."""
+    """Find settings with which no client at all, or no client over TLS, could reach the daemon."""
     bus, found = config.bus, []
     if bus.mode == "client" and not bus.connect:
         found.append(
@@ -419,4 +424,5 @@ RULES: tuple[Rule, ...] = (
     _ros_problems,
     *named_faults.RULES,
 )
-"""The rules. A rule that reads an invalid key is skipped, so each rule reads few keys."""
+"""All rules about combinations of keys. A rule that reads an invalid key is skipped as a whole.
+Therefore each rule checks one thing and reads only a few keys."""

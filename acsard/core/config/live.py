@@ -25,10 +25,12 @@ WHEN: dict[When, str] = {
     "raised": "raised at any time, lowered only while the robot stands",
     "rest": "only while the robot stands",
 }
-"""Says in words when a setting may change. A "raised" setting may be raised at any time, but it may
-be lowered only at rest, because a driving robot with a lower deceleration could not stop in time. A
-"rest" setting may change only at rest. A lower `limits.wheel_speed` would cut the speed at once,
-and after a change in `commands` each sender must send a zero before it drives."""
+"""When a setting may change, in words. The reasons for the restrictions are:
+
+- "raised": With a lower deceleration, a robot that drives could not stop in time.
+- "rest": A lower `limits.wheel_speed` reduces the speed without a ramp. After a change in
+  `commands`, each sender must send a zero before it drives.
+"""
 
 
 class Live(Struct, frozen=True):
@@ -109,9 +111,9 @@ def live(key: str) -> Live | None:
 def flat(value: object, name: str = "") -> Iterator[tuple[str, object]]:
     """Yield the dotted name and the value of each key in nested tables.
 
-    A table in a list, such as a command source, has the value of its key `name` in the dotted name,
-    not its index. The parameter `name` is the dotted name of `value`, "" for the whole
-    configuration.
+    The dotted name of a table in a list contains the table's own `name`, not its index: the timeout
+    of the source "app" is `commands.sources.app.timeout`. The parameter `name` is the dotted name
+    of `value`, "" for the whole configuration.
     """
     if isinstance(value, Mapping):
         for key, inner in value.items():
@@ -125,7 +127,7 @@ def flat(value: object, name: str = "") -> Iterator[tuple[str, object]]:
 
 
 class Difference(Struct, frozen=True):
-    """The value of a setting in force, and its different value in the configuration file."""
+    """A setting whose value in force differs from its value in the configuration file."""
 
     its: object
     """Value in force."""
@@ -134,13 +136,14 @@ class Difference(Struct, frozen=True):
 
     def words(self, key: str) -> str:
         """Return a text with the setting's key and both values."""
-        # If only one configuration has a command source, the other has no value for its keys.
+        # A command source may be in only one of the two configurations. Its keys have no value in
+        # the other one.
         its, ours = ("absent" if one is None else show(one) for one in (self.its, self.ours))
         return f"{key} = {its}, not {ours}"
 
 
 def differences(runs: Config, file: Config) -> dict[str, Difference]:
-    """Return the keys whose values differ between `runs` (in force) and `file`."""
+    """Return the settings that differ between `runs`, which is in force, and `file`, by key."""
     its, ours = dict(flat(effective(runs))), dict(flat(effective(file)))
     return {
         key: Difference(its.get(key), ours.get(key))
@@ -150,10 +153,11 @@ def differences(runs: Config, file: Config) -> dict[str, Difference]:
 
 
 def changed(config: Config, wishes: Mapping[str, object], at_rest: bool) -> tuple[Config, str]:
-    """Return the configuration with these settings, and a description of the changes.
+    """Return a pair: the configuration with the requested settings, and the changes in words.
 
-    A setting that already has the requested value is neither changed nor refused. The description
-    is "" if nothing changes. `wishes` contains the requested values by dotted key.
+    `wishes` contains the requested values by dotted key. `at_rest` says whether the robot stands. A
+    setting that already has the requested value is neither changed nor refused. The text is "" if
+    nothing changes.
 
     Raises:
         ConfigError: the change is not allowed, so no setting is changed. The error says why.
@@ -166,7 +170,7 @@ def changed(config: Config, wishes: Mapping[str, object], at_rest: bool) -> tupl
         more = [f"and {len(fixed) - 1} more of these keys cannot be set"] if len(fixed) > 1 else []
         raise ConfigError([_refusal(fixed[0], new[fixed[0]], before), *more])
     problems: list[str] = []
-    # The rules between tables need a list of tables here, not a tuple of structs.
+    # `build` accepts the tables of the sources only as a list, as a TOML file has them.
     tables["commands"]["sources"] = list(tables["commands"]["sources"])
     for key, value in new.items():
         _put(tables, key.split("."), value)

@@ -1,8 +1,8 @@
-"""Keeps the limits that `acsard set` has lowered, even if the daemon restarts.
+"""Keeps the limits that `acsard set` has lowered, so that a restart does not raise them again.
 
-A limit is lowered if its value is below that in the configuration file. Lowered decelerations are
-not kept, because a robot with a lower deceleration brakes more softly, which is not safer. A jerk
-limit of 0 means "no limit", so it is treated as the highest value.
+A limit is lowered if its value is below the value in the configuration file. Lowered decelerations
+are not kept, because a robot with a lower deceleration brakes more softly, which is not safer. A
+jerk limit of 0 means "no limit", so it is treated as the highest value.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def stays(key: str) -> bool:
 
 
 def lowered(file: LimitsConfig, now: LimitsConfig) -> dict[str, float]:
-    """Return the limits whose value in `now` is below that in `file`, by dotted key."""
+    """Return the limits that are lower in `now` than in `file`: values in `now` by dotted key."""
     return {
         TABLE + name: getattr(now, name)
         for name in file.__struct_fields__
@@ -34,11 +34,12 @@ def lowered(file: LimitsConfig, now: LimitsConfig) -> dict[str, float]:
 
 
 def with_lowered(config: Config, kept: Mapping[str, float]) -> tuple[Config, list[Event]]:
-    """Apply the limits that were lowered before the restart. Return the configuration and events.
+    """Apply the limits that were lowered before the restart to `config`, which is from the file.
 
-    `kept` contains these limits by dotted key. A limit is applied only if it is below that of
-    `config`. If the limits together contradict a file that has changed, they are applied one by
-    one, and each contradicting limit is dropped. The events report applied and dropped limits.
+    Return a pair: the new configuration, and the events that report applied and dropped limits.
+    `kept` contains the lowered limits by dotted key. A limit is applied only if it is below the
+    value in `config`. The file may have changed since the limits were lowered. If it contradicts
+    them, they are applied one at a time, and each limit that contradicts it is dropped.
     """
     limits = config.limits
     wishes: dict[str, object] = {
@@ -73,5 +74,5 @@ def _applied(config: Config, wishes: Mapping[str, object]) -> tuple[Config, list
 
 
 def _rank(name: str, value: float) -> float:
-    """Return a number that is larger for a limit that allows more."""
+    """Return a number to compare values of a limit: a larger number means that more is allowed."""
     return math.inf if name.endswith("_jerk") and value == 0.0 else value

@@ -1,7 +1,7 @@
-"""Finds contradictions between settings of motion.
+"""Finds contradictions between the settings that concern motion.
 
-The settings must let the robot stop soon enough, and motion that the limits allow must not look
-like a fault. The other rules are in `contradictions.py`.
+The robot must be able to stop soon enough, and motion that the limits allow must not look like a
+fault. The rules about other settings are in `contradictions.py`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ LONGEST_STOP_S = 2.0
 """Longest allowed time from full speed to rest after a stop, s. No person should wait longer."""
 
 LONGEST_RAMP_S = 5.0
-"""Longest allowed time from full speed to rest after the commands end, s. In this time, no
+"""Longest allowed time from full speed to rest after the commands end, s. During this ramp, no
 sender controls the robot."""
 
 HEADROOM = 1.1
@@ -48,8 +48,9 @@ def _reach(config: Config) -> _Reach:
     drive, limits = config.drive, config.limits
     sides = (drive.left_wheel_radius_multiplier, drive.right_wheel_radius_multiplier)
     half_track = drive.wheel_separation * drive.wheel_separation_multiplier / 2
-    # Both sides may turn at the same largest wheel speed. If the wheels of one side are larger, the
-    # speeds of the two rims differ. Their mean bounds the linear speed and the speed of a turn.
+    # The limit of the wheel speed is the same for both sides. If the wheels of one side are larger,
+    # the rims of that side are faster. The mean of both rim speeds bounds the linear speed. Divided
+    # by half of the track, the mean bounds the turn rate.
     rim = limits.wheel_speed * drive.wheel_radius * sum(sides) / 2
     fastest_rim = limits.linear_speed + limits.angular_speed * half_track
     wished = fastest_rim / (drive.wheel_radius * min(sides))
@@ -92,7 +93,10 @@ def _jerk_problems(config: Config, name: str) -> list[str]:
 
 
 def _feedback_problems(config: Config, asked: float) -> list[str]:
-    """Find a `feedback.wheel_speed` that a wheel would exceed with commands that are allowed."""
+    """Find a `feedback.wheel_speed` that a sound wheel would exceed when it obeys a command.
+
+    `asked` is the highest wheel speed that the limits allow, rad/s.
+    """
     most = config.feedback.wheel_speed
     needed = min(_rounded_up(HEADROOM * asked), MOST_WHEEL_SPEED)
     if most >= needed:
@@ -142,5 +146,5 @@ RULES: tuple[Rule, ...] = (
 
 
 def problems(config: Config) -> list[str]:
-    """Return the contradictions between the settings of motion, one line each."""
+    """Return the contradictions between the settings that concern motion, one line each."""
     return mistakes(RULES, config)

@@ -37,7 +37,8 @@ ARGUMENTS = {
 written as a to d and stored as 0 to 3. `n` is a number."""
 
 INPUTS = ("estop_pressed", "estop_silent", "bumper_pressed", "bumpers_silent", "driver_fault")
-"""Faults whose last two arguments are the time until the fault begins and its duration, s."""
+"""Faults whose last two arguments are the time from the start of the simulator to the beginning of
+the fault, and the duration of the fault, both in s."""
 
 RESET = "reset"
 """Fault that restarts the simulated board periodically. Its argument is the period, s. It needs a
@@ -108,7 +109,7 @@ def named(text: str) -> NamedFault:
 
 
 def warnings(config: Config) -> list[str]:
-    """Return a warning if `sim.faults` names faults, because simulated ones look like real ones."""
+    """Return a warning if the simulator has faults: a user could take them for real ones."""
     faults = config.sim.faults
     if not faults or not config.mcu.simulated:
         return []

@@ -16,6 +16,6 @@ def nearest(word: str, known: Iterable[str]) -> list[str]:
 
 
 def hint(word: str, known: Iterable[str], otherwise: str) -> str:
-    """Return the most similar known word as a question, or `otherwise` if no word is similar."""
+    """Return "did you mean WORD?", or `otherwise` if no known word is similar to `word`."""
     near = nearest(word, known)
     return f"did you mean {near[0]}?" if near else otherwise

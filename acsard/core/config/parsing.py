@@ -27,7 +27,8 @@ class ConfigError(AcsardError):
 def parse(text: bytes, overrides: dict[str, dict[str, object]] | None = None) -> Config:
     """Return the configuration in `text`. Raises `ConfigError` with every mistake.
 
-    `overrides` are values of the command line, by table and key. They replace those in `text`.
+    `overrides` contains the values from the command line, by table and key. They replace the values
+    in `text`.
     """
     if len(text) > MAX_BYTES:
         raise ConfigError(

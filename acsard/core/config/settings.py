@@ -1,7 +1,7 @@
 """The keys of `acsard.toml`: names, defaults, ranges and units, with one frozen struct per table.
 
-The `acsard.toml` at the root is the commented reference; a test proves that it equals these
-defaults. The rules between keys are in `contradictions.py`.
+The file `acsard.toml` at the root of the repository is the commented reference. A test proves that
+its values equal these defaults. The rules between keys are in `contradictions.py`.
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ SIMULATOR = "sim"
 
 LONGEST_REPLY_S = 0.25
 """Longest allowed time between two feedback lines, s. A board that is silent for one second counts
-as restarted. With this period, the next line arrives in time even if two lines are lost."""
+as restarted. With this time between lines, two lost lines in a row are not such a silence."""
 
 
 class McuConfig(Struct, frozen=True):
@@ -342,12 +342,12 @@ class BusConfig(Struct, frozen=True):
 
     @property
     def plain(self) -> tuple[str, ...]:
-        """Endpoints without TLS, at which the daemon itself listens; empty for a Zenoh client."""
+        """Endpoints without TLS, at which the daemon listens; empty if `mode` is "client"."""
         return tuple(e for e in self.listen if not e.startswith(TLS)) if self._peer else ()
 
     @property
     def outside(self) -> tuple[str, ...]:
-        """Endpoints with TLS, at which the TLS gateway listens; empty for a Zenoh client."""
+        """Endpoints with TLS, at which the TLS gateway listens; empty if `mode` is "client"."""
         return tuple(e for e in self.listen if e.startswith(TLS)) if self._peer else ()
 
     @property

@@ -59,7 +59,7 @@ def _changed(text: str, keys: Mapping[str, object]) -> str:
 
 
 def _adjusted(array: object, value: object) -> bool:
-    """Try to change a list in place, so that its comments stay. Return whether this succeeded."""
+    """Change a list in place, so that its comments stay. Return False if that is not possible."""
     from tomlkit.items import Array
 
     if not (isinstance(array, Array) and isinstance(value, list | tuple)):
@@ -77,8 +77,8 @@ def _adjusted(array: object, value: object) -> bool:
 def _dotted(text: str, keys: Mapping[str, object]) -> tuple[str, dict[str, object]]:
     """Insert new settings into tables that the text writes as dotted keys, like `mcu.port = ...`.
 
-    tomlkit would insert a table header in the middle of the dotted keys. Return the new text, and
-    the settings that were not inserted.
+    tomlkit would insert a table header in the middle of the dotted keys. Return a pair: the new
+    text, and the settings that still have to be changed.
     """
     import tomlkit
 

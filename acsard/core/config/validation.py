@@ -21,8 +21,8 @@ _BARE_KEY = re.compile(r"[A-Za-z0-9_-]{1,80}")
 def build(cls: type[T], table: object, path: str, problems: list[str]) -> T | None:
     """Return `table` as a struct, or None if it has a mistake.
 
-    `path` is the dotted name of the table, "" for the whole document. `problems` gets a line for
-    each mistake.
+    `path` is the dotted name of the table, "" for the whole document. The function appends a line
+    to `problems` for each mistake.
     """
     before = len(problems)
     made = build_partly(cls, table, path, problems, set())
@@ -34,8 +34,8 @@ def build_partly(
 ) -> T | None:
     """Return `table` as a struct, with the default in place of each invalid value.
 
-    Returns None if a required key has no valid value. `invalid` gets the dotted key of each invalid
-    value. The other arguments are those of `build`.
+    Returns None if a required key has no valid value. The function adds the dotted key of each
+    invalid value to `invalid`. The other arguments are those of `build`.
     """
     if not isinstance(table, Mapping):
         header = f"[[{path.partition('[')[0]}]]" if path.endswith("]") else f"[{path}]"
@@ -47,7 +47,7 @@ def build_partly(
         if key not in known:
             near = nearest(key, known)
             problems.append(_unknown(key, table[key], path, near, list(known)))
-            # The user may have meant the similar key, so the value of that key is unknown.
+            # The user may have meant the similar key, so treat the value of that key as invalid.
             invalid |= {prefix + name for name in near}
     values: dict[str, Any] = {}
     for name, field in known.items():

@@ -14,8 +14,8 @@ CHECK_BYTES = 8
 """Length of the sequence number and the checksum of a command or a reply (`#07*585F`), bytes."""
 
 SAMPLE_BYTES = 21
-"""Length of `@` and the sample fields of a reply (the board's clock, four encoder counts), bytes. A
-command that requests the sample fields is one letter longer than a command that does not."""
+"""Length of `@` and the sample fields (the board's clock, four encoder counts) in a reply, bytes.
+In a command, the request for the sample fields takes one letter."""
 
 STATUS_BYTES = 28
 """Length of `!status estop=pressed*F4BC`, a typical status line, with CR LF, bytes."""
@@ -24,11 +24,13 @@ STATUS_HZ = 10
 """Rate at which a board sends status lines, Hz."""
 
 FIELD = 65536
-"""Number of values of a sample field, which has four hexadecimal digits. FFFF wraps to 0."""
+"""Number of different values of a sample field, which has four hexadecimal digits. The value after
+FFFF is 0."""
 
 COMFORTABLE_USE = 0.8
-"""Largest advisable use of the wire, as a share of its capacity. Above it, a slightly late line
-delays the next one. The rest leaves room for a space after each comma (36 bytes instead of 33)."""
+"""Largest advisable use of the wire, as a share of its capacity. If more is used, a slightly late
+line delays the next one. The other 20 % also have room for a space after each comma, which makes a
+line 36 bytes long instead of 33."""
 
 
 def wire_ns(count: int, baud_rate: int) -> int:

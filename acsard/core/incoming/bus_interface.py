@@ -27,7 +27,7 @@ class BusInput(Struct, frozen=True):
     dropped: int = 0
     """Number of published messages that were dropped because the bus did not send them in time."""
     stuck: bool = False
-    """True once: in the first `BusInput` after a send on the bus has begun to block."""
+    """True only in the first `BusInput` after a send on the bus has begun to block."""
     routers: RoutersStatus | None = None
     """The connections to the endpoints in `bus.connect` if they have changed, else None."""
 
@@ -50,7 +50,7 @@ class Bus(Protocol):
 
     @property
     def wanted(self) -> AbstractSet[str]:
-        """Published topics that have a subscriber."""
+        """Keys that the daemon publishes and that have a subscriber."""
 
     def take(self, queries: int) -> BusInput:
         """Return the input since the last call, with at most `queries` + 1 queries.
@@ -70,7 +70,7 @@ class Bus(Protocol):
         """Reply to the query that holds the ticket `reply.ticket`."""
 
     def retire(self, ticket: int) -> None:
-        """End the query that holds this ticket. It gets no more replies."""
+        """End the query that holds this ticket. No more replies to the query are possible."""
 
 
 GATEWAY_KEY = "gateway"
@@ -79,20 +79,24 @@ _decoder = Decoder(GatewayState)
 
 
 class GatewayFollower:
-    """Counts the events in the reports of the TLS gateway, also across restarts of the gateway."""
+    """Counts the starts of the TLS gateway, and the checks that found all connections in use.
+
+    The gateway reports its own count of such checks, which begins at 0 after each start.
+    """
 
     def __init__(self) -> None:
         self._last = GatewayState(0, 0, 0)
 
     def receive(self, arrival: Arrival, counters: MutableMapping[str, int]) -> int | None:
-        """Add the gateway's new events to `counters`. An invalid report is ignored.
+        """Add the new counts in a report to `counters`. An invalid report is ignored.
 
-        Returns the wall-clock time at which the TLS certificate expires, ns, or None if unknown.
+        Returns the earliest expiry of the TLS certificates, wall-clock ns since 1970, or None if it
+        is unknown.
         """
         try:
             report = _decoder.decode(arrival.encoding, arrival.payload)
         except DecodeError:
-            return None  # only local programs may put on this key, so a bad report is harmless
+            return None  # only local programs may put on this key, so ignoring it is harmless
         last = self._last
         if report.opened != last.opened:
             counters["gateway_opened"] += 1
@@ -119,7 +123,7 @@ class RouterFollower:
     def receive(
         self, status: RoutersStatus, counters: MutableMapping[str, int], events: list[Event]
     ) -> None:
-        """Store the present status, and add counters and events for changed connections."""
+        """Store the present status. For each change, add to `counters` and `events`."""
         before, self.status = self.status, status
         lost = [endpoint for endpoint in status.missing if endpoint not in before.missing]
         made = [endpoint for endpoint in status.connected if endpoint not in before.connected]

@@ -49,16 +49,16 @@ MAX_BOUND = 1024
 class Bindings:
     """Binds each sender id to the certificate with which the daemon first saw it.
 
-    One id with two certificates is a mistake or a stolen secret. The daemon refuses the second
-    certificate while the sender with the first one keeps commanding. Only native keys name a
-    certificate. A sender on a ROS key is not bound, and its public name never equals that of a
-    native sender.
+    If one id comes with two certificates, it was copied by mistake, or its secret was stolen. The
+    daemon refuses the second certificate while commands with the first one keep coming. Only native
+    keys name a certificate. So the sender of a command on a ROS key is not bound. The public name
+    of such a sender never equals the public name of a native sender.
     """
 
     def __init__(self) -> None:
         self._seen: dict[str, tuple[str, int]] = {}
-        """Maps each sender id to its certificate ("" on the robot itself) and to the monotonic time
-        of its last command, ns."""
+        """Maps each sender id to a pair: its certificate ("" on the robot itself), and the
+        monotonic time of its last command, ns. The sender id is in the form of its public name."""
 
     def other(self, sender: str, certificate: str, now_ns: int) -> str | None:
         """Bind `sender` to `certificate` and return None.
@@ -101,17 +101,17 @@ class Arrival(Struct, frozen=True):
     stamp_ns: int | None
     """Zenoh's timestamp by the wall clock, ns, if the sender or a router set it."""
     sender: str
-    """Id of the Zenoh session that stamped the sample: that of its sender, a router or a bridge. It
-    is "" if the sample has no stamp, or if the daemon's own session stamped it."""
+    """Id of the Zenoh session that stamped the sample: the session of the sender, of a router or of
+    a bridge. It is "" if the sample has no stamp, or if the daemon's own session stamped it."""
     via: Via = "native"
     attachment: bytes = b""
     received_ns: int | None = None
     """Zenoh's timestamp by the wall clock, ns, if the daemon's own session set it. The session does
-    so if the sample has none, or one that is too far ahead of the daemon's clock."""
+    so if the sample has no timestamp, or a timestamp too far ahead of the daemon's clock."""
 
 
 class _TwistPayload(Struct, frozen=True, forbid_unknown_fields=True):
-    """A Twist or a TwistStamped. The fields that are set show which of the two it is."""
+    """A Twist, with `linear` and `angular`, or a TwistStamped, with `header` and `twist`."""
 
     linear: Vector3 | UnsetType = UNSET
     angular: Vector3 | UnsetType = UNSET
@@ -120,8 +120,8 @@ class _TwistPayload(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 TWIST_CDR_BYTES, STAMPED_CDR_BYTES = 52, 68
-"""Size of a Twist in CDR and the least size of a TwistStamped, bytes. If the Encoding names no
-type, the size shows which of the two a payload is."""
+"""Size of a Twist in CDR, and least size of a TwistStamped in CDR, bytes. If the Encoding does not
+name the type, the size of a payload shows which of the two types it is."""
 
 TWISTS = ("geometry_msgs/msg/Twist", "acsard.Twist.v1")
 STAMPED_TWISTS = ("geometry_msgs/msg/TwistStamped", "acsard.TwistStamped.v1")
@@ -244,8 +244,8 @@ class Receiver:
     ) -> Request:
         """Return the request in a service query. Raises `DecodeError` if the payload is not valid.
 
-        `ticket` is the number with which the reply names the query. `asked_ns` is the monotonic
-        time of the query.
+        `ticket` is the number by which the reply names the query. `asked_ns` is the monotonic time
+        at which the query arrived, ns.
         """
         request = Request(verb, ticket, asked_ns=asked_ns)
         if verb not in _payloads or (SERVICES[verb].optional and not payload):
@@ -279,15 +279,15 @@ class Identity(Struct, frozen=True):
     steady: bool = False
     """Whether the sender states that the clock of its stamps is never adjusted."""
     signed: str = ""
-    """Public name of the sender's id. Unlike `sender`, it does not depend on the certificate. "" if
-    the sample has no id, or is not a command on a native key."""
+    """Public name that is made from the sender id alone, without the certificate that `sender`
+    includes; "" if the sample has no sender id, or is not a command on a native key."""
 
 
-# The results are cached, because each command needs the parts of its key twice, and few different
-# keys carry commands.
+# The results are cached, because each command needs the parts of its key twice, and commands arrive
+# on only a few different keys.
 @lru_cache(64)
 def parts(key: str) -> tuple[str, str, str]:
-    """Return kind, source and certificate in a command's key: "cmd", "app" and "" for `cmd/app`."""
+    """Return the kind, source and certificate of a command key: "cmd", "app", "" for `cmd/app`."""
     kind, _, rest = key.partition("/")
     source, _, certificate = rest.partition("/")
     return kind, source, certificate
@@ -302,10 +302,10 @@ def identify(arrival: Arrival) -> Identity:
     - on a key of rmw_zenoh: the GID
     - on a key of a bridge: the session that stamped the sample, the key
 
-    Only a program's sender id or GID is its own. Other identities may be shared: a router or a
-    bridge stamps the samples of all programs behind it, and the daemon cannot tell its session from
-    that of a program. A GID does not prove the identity: ROS discovery publishes it, so a program
-    that may put on a key of rmw_zenoh can claim any GID.
+    A sender id or a GID belongs to one program. A session or a key may stand for several programs:
+    a router or a bridge stamps the samples of all programs behind it, and the daemon cannot tell
+    the session of a router from the session of a program. A GID does not prove the identity: ROS
+    discovery publishes the GIDs, so a program that may put on a key of rmw_zenoh can claim any GID.
     """
     if arrival.via == "rmw":
         rmw = unpack(arrival.attachment)
@@ -318,7 +318,7 @@ def identify(arrival: Arrival) -> Identity:
     if signed is None:
         name = _by_key(arrival)
         if arrival.sender:
-            # No sender id has such a public name: behind a prefix there is always a slash.
+            # No sender id has such a public name: in public names, "/" separates name and hash.
             name = f"session {public_name(arrival.sender, certificate)}"
         return Identity(name, arrival.stamp_ns, shared=True)
     return Identity(
@@ -340,9 +340,9 @@ def _by_key(arrival: Arrival) -> str:
 
 
 def claimed_identity(arrival: Arrival) -> Identity:
-    """Return the identity of a sample's sender, as `identify`, but never raise an error.
+    """Return the identity of a sample's sender like `identify`, but never raise an error.
 
-    The `sender` of an rmw_zenoh sample without a GID is "".
+    Of an rmw_zenoh sample, only the field `sender` is set. It is "" if the sample has no GID.
     """
     if arrival.via == "rmw":
         gid = arrival.attachment[-GID_BYTES:]
@@ -373,10 +373,10 @@ def _twist_payload(arrival: Arrival) -> _TwistPayload:
 def caller_name(via: Via, attachment: bytes, stamped_by: str = "") -> str:
     """Return a name for the program that called a service or sent a stop, for the log.
 
-    It is the public name of the sender id in the attachment, with the transport in brackets. The
-    name is only a claim of the program, because Zenoh does not say on which connection a query
-    arrived. A call over rmw_zenoh is named by the GID of the client. A call through a bridge has no
-    name. `stamped_by` is the id of the Zenoh session that stamped the sample, or "".
+    The name is the public name of the sender id in the attachment, with the transport in brackets.
+    It is only a claim of the program, because Zenoh does not say on which connection a query
+    arrived. For a call over rmw_zenoh, the name is the GID of the client. A call through a bridge
+    is unnamed. `stamped_by` is the id of the Zenoh session that stamped the sample, or "".
     """
     if via == "rmw":
         return f"unnamed (rmw {attachment[-GID_BYTES:].hex()})"

@@ -3,8 +3,9 @@
 A sample is a sensor_msgs/Imu in any encoding. In JSON and msgpack only `angular_velocity` is
 required. The z axis points up, so a turn to the left is positive.
 
-The daemon uses the samples of one gyro until that gyro is silent. Then it may follow another one,
-whose first sample is marked (`GyroSample.anew`), because two gyros have different biases.
+The daemon uses the samples of one gyro until that gyro is silent. After that, it may use another
+gyro. The first sample of the new gyro is marked (`GyroSample.anew`), because two gyros have
+different biases.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ MAX_RATE = 50.0
 """Largest turn rate that is accepted, rad/s. No robot turns that fast."""
 
 FOLLOWED_NS = NS_PER_S // 2
-"""Silence of a gyro after which the daemon may follow another one, ns."""
+"""Silence of a gyro after which the daemon may use another one, ns."""
 
 OWN = "gyro of the simulator/own"
 """The sender id with which the simulator signs the samples of its gyro."""
@@ -34,7 +35,7 @@ MOST_WHO = 64
 """Largest number of characters of a sender's name in an error message."""
 
 UNKNOWN = [0.0] * 9
-"""Covariance for a sample without one. sensor_msgs/Imu defines zeros as "unknown"."""
+"""Covariance to use if a sample contains none. In sensor_msgs/Imu, zeros mean "unknown"."""
 
 
 class _Reading(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -62,7 +63,10 @@ class GyroFollower:
     def receive(
         self, arrival: Arrival, counters: MutableMapping[str, int], events: list[Event]
     ) -> GyroSample | None:
-        """Return the turn rate in a sample, or None after counting and reporting its refusal."""
+        """Return the turn rate in a sample, or None if the sample is refused.
+
+        A refusal is counted in `counters` and reported in `events`.
+        """
         try:
             sample = reading(arrival)
             anew = self._follow(claimed_identity(arrival).sender, arrival.arrived_ns)
@@ -73,10 +77,10 @@ class GyroFollower:
         return replace(sample, anew=True) if anew else sample
 
     def _follow(self, who: str, now_ns: int) -> bool:
-        """Follow the sender `who`, and return whether it replaces another one.
+        """Use the gyro of the sender `who`. Return whether another sender's gyro was used before.
 
-        Raises `DecodeError` if another gyro is in use that is not silent, or that belongs to the
-        daemon's own simulator.
+        Raises `DecodeError` if the gyro in use belongs to another sender, and is not silent or is
+        the gyro of the daemon's own simulator.
         """
         other = who != self._followed
         if other and (self._own or now_ns - self._heard_ns < FOLLOWED_NS):

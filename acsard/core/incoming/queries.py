@@ -1,7 +1,7 @@
 """Answers queries from the bus, or turns them into a `Request` to the robot if they call a service.
 
-A service runs only if the query has exactly the key of the service: a get on `<id>/**` must never
-stop the robot or clear a latch. All other keys may also be queried with a wildcard.
+A query calls a service only if it names exactly the key of the service: a get on `<id>/**` must
+never stop the robot or clear a latch. All other keys may also be queried with a wildcard.
 """
 
 from __future__ import annotations
@@ -71,9 +71,9 @@ class Query(Struct, frozen=True):
     """A query as Zenoh delivered it."""
 
     ticket: int
-    """The number with which replies name the query."""
+    """The number by which replies name the query."""
     topic: str
-    """The key in the topic table that the query matches."""
+    """The row of the topic table that the query matches, by the row's key."""
     asked: str
     """The key expression of the query, without `acsard/<id>/` if it begins with exactly that."""
     fmt: str
@@ -108,7 +108,8 @@ class _Waiting(Struct, frozen=True):
     """The attachment of a call over rmw_zenoh, which the reply repeats. None for other calls."""
     ros: bool = False
     wish: bytes = b""
-    """Payload of a ROS request to set parameters, from which the reply is built. Else b""."""
+    """Payload of a ROS request to set parameters, from which the reply is built. b"" for other
+    calls."""
 
 
 class Queries:
@@ -135,10 +136,10 @@ class Queries:
     ) -> list[Reply] | Request:
         """Return the replies to a query, or the `Request` of a service call.
 
-        The list is empty if the daemon has no value for the query. Raises `DecodeError` for a ROS
-        request that cannot be served; `refused` builds the reply to such a request. `current`
-        returns the present message of a published key. `outputs` are those of the last step, or
-        None before the first step.
+        The list is empty if the daemon has no value for the query. `current` returns the present
+        message of a published key. `outputs` are those of the last step, or None before the first
+        step. Raises `DecodeError` for a ROS request that cannot be served. The caller then sends
+        the reply that `refused` builds.
         """
         if query.via != "native":
             return self._ros(query, 0 if outputs is None else outputs.now.wall_ns)
@@ -257,7 +258,10 @@ def includes(expression: str, key: str) -> bool:
 
 
 def _fits(pattern: str, chunk: str) -> bool:
-    """Return whether `pattern` includes `chunk`. In the pattern, `$*` matches any characters."""
+    """Return whether `pattern`, a chunk of a key expression, matches `chunk`, a chunk of a key.
+
+    In the pattern, `$*` matches any characters.
+    """
     if pattern == "*":
         return True
     first, *middle = pattern.split("$*")
@@ -278,7 +282,8 @@ def _fits(pattern: str, chunk: str) -> bool:
 def refused(query: Query, why: str, wall_ns: int) -> Reply | None:
     """Return the reply that refuses a query, or None if the client could not read a reply.
 
-    A ROS client receives no error replies of Zenoh, so its response says that the call failed.
+    A ROS client does not receive error replies of Zenoh. Therefore it gets a normal response, which
+    says that the call failed.
     """
     if query.via == "native":
         return Reply(query.ticket, query.topic, why.encode(), "text/plain", ok=False)
@@ -300,12 +305,19 @@ def most_bytes(topic: str) -> int:
 
 
 def _echo(asked: Attachment | None, wall_ns: int) -> bytes:
-    """Return the attachment by which rmw_zenoh matches a reply with its request, or b""."""
+    """Return the attachment by which rmw_zenoh matches a reply with its request.
+
+    `asked` is the attachment of the request. If it is None, the result is b"". `wall_ns` is the
+    time of the reply.
+    """
     return b"" if asked is None else Attachment(asked.sequence, wall_ns, asked.gid).pack()
 
 
 def _format(query: Query) -> Format:
-    """Return the encoding of a reply: `fmt`, else that of a service call's payload, else JSON."""
+    """Return the encoding of the reply to a query.
+
+    It is the one that `fmt` names, else the encoding of a service call's payload, else JSON.
+    """
     for form in FORMATS:
         if query.fmt == form:
             return form
@@ -322,7 +334,7 @@ def _format(query: Query) -> Format:
 
 
 def topic_table(config: Config) -> Topics:
-    """Return the topic table with full keys, without the messages that this daemon never sends."""
+    """Return the topic table with full keys, without the keys on which this daemon never sends."""
     robot, silent = config.robot.id, left_out(config)
     return Topics(
         [
@@ -334,7 +346,7 @@ def topic_table(config: Config) -> Topics:
 
 
 def note_of(config: Config, topic: Topic) -> str:
-    """Return the meaning of a key with this configuration, which decides the fixed transforms."""
+    """Return the meaning of a key. For `tf_static`, list the transforms that `config` enables."""
     if topic.key != "tf_static":
         return topic.note
     frames = {"lidar": config.lidar.publish_tf, "base_footprint": config.footprint.publish_tf}

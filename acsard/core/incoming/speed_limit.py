@@ -5,9 +5,9 @@ A speed limit never raises a speed. The robot's `limits.linear_speed` is the low
 - the *setting*: the value in the configuration, or the value of the last `set`.
 - the limit in the last message, converted to m/s. A message with 0.0 lifts the limit.
 
-The class `Robot` does not know speed limits: this module sends it a `set` request with the lower
-value. While a limit is in force, a client's `set` is checked against the settings without the
-limit, because they apply again when the limit is lifted.
+The class `Robot` has no code for speed limits: this module sends it a `set` request with the lower
+value. When the limit is lifted, the settings without the limit apply again. Therefore, while a
+limit is in force, a client's `set` must be valid together with those settings.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ SETTING = "limits.linear_speed"
 
 PAUSE_NS = NS_PER_S // 10
 """Least time between two changes of the limit, ns. Each change builds the whole configuration, so a
-flood of messages would delay the control loop. Meanwhile the newest message waits."""
+flood of messages would delay the control loop. During this time, only the newest message is
+kept."""
 
 LIFTED = 0.0
 """Value of nav2_msgs/SpeedLimit that means "no limit", in m/s and in %."""
@@ -58,7 +59,10 @@ class Limit(Struct, frozen=True):
 
 
 def decode_limit(arrival: Arrival, configured: float) -> Limit:
-    """Return the limit in a sample, or raise `DecodeError`. 100 % is `configured`, m/s."""
+    """Return the limit in a sample, or raise `DecodeError`.
+
+    A limit in % is a share of `configured`, the configured highest speed, m/s.
+    """
     if not arrival.put:
         raise DecodeError("not_a_put", "a DELETE is not a speed limit: send a PUT")
     if len(arrival.payload) > MAX_COMMAND_BYTES:
@@ -95,7 +99,8 @@ class SpeedLimiter:
         self._robot = self._settings = config
         """`_robot` is the robot's configuration. `_settings` is the one without the speed limit."""
         self._asked: tuple[Request, float] | None = None
-        """The client's `set` of the speed in this step, and the speed that it asks for, m/s."""
+        """The client's request in this step that sets the speed, and the speed it asks for, m/s.
+        None without such a request."""
         self._held: list[Request] = []
         """The `set` requests that wait for the next control step. While a limit is in force, a step
         takes only one `set` request."""
@@ -109,7 +114,7 @@ class SpeedLimiter:
     def lowers(self) -> bool:
         """Whether the limit lowers the speed.
 
-        After the end of the limit, it is still True until the robot has its higher setting again.
+        After the end of the limit, this stays True until the robot has its higher setting again.
         """
         lowest = min(self._limit.speed, self._robot.limits.linear_speed)
         return lowest < self._settings.limits.linear_speed
@@ -134,9 +139,9 @@ class SpeedLimiter:
     def requests(
         self, requests: tuple[Request, ...], now_ns: int
     ) -> tuple[tuple[Request, ...], list[Answer]]:
-        """Return the requests for the robot in this step, and the answers to refused requests.
+        """Return a pair: the requests for the robot in this step, and answers to refused requests.
 
-        `requests` are those of the clients. Call `settle` after the step.
+        The argument `requests` contains the requests of the clients. Call `settle` after the step.
         """
         own = self._own(now_ns)
         if self._limit is NONE and not self._held:
@@ -157,9 +162,9 @@ class SpeedLimiter:
         return tuple(found), refused
 
     def _limited(self, request: Request) -> Request:
-        """Return a client's `set` with its speed lowered to the limit, if it is higher.
+        """Return a client's `set` request, with a speed above the limit lowered to the limit.
 
-        Raises `ConfigError` if the settings would be invalid after the end of the limit.
+        Raises `ConfigError` if the requested settings would be invalid after the end of the limit.
         """
         # Whether a change must wait until the robot stands is checked by the robot itself.
         made, _ = changed(self._settings, request.settings, at_rest=True)
@@ -172,7 +177,7 @@ class SpeedLimiter:
         return replace(request, settings=request.settings | {SETTING: self._limit.speed})
 
     def _own(self, now_ns: int) -> tuple[Request, ...]:
-        """Return the request that makes the robot obey the newest message, or () if none is due."""
+        """Return the request that applies the newest limit to the robot, or () if none is due."""
         if self._waiting is None or now_ns - self._changed_ns < PAUSE_NS:
             return ()
         new, self._waiting = self._waiting, None
@@ -186,10 +191,11 @@ class SpeedLimiter:
     def settle(
         self, robot: Config, answers: Iterable[Answer], events: list[Event]
     ) -> tuple[Answer, ...]:
-        """Store the robot's configuration after the step, and return the answers to the clients.
+        """Store the robot's configuration after the step, and return the answers for the clients.
 
-        If a client has set a speed above the limit, its answer and a new event say that the speed
-        will apply when the limit ends.
+        `robot` is that configuration. `answers` are the robot's answers in the step. If a client
+        has set a speed above the limit, the answer to this client and a new event say that the
+        speed will apply when the limit ends.
         """
         answers = tuple(answers)
         speed = self._settings.limits.linear_speed

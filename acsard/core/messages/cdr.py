@@ -1,9 +1,9 @@
 """Encodes msgspec structs as CDR, the encoding of ROS 2, and decodes them.
 
-The codec is derived from the type of the struct. `incoming/commands.py` decodes velocity commands
-with it. It writes plain CDR (XCDR1), little endian, after the encapsulation header of 4 bytes. It
-reads both byte orders. Numbers are aligned relative to the byte after the header. Neighbouring
-numbers are packed by a single call, which is faster.
+The codec is derived from the type of the struct. `incoming/commands.py` uses it to decode velocity
+commands. The codec writes plain CDR (XCDR1), little endian, after the encapsulation header of 4
+bytes. It reads both byte orders. Numbers are aligned relative to the byte after the header. For
+speed, neighboring numbers are packed by a single call.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ class Cdr(Generic[T]):
     """Codec of one struct type. The constructor raises `TypeError` if CDR cannot represent it."""
 
     def __init__(self, cls: type[T]) -> None:
-        # The cache of `_compiled` needs hashable arguments. For mypy, a type variable is not one.
+        # The cache of `_compiled` needs hashable arguments. mypy does not know that `cls` is
+        # hashable.
         of_type: Any = cls
         self._parts, self._build = _compiled(of_type)
 
@@ -135,7 +136,10 @@ def _whole(code: str, value: Any) -> Any:
 
 @cache
 def _layout(order: str, codes: str, start: int) -> struct.Struct:
-    """Return the layout of numbers, each aligned to its size. `start` is the position modulo 8."""
+    """Return the layout of numbers that begin at the position `start` modulo 8.
+
+    Each number is aligned to its size.
+    """
     text, at = order, start
     for code in codes:
         pad = -at % SIZES[code]
@@ -154,7 +158,7 @@ _put_count = _packs("I")
 
 @lru_cache(256)
 def _text_bytes(text: str) -> bytes:
-    """Return a string as CDR with its length. It is cached, because a robot repeats few strings."""
+    """Return a string as CDR with its length. Cached: a robot sends few different strings."""
     raw = text.encode() + b"\0"
     return struct.pack("<I", len(raw)) + raw
 
@@ -168,7 +172,7 @@ Get = Callable[[Any], Any]
 
 
 class _Numbers:
-    """Part of a message: neighbouring numbers, which may belong to different nested structs."""
+    """Part of a message: neighboring numbers, which may belong to different nested structs."""
 
     def __init__(self, run: list[tuple[str, inspect.Type]]) -> None:
         self._codes = "".join(number_code(kind) for _, kind in run)
@@ -208,8 +212,10 @@ class _Text:
 
 
 class _List:
-    """Part of a message: a sequence of up to `most` items, or an array of `most` items if
-    `fixed`."""
+    """Part of a message: a sequence, or an array if `fixed` is true.
+
+    A sequence has up to `most` items, or any number if `most` is None. An array has `most` items.
+    """
 
     def __init__(self, get: Get, kind: inspect.Type, most: int | None, fixed: bool) -> None:
         self._get, self._most = get, most
@@ -273,7 +279,7 @@ _Part = _Numbers | _Text | _List
 
 @cache
 def _compiled(cls: Any) -> tuple[tuple[_Part, ...], Build]:
-    """Return the parts of a struct type in order, and a function that builds an instance."""
+    """Return a pair: the parts of a struct type in order, and the function that builds it."""
     info = struct_info(cls)
     parts: list[_Part] = []
     run: list[tuple[str, inspect.Type]] = []

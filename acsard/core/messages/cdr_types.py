@@ -1,8 +1,9 @@
 """Reads the type of a struct for `cdr.py`: its fields in order, and how to build an instance.
 
-A number declares its width with `Meta(extra={"cdr": code})`, where the code is one of the struct
-module (`B i I q Q`, and `f` for a float32). A `float` without a code is a float64. In a field of
-type `float | None`, None is encoded as NaN. A list whose `Meta` fixes its length is an array.
+A number declares its width with `Meta(extra={"cdr": code})`. The code is a format character of
+Python's module `struct`: one of `B i I q Q`, or `f` for a float32. A `float` without a code is a
+float64. In a field of type `float | None`, None is encoded as NaN. A list whose `Meta` fixes its
+length is an array.
 """
 
 from __future__ import annotations
@@ -13,11 +14,11 @@ from typing import Any
 from msgspec import inspect
 
 SIZES = {"d": 8, "f": 4, "q": 8, "Q": 8, "i": 4, "I": 4, "B": 1, "?": 1}
-"""Size and alignment of a number in CDR, in bytes, by its code in the struct module."""
+"""Size and alignment of a number in CDR, bytes, by its format character in Python's `struct`."""
 
 Build = Callable[[Iterator[object]], object]
-"""Function that builds a struct. Its argument yields the values of the struct's fields in order,
-with the fields of each nested struct in place of that struct."""
+"""Function that builds a struct. Its argument is an iterator over the values of the struct's fields
+in order. In place of a nested struct, the iterator yields the values of that struct's fields."""
 
 Limit = tuple[float, float]
 """Least and greatest value of a number."""
@@ -54,7 +55,7 @@ def plain(kind: inspect.Type) -> inspect.Type:
 
 
 def number_code(kind: inspect.Type) -> str:
-    """Return the code of a number in the struct module, or "" for any other type."""
+    """Return the format character of a number in Python's `struct`, or "" for any other type."""
     extra = kind.extra if isinstance(kind, inspect.Metadata) else None
     code = str((extra or {}).get("cdr", ""))
     match plain(kind):

@@ -1,4 +1,4 @@
-"""Describes how long the TLS certificates are valid, for `state`, `diagnostics` and `doctor`."""
+"""Says how long the TLS certificates stay valid, for `state`, `diagnostics` and `acsard doctor`."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from collections.abc import Mapping
 from acsard.core.values import NS_PER_S
 
 EXPIRY_DAYS = 30
-"""If a certificate expires in fewer days than this, its expiry is a warning."""
+"""If a certificate expires in fewer days than this, `state` and `diagnostics` show a warning."""
 
 DAY_NS = 86400 * NS_PER_S
 
 
 def expiry(ends: Mapping[str, int], now_ns: int) -> tuple[int, str]:
-    """Return the level (0 ok, 1 warning, 2 error) and a description of the validity.
+    """Return a pair: the level (0 ok, 1 warning, 2 error) and a text about the validity.
 
-    Only the description of level 0 begins with "valid". `ends` is the expiry time of each
-    certificate that TLS needs, by the name of its owner. The robot's own certificate has the name
-    "". The mapping is empty if no expiry time is known. Times are wall-clock ns since 1970.
+    The text begins with "valid" only at level 0. `ends` is the expiry time of each certificate that
+    TLS needs, by the name of its owner. The robot's own certificate has the name "". The mapping is
+    empty if no expiry time is known. Times are wall-clock ns since 1970.
     """
     if not ends:
         return (
@@ -38,7 +38,7 @@ def expiry(ends: Mapping[str, int], now_ns: int) -> tuple[int, str]:
 def first(ends: Mapping[str, int]) -> tuple[str, int]:
     """Return the owner and the expiry time of the certificate that expires first.
 
-    The TLS gateway reports the earliest expiry time of all certificates under the name "". If a
-    certificate with an owner's name has the same time, that name is returned.
+    The time under the name "" may be the earliest expiry of all certificates, which the TLS gateway
+    reports. If another name has the same time, the result has that name, because it is the owner.
     """
     return min(ends.items(), key=lambda one: (one[1], one[0] == ""))

@@ -1,9 +1,9 @@
 """Converts the covariances of planar odometry to the 6x6 matrices of ROS messages.
 
 A matrix is row major, and its axes are x, y, z, roll, pitch and yaw. Wheels do not measure z, roll
-and pitch. These axes get the configured variances, limited to a range that RViz can draw and a
-filter can invert. With `odometry.covariance = "constant"`, the matrices of pose and twist are the
-configured diagonals without this limit.
+and pitch. The variances of these three axes are those in the configuration, limited to a range that
+RViz can draw and a filter can invert. With `odometry.covariance = "constant"`, the matrices of pose
+and twist are the configured diagonals, without this limit.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ SMALLEST, LARGEST = 1e-6, 1e6
 rad2/s2 for a twist."""
 
 UNKNOWN = [LARGEST if cell % 7 == 0 else 0.0 for cell in range(36)]
-"""Covariance of a twist of which nothing is measured: 6x6, row major, m2/s2 and rad2/s2."""
+"""Covariance of a twist that is not measured at all: 6x6, row major, m2/s2 and rad2/s2."""
 
 
 class Covariances:

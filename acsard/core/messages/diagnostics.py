@@ -4,9 +4,10 @@
 - WARN: a person should know about a condition.
 - ERROR: a condition keeps the robot from driving.
 
-Each message has the same rows, because rqt_robot_monitor shows a missing row as stale. The rows of
-the board and of its battery appear when the board first reports a value for them. They stay until
-another board is connected that reports none.
+Each message has the same rows, because rqt_robot_monitor shows a missing row as stale. There are
+two exceptions. The row of the board's inputs and the row of its battery appear when the board first
+reports a value for them, or from the start if the configuration requires such values. They stay
+until another board is connected that does not report the values.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ from acsard.core.values import (
 OK, WARN, ERROR = 0, 1, 2
 
 OF_MODE = {"stopped": WARN, "fault": ERROR}
-"""Level of the modes in which the robot waits for a person to clear a latch. Other modes are OK."""
+"""Diagnostic level of the modes in which a person must clear a latch. Other modes are OK."""
 
 BOARD = {
     "": (OK, "no emergency-stop input"),
@@ -57,13 +58,13 @@ REFUSED_S = 2.0
 """Time for which `diagnostics` shows a refused command, s: two messages at the default 1 Hz."""
 
 MISSED_SHARE = 0.01
-"""Fraction of the control periods of the last minute that may be missed without a warning."""
+"""Fraction of the last minute's control periods that may be missed without a warning."""
 
 NO_ROUTER, NOT_YET = "a peer, not a router", "not connected yet"
 
 
 class Row(Struct, frozen=True):
-    """A row of `diagnostics`: one part of the robot, its level, and details as text by name."""
+    """A row of `diagnostics` about one part of the robot. `values` are details as text, by name."""
 
     name: str
     level: int
@@ -80,9 +81,9 @@ def diagnostics(
 ) -> DiagnosticArray:
     """Return the message with all rows.
 
-    `certificate` is the level and the description that `expiry` returns. Without TLS the
-    description is "", and the message has no row about the certificate. `speed_limit` is the speed
-    limit that lowers a setting, in words; "" if none does.
+    `certificate` is the pair of level and text that `expiry` returns. Without TLS the text is "",
+    and the message has no row about the certificate. `speed_limit` describes the speed limit that
+    lowers a setting; "" if no limit does.
     """
     mode = {"mode": outputs.mode, "source": outputs.source}
     rows = [
@@ -165,7 +166,7 @@ def _commands(outputs: Outputs, snapshot: Snapshot, speed_limit: str) -> Row:
 
 
 def _wheels(doubt: WheelsStatus, counters: dict[str, int]) -> Row:
-    """Return the row that says whether front and rear wheels agree and are as fast as commanded."""
+    """Return the row about wheels that are faulty, slip or turn slower than commanded."""
     left, right = doubt.differ
     values = {
         "left_out": ", ".join(doubt.left_out),

@@ -36,8 +36,11 @@ _text = msgspec.json.Encoder()
 
 
 class DecodeError(AcsardError):
-    """Error for a payload that cannot be decoded. `reason` is the last part of the name of the
-    counter that counts such errors."""
+    """Error for a payload that cannot be decoded.
+
+    `reason` is the kind of the error. It is also the end of the name of the counter for such
+    errors: the reason "malformed" is counted as `command_malformed`.
+    """
 
     def __init__(self, reason: str, text: str) -> None:
         super().__init__(text)
@@ -48,7 +51,7 @@ _AT_BYTE = re.compile(r"JSON is malformed: (.*) \(byte (\d+)\)")
 
 
 def encoding_name(form: Format, type_name: str = "") -> str:
-    """Return the Zenoh Encoding of a published payload, without a type if `type_name` is ""."""
+    """Return the Zenoh Encoding of a payload to send. It names a type unless `type_name` is ""."""
     return f"{_MIME[form]};acsard.{type_name}.v1" if type_name else _MIME[form]
 
 
@@ -99,7 +102,7 @@ class Decoder(Generic[T]):
         return self.decode_as(detect(encoding, payload), payload)
 
     def decode_as(self, form: Format, payload: bytes) -> T:
-        """Return the message in a payload of the given form, or raise `DecodeError`."""
+        """Return the message in a payload in the encoding `form`, or raise `DecodeError`."""
         if form == "cdr":
             return decode_cdr(self._cls, payload)
         try:

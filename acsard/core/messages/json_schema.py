@@ -2,8 +2,8 @@
 
 A message that the daemon publishes has all its fields, and a later version may add more. Its schema
 therefore requires all fields and allows others. A message that the daemon receives may omit fields
-with a default, and unknown fields are refused. A type that is used in both directions has two
-schemas: `Imu` for publishing, and `ImuIn` for receiving.
+with a default, but must not have unknown fields. A type that is used in both directions has two
+schemas, for example `Imu` for messages of the daemon and `ImuIn` for messages to the daemon.
 """
 
 from __future__ import annotations
@@ -38,7 +38,8 @@ ENOUGH: dict[type, list[str]] = {
     Imu: ["angular_velocity"],
     SpeedLimit: ["speed_limit"],
 }
-"""Required fields of some received types. Other types require each field without a default."""
+"""Required fields of some received types. In all other types, each field without a default is
+required."""
 
 Schema = dict[str, Any]
 

@@ -1,8 +1,8 @@
 """The table of all keys below `acsard/<id>/`: direction, type, rate, meaning and required roles.
 
-A key that is not in the table does not exist. The bus declares its keys from this table, `acsard
-topics` and the README list it, and the query `topics` answers with it. `permissions.py` derives the
-permissions of the roles from it.
+A key that is not in the table does not exist. The bus declares its keys from this table. `acsard
+topics`, the README and the answer to the query `topics` show the table. `permissions.py` derives
+the permissions of the roles from it.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ _PLACE = re.compile("<[A-Za-z]+>")
 Direction = Literal["out", "in", "query", "service"]
 """Direction of a key.
 
-- out: the daemon publishes on it.
-- in: clients put on it.
-- query: the daemon answers queries for it, also queries with a wildcard.
-- service: a query for it calls a service. The query must name the exact key.
+- out: the daemon publishes on the key.
+- in: clients put messages on the key.
+- query: the daemon answers queries for the key, including queries with a wildcard.
+- service: a query for exactly this key calls a service.
 """
 
 
@@ -37,7 +37,7 @@ class Topic(Struct, frozen=True):
     """The key below the robot's id, with placeholders such as `<source>`."""
     direction: Direction
     type: str
-    """Type of the message, in words if it is not a type of `MESSAGES`."""
+    """Type of the message: its name in `MESSAGES`, or a description if it has no such name."""
     rate: str
     """How often the daemon publishes or accepts a message, in words; "" for a query."""
     note: str
@@ -46,12 +46,12 @@ class Topic(Struct, frozen=True):
     subscribe: Role | None = None
     """Lowest role that may subscribe to the key. None means that no client may subscribe."""
     query: Role | Literal["<role>"] | None = None
-    """Lowest role that may query the key. `<role>` means the role that the key ends with. None
-    means that no client may query it."""
+    """Lowest role that may query the key. `<role>` means the role at the end of the queried key.
+    None means that no client may query it."""
     local: bool = False
     """True for a key that only programs on the robot's own machine may use."""
     latched: bool = False
-    """True for a key whose last message a new subscriber receives at once."""
+    """True for a key whose last message each new subscriber receives immediately."""
     simulated: bool = False
     """True for a key that exists only with the built-in simulator."""
     gyro: bool = False
@@ -123,7 +123,7 @@ PLAIN_SERVICES = tuple(
 """The services that can be called without a payload."""
 
 IMU = "imu"
-"""Key on which a gyro's samples arrive. The simulator publishes those of its own gyro on it."""
+"""Key on which a gyro's samples arrive, also the samples of the simulated gyro."""
 
 SPEED_LIMIT = "speed_limit"
 """Key on which a client, such as Nav2's speed filter, lowers the robot's highest speed."""
@@ -132,8 +132,8 @@ DESCRIPTION = "robot_description"
 
 WHOAMI = "whoami/<role>"
 """Pattern of the keys with which a client finds out its role. There is one key for each role.
-Zenoh's access rules let a client query only the keys of its own role and of lower roles. So an
-answer on a key proves that the client has at least this role."""
+Zenoh's access rules let a client query only the keys of its own role and of lower roles. So a
+client that gets an answer on a key has at least the role of that key."""
 
 
 def whoami_key(role: str) -> str:
@@ -266,13 +266,16 @@ def offered(config: Config) -> tuple[Topic, ...]:
 
 
 def published(config: Config) -> tuple[Topic, ...]:
-    """Return the rows of the keys on which this daemon publishes, the simulator's gyro included."""
+    """Return the rows of the keys on which this daemon publishes.
+
+    With the built-in simulator, they include the key of the simulated gyro.
+    """
     own = config.mcu.simulated
     return tuple(t for t in offered(config) if t in PUBLISHED or (own and t.key == IMU))
 
 
 def full_key(robot_id: str, key: str) -> str:
-    """Return the key on the bus for a key below a robot's id."""
+    """Return the key on the bus, such as `acsard/acsar/state` for the key `state`."""
     return f"{ROOT}/{robot_id}/{key}"
 
 
@@ -296,7 +299,7 @@ def source_keys(sources: Iterable[str], certificate: str = "") -> list[str]:
 
 
 def unknown(key: str) -> bool:
-    """Return whether no row of the table of keys matches a key.
+    """Return True if no row of the table of keys matches `key`.
 
     Keys below `json/` and all keys of commands always count as known.
     """

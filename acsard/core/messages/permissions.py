@@ -59,9 +59,9 @@ def _exact(row: Topic, use: Use) -> Iterator[tuple[str, Role]]:
 def least_role(key: str) -> Role:
     """Return the lowest role that may use `key`, the part of the full key after the robot's id.
 
-    To use a key means to put on it if clients may do that, else to query it, else to subscribe to
-    it. For an unknown key, the result is the lowest role of all. It is only a hint, so a caller
-    that grants permissions must not ask for an unknown key.
+    To use a key means to put on it if any client may do that, else to query it, else to subscribe
+    to it. For an unknown key, the result is the lowest role of all, which is only a hint. So do not
+    call this function with an unknown key to decide about permissions.
     """
     row = row_of(key.removeprefix(JSON_TREE))
     if row is None:

@@ -1,8 +1,9 @@
 """Keeps the last events for the topic `events`.
 
-Events that repeat are one row with a count. If each repetition had its own row, a computer that
-misses a control period every second would push a fault out of the twenty rows within 20 s. An event
-whose `news` is true always gets its own row. The log has a line for each event.
+An event and its repetitions share one row with a count. If each repetition had its own row, a
+computer that misses a control period every second would push a fault out of the twenty rows within
+20 s. An event whose `news` is true always gets its own row. The rows do not affect the lines in the
+log, which `event_throttle.py` limits.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ LAST = 20
 """Number of rows that are kept, so that a client that polls slowly seldom misses an event."""
 
 PAUSE_NS = 60 * NS_PER_S
-"""Time after which an event of the same name gets a new row and is not a repetition, ns."""
+"""An event counts as a repetition only if the last event of the same name is at most this old, ns.
+Otherwise it gets a new row."""
 
 
 class _Row(Struct, frozen=True):

@@ -81,7 +81,7 @@ class _Rate:
 
 
 class Report:
-    """Builder of messages. It keeps only the last outputs, estimate and events."""
+    """Builds messages. It keeps only the last outputs, the last estimate and the last events."""
 
     def __init__(
         self, config: Config, start: Instant, certificate_ends: Mapping[str, int] | None = None
@@ -91,7 +91,8 @@ class Report:
         robot's own certificate has the name "". If the daemon may not read the robot's own
         certificate, the TLS gateway reports its expiry."""
         self.settings_differ = ""
-        """Settings in force that differ from the configuration file, in words; "" if none does."""
+        """Settings in force that differ from the configuration file, in words; "" if none
+        differs."""
         self.speed_limit = ""
         """The speed limit that lowers a setting, in words; "" if none does."""
         self.description = ""
@@ -211,7 +212,7 @@ class Report:
         return String(self.description) if self.description else None
 
     def _odom(self, estimate: Estimate, live: bool = True) -> Odometry:
-        """Return the odometry. Unless `live`, the twist is zero and its covariance `UNKNOWN`."""
+        """Return the odometry. If `live` is false, the twist is zero with covariance `UNKNOWN`."""
         frames, pose = self._config.odometry, estimate.pose
         of_pose = self._covariances.of_pose(estimate.covariance)
         of_twist = self._covariances.of_twist(estimate.twist_variances) if live else UNKNOWN

@@ -1,8 +1,8 @@
 """The types of the messages on the bus, with the unit of each field.
 
 A type has the name and the fields of its ROS 2 counterpart if there is one. A field means the same
-in msgpack, JSON and CDR. Unknown fields are refused, so a command with a misspelt axis is an error.
-If the field were ignored, the command would mean zero speed.
+in msgpack, JSON and CDR. Unknown fields are refused, so a command with a misspelled axis is an
+error. If such a field were ignored, the speed on that axis would be zero without an error.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ LatchNumber = Annotated[int, Meta(ge=0, lt=1 << 53)]
 """Number of a latch. It is below 2^53, so JavaScript represents it exactly."""
 
 FEW = Meta(max_length=64)
-"""Limit of 64 items for a list or a map, so that a huge one is refused quickly. No robot has as
-many joints."""
+"""Limit of 64 items for a list or a map, so that a huge message is refused quickly. No robot has
+more than 64 joints."""
 
 
 def one_of(values: Iterable[object]) -> Meta:
@@ -80,7 +80,7 @@ class Header(Message, frozen=True):
 
 
 class Vector3(Message, frozen=True):
-    """Three components in the unit of the field that holds them."""
+    """A vector. The field that contains it defines the unit."""
 
     x: float = 0.0
     y: float = 0.0
@@ -111,7 +111,7 @@ class TwistStamped(Message, frozen=True):
 
 
 class Pose(Message, frozen=True):
-    """Pose: `position` in m, and `orientation`."""
+    """A pose: `position` in m, and `orientation` as a rotation."""
 
     position: Vector3
     orientation: Quaternion
@@ -125,14 +125,14 @@ class PoseStamped(Message, frozen=True):
 
 
 class PoseWithCovariance(Message, frozen=True):
-    """A pose with its 6x6 covariance, row major, (x, y, z, roll, pitch, yaw), m and rad."""
+    """A pose and its 6x6 covariance: row major; x, y, z in m; roll, pitch, yaw in rad."""
 
     pose: Pose
     covariance: Covariance
 
 
 class TwistWithCovariance(Message, frozen=True):
-    """A twist with its 6x6 covariance, row major, m/s and rad/s."""
+    """A twist and its 6x6 covariance: row major; linear x, y, z in m/s; angular ones in rad/s."""
 
     twist: Twist
     covariance: Covariance
@@ -184,7 +184,7 @@ class JointState(Message, frozen=True):
 class Imu(Message, frozen=True):
     """An inertial measurement in `header.frame_id`: rad/s and m/s2, each with its 3x3 covariance.
 
-    A covariance whose first element is -1 marks a quantity that is not measured.
+    If the first element of a covariance is -1, the quantity is not measured.
     """
 
     header: Header
@@ -197,7 +197,7 @@ class Imu(Message, frozen=True):
 
 
 class SpeedLimit(Message, frozen=True):
-    """A limit that lowers the robot's highest speed, as nav2_msgs/SpeedLimit; 0.0 lifts it."""
+    """A limit on the robot's speed, as in nav2_msgs/SpeedLimit. 0.0 lifts the limit."""
 
     header: Header
     percentage: bool
@@ -227,7 +227,10 @@ class Battery(Message, frozen=True):
     percentage: Float32 | None = None
     """State of charge, 0 to 1."""
     power_supply_status: Annotated[Byte, one_of(range(5))] = 0
-    """0 unknown, 1 charging, 2 discharging, 3 not charging, 4 full, as derived from `current`."""
+    """0 unknown, 1 charging, 2 discharging, 3 not charging, 4 full.
+
+    The daemon derives the value from the sign of `current`, so it never sends 4.
+    """
     power_supply_health: Annotated[Byte, one_of(range(9))] = 0
     """Always 0, unknown."""
     power_supply_technology: Annotated[Byte, one_of(range(9))] = 0
@@ -243,7 +246,7 @@ class Battery(Message, frozen=True):
 
 
 class BatterySummary(Message, frozen=True):
-    """The battery in short. A value that the board does not report now is null."""
+    """A summary of the battery. A value that the board does not report now is null."""
 
     volts: float | None
     percent: float | None
@@ -253,8 +256,8 @@ class BatterySummary(Message, frozen=True):
     level: Annotated[str, one_of(get_args(BatteryLevel))]
     """Level according to the thresholds in `[battery]`; `ok` if none is set.
 
-    `unknown` means that the board no longer reports the battery, or does not report the quantity (V
-    or %) that the thresholds use.
+    `unknown` means that the board does not report the quantity (V or %) that the thresholds use, or
+    has reported it only for a few seconds so far.
     """
 
 
@@ -264,7 +267,11 @@ class SourceState(Message, frozen=True):
     name: str
     priority: int
     age: float | None
-    """Seconds since the last accepted command of the source; null before the first one."""
+    """Seconds since the last accepted command of the source.
+
+    It is null if no command was accepted since each sender was last required to send a zero, for
+    example since the start or a `clear`.
+    """
     waits_for: str
     """The condition that the source waits for before it drives, in words; empty if it drives."""
 
@@ -288,7 +295,7 @@ class Latency(Message, frozen=True):
 class RobotState(Message, frozen=True):
     """Summary of the robot: mode and reason, pose (m, rad), twist (m/s, rad/s), wheels (rad/s).
 
-    Without feedback the speeds are unknown: `linear` and `angular` are null, `wheels` is empty.
+    Without feedback the speeds are unknown: `linear` and `angular` are null, and `wheels` is empty.
     """
 
     stamp: Time
@@ -311,7 +318,7 @@ class RobotState(Message, frozen=True):
     certificate_expiry: str = ""
     """Remaining validity of the bus's TLS certificate, in words; empty without TLS.
 
-    The text begins with "valid" as long as at least 30 days of validity remain.
+    The text begins with "valid" while at least 30 days remain.
     """
     latencies: dict[str, Latency] = {}
     """Latencies of the daemon by name (`daemon/latencies.py`). They are up to one second old."""
@@ -320,15 +327,16 @@ class RobotState(Message, frozen=True):
     encoder_counts: list[int] = []
     """Configured encoder counts per wheel turn, in the order of `wheels`.
 
-    0 means that the counts are not configured, or that the reported speeds are not whole counts.
+    0 means that the counts are not configured, or that the board does not compute the reported
+    speeds from whole counts.
     """
     wheel_fault: str = ""
     """The wheel that the odometry leaves out, or the side that slips, in words; else empty."""
     sender: str = ""
     """Public name of the selected sender of `source`; empty while no sender is selected.
 
-    The selected sender may still have to send a zero before it drives. It is also given while a
-    latch keeps the robot from driving.
+    A selected sender does not always drive. It may still have to send a zero first, or a latch may
+    keep the robot from driving.
     """
     effective_track: str = ""
     """Effective track divided by the wheel separation, in words.
@@ -346,7 +354,8 @@ class RobotState(Message, frozen=True):
     latch_file_error: str = ""
     """Reason why a stop would not survive a restart, in words.
 
-    It is empty if a stop would survive, and with the built-in simulator.
+    The text is empty if a stop would survive. It is also empty if the daemon keeps no latch file,
+    as with the built-in simulator.
     """
     feedback_age: float | None = None
     """Seconds since the last valid feedback line; null before the first one."""
@@ -358,16 +367,16 @@ class RobotState(Message, frozen=True):
     bumpers: list[bool] | None = None
     """Whether each bumper counts as pressed, in the order of the board, 1 to 4 values.
 
-    Null if the board has never reported its bumpers. If it no longer reports them, each value is
-    true.
+    Null if the board has never reported its bumpers. While it no longer reports them, each value is
+    true, because the bumpers then count as pressed.
     """
     battery: BatterySummary | None = None
     """The battery; null if the board has never reported its voltage or its charge."""
     settings_differ: str = ""
     """Settings in force that differ from the daemon's configuration file, in words; else empty.
 
-    If the daemon could not start again with that file, the text gives the reason. A setting that a
-    speed limit lowers is not listed.
+    If the daemon could not start again with that file, the text gives the reason. A speed limit
+    lowers a setting only for a time, so such a difference is not listed.
     """
     speed_limit: str = ""
     """The speed limit that lowers `limits.linear_speed` at present, with its sender, in words.
@@ -392,7 +401,10 @@ class GatewayState(Message, frozen=True):
     connections: Annotated[int, Meta(ge=0, lt=1 << 16)]
     """Number of connections from the network at present."""
     full: Annotated[int, Meta(ge=0, lt=1 << 31)]
-    """Number of checks that found all connections in use. There are four checks a second."""
+    """Number of checks since the gateway's start that found all connections in use.
+
+    The gateway checks four times a second.
+    """
     certificate_ends: Annotated[int, Meta(ge=0, lt=1 << 62)] = 0
     """Time at which the first of the TLS certificates expires, wall-clock ns since 1970; 0 if the
     library to read certificates is missing."""
@@ -440,15 +452,15 @@ class LogEvent(Message, frozen=True):
     count: int
     """Number of occurrences that this row stands for.
 
-    Repetitions with pauses of less than a minute are counted in the same row.
+    An event that repeats within a minute is counted in the same row.
     """
 
 
 class Events(Message, frozen=True):
     """The last events, oldest first.
 
-    An event that repeats is one row, with the time of its last repetition. When it repeats, its row
-    moves to the end.
+    An event and its repetitions share one row, which has the time of the last repetition. Each
+    repetition moves the row to the end.
     """
 
     stamp: Time
@@ -456,7 +468,7 @@ class Events(Message, frozen=True):
     total: int
     """Number of events since the start, with each repetition counted.
 
-    If `total` has grown by N since the last message, new events are among the last N rows.
+    If `total` has grown by N since the last message, all new events are among the last N rows.
     """
     events: list[LogEvent]
 
@@ -480,8 +492,11 @@ class Release(Message, frozen=True):
     """Payload of the services `clear` and `activate`."""
 
     latch: LatchNumber | None = None
-    """Number of the latch to release, as in `RobotState.latch`. If it is null, the call is refused
-    for 2 s after the latch."""
+    """Number of the latch to release, as in `RobotState.latch`.
+
+    If it is null, the call is refused for 2 s after a stop, after a `deactivate` and after the
+    start of the daemon, because the client may not know of the latch yet.
+    """
 
 
 class Settings(Message, frozen=True):
@@ -576,4 +591,4 @@ MESSAGES: dict[str, type[Message]] = {
     )
 }
 """The types of complete messages, by name, without the types that are only parts of a message. A
-query of the key `schema/<Type>` returns the schema of each."""
+query of the key `schema/<Type>` returns the JSON Schema of a type."""

@@ -21,7 +21,7 @@ from acsard.core.messages.state_warnings import brief, charge, warnings
 
 
 def place(x: float, y: float, yaw: float) -> list[str]:
-    """Return a pose as text with units. `yaw` is in rad, and in degrees in the text."""
+    """Return a pose as text with units. The argument `yaw` is in rad, the text is in degrees."""
     return [
         f"x {signed(x, 3, 8)} m",
         f"y {signed(y, 3, 8)} m",

@@ -27,8 +27,8 @@ MAX_NAME = 40
 """Largest number of characters that a public name takes from NAME in a sender id `NAME/SECRET`."""
 
 DIGITS = 16
-"""Number of hexadecimal digits of the hash in a public name. They are 64 bits, so nobody can find
-another sender id with the hash of a given one."""
+"""Number of hexadecimal digits of the hash in a public name. 16 digits encode 64 bits, so nobody
+can find a second sender id with the same hash."""
 
 MARKS = " @._-:/+"
 """Characters besides letters and digits that a public name may contain. All others become "?".
@@ -80,8 +80,8 @@ def public_name(sender: str, certificate: str = "") -> str:
     that do not exist are left out.
 
     Args:
-        sender: the sender id. If the message has none, it is the id of the Zenoh session that set
-            the timestamp of the message.
+        sender: the sender id. If the message has no sender id, pass the id of the Zenoh session
+            that set the timestamp of the message.
         certificate: the common name of the sender's TLS certificate, or "".
     """
     digits = sha256(sender.encode("utf-8", "surrogatepass")).hexdigest()[:DIGITS]

@@ -1,8 +1,8 @@
 """Lists the warnings about a robot, such as a low battery.
 
-A robot in the mode `ready` may have warnings, too. `acsard fleet`, `acsard top`, `acsard echo
---short`, `/metrics` and the web page show the warnings in the words of this module. Programs find
-the facts behind the warnings in the message `state`.
+Even a robot in the mode `ready` may have warnings. `acsard fleet`, `acsard top`, `acsard echo
+--short`, `/metrics` and the web page show the warnings in the words of this module. Programs can
+read the same facts from the fields of the message `state`.
 """
 
 from __future__ import annotations
