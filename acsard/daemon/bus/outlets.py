@@ -119,7 +119,7 @@ class Outlets:
         return self._began_ns is not None or self._stuck or self._dropped > 0
 
     def losses(self, now_ns: int) -> tuple[int, bool]:
-        """Return the number of dropped messages, and whether the bus has begun to block.
+        """Return a pair: the number of dropped messages, and whether the bus has begun to block.
 
         Both values cover the time since the last call. `now_ns` is the monotonic time.
         """
@@ -176,8 +176,9 @@ class Outlets:
         Args:
             encoding: Zenoh's name of the encoding.
             latched: whether the publisher keeps its last sample for late subscribers.
-            gid: identity of a ROS publisher. With it, the samples carry an attachment of rmw_zenoh.
-            signed: attachment of the samples if there is no `gid`.
+            gid: identity of a ROS publisher; b"" for any other publisher. The samples of a ROS
+                publisher carry an attachment of rmw_zenoh.
+            signed: attachment of the samples if `gid` is b"".
         """
         if latched:
             publisher: Any = zenoh.ext.declare_advanced_publisher(
