@@ -44,7 +44,7 @@ s."""
 
 JOBS = 32
 """Largest number of `set` requests with `keep` that wait for their reply. Further requests are
-refused at once."""
+refused immediately."""
 
 Signature = tuple[int, int, int]
 """Inode, size in bytes and modification time in ns of a file."""
@@ -121,9 +121,9 @@ class SettingsFile:
             self.differ = f"the daemon cannot compare its settings with its file ({error})"
 
     def use(self, config: Config) -> None:
-        """Compare the file with `config`, and again whenever the file changes.
+        """Compare the file with `config` from now on, also after later changes of the file.
 
-        `config` has the settings in force, but not the limit that clients set by the Zenoh key
+        `config` has the settings in force, except the limit that clients set by the Zenoh key
         `speed_limit`.
         """
         self._in_force = config
@@ -200,15 +200,15 @@ class SettingsFile:
 
     @property
     def limits(self) -> LimitsConfig:
-        """The limits at the daemon's start, updated with those written to the file since then."""
+        """The limits at the daemon's start, with the values written to the file since then."""
         return self._limits
 
     def latches(self, latches: Latches, now: LimitsConfig) -> Latches:
         """Return the robot's latches as they must be stored for the next start of the daemon.
 
         The next start reads the limits from the configuration file. So if the daemon has written
-        limits to the file, `lowered` in the result has those limits that are lower in `now` than in
-        the file. `now` has the limits in force, but not the limit that clients set by the Zenoh key
+        limits to the file, `lowered` in the result has the limits that are lower in `now` than in
+        the file. `now` has the limits in force, except the limit that clients set by the Zenoh key
         `speed_limit`.
         """
         file = self._limits
@@ -259,7 +259,9 @@ class SettingsFile:
         try:
             keep(edit)
         except MendableError as error:
-            return Answer(answer.id, False, f"{told}, but only until the next start: {error}")
+            return Answer(
+                answer.id, False, f"{told}, but only until the daemon's next start, because {error}"
+            )
         limits = {
             key.removeprefix(TABLE): float(value)  # type: ignore[arg-type]
             for key, value in edit.keys.items()
@@ -304,5 +306,5 @@ def _overdue(pending: _Pending) -> Answer:
     answer = pending.answer
     text = f"nothing is set: {why}"
     if answer is not None:
-        text = f"{answer.message}; {why}: look whether the file has the new value"
+        text = f"{answer.message}, but {why}: check whether the file has the new value"
     return Answer(pending.request.id, False, text)

@@ -1,8 +1,8 @@
 """Installs acsard as a system service, or removes it.
 
-The files come from `deploy/`, with the path of this installation in the units. Without
-`force` or `purge`, the module neither replaces nor removes a file that another person or program
-has changed. The user can read the text of every step before the steps are carried out.
+The files come from `deploy/`, with the path of this installation in the units. Without `force` or
+`purge`, the module neither replaces nor removes a file that another person or program has changed.
+The user can read the text of every step before the steps are carried out.
 """
 
 from __future__ import annotations
