@@ -388,7 +388,7 @@ class ControlLoop:
             self._others.append(BUS_STUCK)
 
     def _served(self, query: Query, now: Instant, refusals: list[Refusal]) -> Request | None:
-        """Answer a query and return None, or return its request for the robot to decide.
+        """Answer a query and return None, or return the request about which the robot decides.
 
         A `set` with `keep` goes to the settings file first. A refusal is added to `refusals`.
         """

@@ -2,9 +2,9 @@
 
 The daemon enters the contexts of the simulator, the bus, the port and the control loop, in this
 order. The shutdown leaves these contexts in reverse order: the robot ramps to zero, the port writes
-STOP and closes, and the bus closes. The first signal begins the shutdown, and a second one cuts the
-ramp short. After an exception in any task, the daemon leaves the contexts in the same order, but
-without the ramp.
+STOP and closes, and the bus closes. The first signal begins the shutdown, and a second signal cuts
+the ramp short. After an exception in any task, the daemon also leaves the contexts in reverse
+order, but without the ramp.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ EXIT_RAMP_S = 0.6
 
 
 class Departure:
-    """The shutdown. The first signal begins it, and a second signal cuts its ramp short."""
+    """The shutdown. The first signal begins a ramp to zero, and the second cuts the ramp short."""
 
     def __init__(self, log: Log, wake: Callable[[], None], manager: Systemd) -> None:
         self._log, self._wake, self._manager = log, wake, manager

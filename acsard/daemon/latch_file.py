@@ -248,7 +248,7 @@ class LatchFile:
         self._box.put(latches)
 
     def holds(self, latches: Latches) -> bool:
-        """Return whether the file contains these latches, so that they survive a kill."""
+        """Return whether the file has these latches, so that they survive a kill of the process."""
         return self._held is latches
 
     def wait(self, latches: Latches, seconds: float) -> None:

@@ -1,9 +1,9 @@
 """Detects late control periods, and reports the cause if the kernel's counters show a cause.
 
 In each period the control loop reads only one small file, `schedstat`, with the processor times of
-its thread. The kernel's other files take longer to read, so a thread of this module reads them. It
-does so four times a second, and once more after a late period. `late_causes.py` compares the
-reading from before the lateness with the one from after the lateness.
+its thread. The kernel's other files take longer to read, so a thread of this module reads these
+files four times a second, and once more after a late period. `late_causes.py` compares the reading
+from before the lateness with the reading from after the lateness.
 
 The event of this module has the name `missed_periods`, like an event of the robot. The robot's
 event comes first and states the number of missed periods. The cause is known only later.
@@ -73,7 +73,7 @@ class Late(Struct, frozen=True):
     """Monotonic time of the step of the late period, ns."""
     late_ns: int
     before: bytes
-    """Content of `OWN_TIMES` in the period before the late one; b"" if it is unknown."""
+    """Content of `OWN_TIMES` in the period before the late period; b"" if it is unknown."""
     after: bytes
     """Content of `OWN_TIMES` in the late period; b"" if it is unknown."""
 

@@ -87,7 +87,8 @@ class SettingsFile:
 
         Args:
             file: the file that the daemon has read, or None for the built-in defaults.
-            parse: returns the configuration of a daemon that starts with the given file content.
+            parse: function that returns the configuration of a daemon that starts with the given
+                content of the file.
             started: the configuration with which the daemon has started.
         """
         self.differ = ""

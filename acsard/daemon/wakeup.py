@@ -82,7 +82,10 @@ class Ticker(_Timer):
         self._timer.set(self._due_ns)
 
     def take(self, now_ns: int) -> Period:
-        """Return the periods that have ended by monotonic `now_ns` since the last call."""
+        """Return how many periods have ended since the last call, and when the first was due.
+
+        `now_ns` is the present monotonic time.
+        """
         if not self._rang and now_ns < self._due_ns:
             return NO_PERIOD
         # `now_ns` is from the daemon's clock. NTP may slew the timer's clock, and the timer then

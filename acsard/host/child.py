@@ -3,9 +3,9 @@
 Each child gets a session of its own, so that a Ctrl-C at the terminal reaches only the parent,
 which then ends its children. A child does not outlive its parent.
 
-The parent uses `Child`, and the child uses `Parent`. A socket connects the two processes, and it is
-the child's standard input. The child writes signs of life to the socket, and ends when the parent
-closes the socket. The parent kills a child that falls silent.
+The parent uses `Child`, and the child uses `Parent`. A socket connects the two processes. The child
+uses it as its standard input, writes signs of life to it, and ends when the parent closes it. The
+parent kills a child that falls silent.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""Reads the clocks of this computer, and detects that it was suspended.
+"""Reads the clocks of this computer, and detects that this computer was suspended.
 
 In the daemon, no other module reads a clock. The monotonic clock is CLOCK_MONOTONIC_RAW, because
 NTP makes CLOCK_MONOTONIC up to 8 % faster or slower. With CLOCK_MONOTONIC, distances and delays
 would be wrong by the same percentage.
 
-The times in an `Instant` are whole microseconds. More precision would be useless, because reading
-the clocks takes about 1 us, and it would make a recording twice as large.
+The times in an `Instant` are whole microseconds. More precision would make a recording twice as
+large. It would also be useless, because reading the clocks takes about 1 us.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Reads the kernel's counters that can explain why a program was late.
 
 A value is 0 if this computer does not have the value's file, or if this user may not read the file.
-Reading can take a few milliseconds, so the control loop never does it.
+A reading can take a few milliseconds, so the control loop never reads the counters.
 """
 
 from __future__ import annotations

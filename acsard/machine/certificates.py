@@ -52,7 +52,7 @@ def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -
         raise MendableError(
             f"{directory / CA} exists: `acsard tls add` makes one more certificate with it; "
             "--force makes a new authority, and then the daemon refuses all certificates of the "
-            "old one",
+            "old authority",
         )
     maker = _maker()
     _writable(directory)

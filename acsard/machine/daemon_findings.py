@@ -61,15 +61,15 @@ WAYS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = (
     (
         lambda key: key in OPTIONS,
         "ok",
-        "they come from the options of `acsard run` or from another file, or the file has changed "
-        "since the daemon started",
+        "these values come from the options of `acsard run` or from another file, or the file has "
+        "changed since the daemon started",
         "to keep {which} after a restart, write these lines into the file: {lines}",
     ),
     (
         lambda key: key not in OPTIONS and live(key) is None,
         "warning",
-        "they come from another file or from the daemon's environment, or the file has changed "
-        "since the daemon started",
+        "these values come from another file or from the daemon's environment, or the file has "
+        "changed since the daemon started",
         "if the daemon runs with another file, name that file with --config; otherwise either "
         "write the daemon's values into this file, or restart the daemon with this file. The "
         "findings below are about the running daemon",
@@ -77,8 +77,8 @@ WAYS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = (
     (
         lambda key: live(key) is not None,
         "warning",
-        "they were set while the daemon ran, or come from another file, or the file has changed "
-        "since the daemon started",
+        "these values were set while the daemon ran, or come from another file, or the file has "
+        "changed since the daemon started",
         "when the daemon starts again, it uses the file's values; `acsard set KEY VALUE --write` "
         "writes a value into the file",
     ),

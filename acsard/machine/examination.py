@@ -56,7 +56,7 @@ def meddlers() -> Iterator[Finding]:
 
 
 def clock_set() -> Iterator[Finding]:
-    """Yield a finding that says whether the wall clock, which dates all messages, is set."""
+    """Yield a finding that says whether the wall clock is set. This clock dates all messages."""
     year = time.gmtime(clock.now().wall_ns / NS_PER_S).tm_year
     if year < 2026:  # a computer without a battery for its clock starts with an old date
         mend = (
@@ -93,7 +93,9 @@ def scheduling(wanted: bool, pid: int | None) -> Iterator[Finding]:
     elif real_time.allowed():
         yield Finding("real time", "ok", "this user may use real-time scheduling")
     else:
-        yield Finding("real time", "warning", "this user may not use real-time scheduling", REAL)
+        yield Finding(
+            "real time", "warning", "this user has no permission for real-time scheduling", REAL
+        )
 
 
 LOOK_S = 0.3
@@ -155,7 +157,7 @@ def serial_port(config: Config) -> Iterator[Finding]:
 
 
 def _hardware(name: str) -> Iterator[Finding]:
-    """Yield warnings about an unknown board, and about a USB chip that delays bytes."""
+    """Yield a warning if the board is unknown, and one if its USB chip delays bytes."""
     usb = [port for port in serial_devices() if port.device == f"/dev/{name}"]
     if usb and usb[0].usb_id and not usb[0].board:
         known = ", ".join(sorted(BOARDS))

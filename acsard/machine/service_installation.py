@@ -60,8 +60,8 @@ def misplaced(
         closed = _closed(path)
         if closed:
             return (
-                f"the service's user may not enter {closed}, but needs {path}; run `chmod o+rx "
-                f"{closed}`, or {_anew(prefix)}"
+                f"the service's user has no permission to enter {closed}, but needs {path}; run "
+                f"`chmod o+rx {closed}`, or {_anew(prefix)}"
             )
     return ""
 
@@ -110,8 +110,7 @@ def _closed(path: Path) -> Path | None:
 
 
 OURS = ("bin", "acsard", "acsard.service.d", "acsard-gateway.service.d", "acsard-web.service.d")
-"""Names of the directories that the removal of the service also removes if they have become
-empty."""
+"""Names of the directories that the removal of the service also removes, if they are then empty."""
 
 
 class File(Struct, frozen=True):
@@ -136,7 +135,8 @@ class File(Struct, frozen=True):
     def is_as_written(self) -> bool:
         """Return whether the existing file has the mode of the installation, and root owns it.
 
-        Return True for a `kept` file and for a symbolic link: the user decides about these.
+        Also return True for a `kept` file and for a symbolic link, because the user decides about
+        such a file.
         """
         status = self.path.lstat()
         if self.kept or stat.S_ISLNK(status.st_mode):

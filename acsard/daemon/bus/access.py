@@ -2,9 +2,9 @@
 
 Zenoh denies every message that no rule allows.
 
-- Zenoh checks the rules where a client's link ends: in the daemon's session or, over TLS, in that
-  of the TLS gateway. This session knows only the neighbor on the link, so a client that connects
-  through a router has the permissions of the router.
+- Zenoh checks the rules in the session at the end of a client's link. That is the daemon's session
+  or, over TLS, the session of the TLS gateway. This session knows only the neighbor on the link, so
+  a client that connects through a router has the permissions of the router.
 - A rule allows a message only if one of the rule's key expressions includes the whole key
   expression of the message. A query with a wildcard therefore needs a rule with a wildcard.
 - A client over TLS may use exact keys only, unless `access.wildcards` is set. A few wildcards can
@@ -163,8 +163,8 @@ class _Keys:
     def commands_by(self, certificate: str) -> list[str]:
         """Return the command keys of all sources for the certificate with this common name.
 
-        For the name "*", the key expressions include the keys of all certificates. A router needs
-        them, because it forwards the commands of every client.
+        For the name "*", the result is key expressions that include the keys of all certificates. A
+        router needs these key expressions, because it forwards the commands of every client.
         """
         return [full_key(self._robot, key) for key in source_keys(self._sources, certificate)]
 

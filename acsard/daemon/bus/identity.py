@@ -30,7 +30,7 @@ Ask = Callable[[str, Callable[[zenoh.Sample], object]], None]
 
 
 class Identity(Struct, frozen=True):
-    """The role, the certificate and the name that a client has for the daemon."""
+    """The identity of a client at a robot: its role, its certificate and its name."""
 
     role: Role | Literal[""]
     """The role of the client; "" if no key answered."""

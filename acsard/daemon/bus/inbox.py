@@ -4,8 +4,8 @@ Zenoh's threads fill the buffers, and every buffer is bounded. A callback in thi
 its input. It never calls back into Zenoh: even a refusal is queued for `Replies`.
 
 `Replies` sends the replies in a separate thread, because a client that hangs would block the
-control loop. Each query gets a number when it arrives, its ticket. A reply names the ticket of its
-query. When a ticket is retired, Zenoh's query is dropped, and the client stops waiting.
+control loop. Each query gets a number, called its ticket, when it arrives. A reply names the ticket
+of its query. When a ticket is retired, Zenoh's query is dropped, and the client stops waiting.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Replies:
         self._queue.put(ticket)
 
     def start(self, session: zenoh.Session) -> None:
-        """Start the thread that sends the replies. It also sends those that are queued already."""
+        """Start the thread that sends the replies, beginning with the queued replies."""
         self._thread = BusThread("replies", partial(self._run, session))
         self._thread.start()
 

@@ -1,4 +1,4 @@
-"""Publishes each topic on those of its keys that have a subscriber.
+"""Publishes each topic on the keys of the topic that have a subscriber.
 
 A topic has native keys and perhaps ROS keys. Each key has an outlet, which is the publisher on that
 key. A message is encoded once per encoding, and only if an outlet with that encoding has a
@@ -129,7 +129,7 @@ class Outlets:
         return dropped, self._stuck and not was_stuck
 
     def start(self) -> None:
-        """Start the thread that sends the messages, first those that wait in the slots already."""
+        """Start the thread that sends the messages, beginning with the messages in the slots."""
         self._thread.start()
 
     def stop(self, timeout: float) -> None:

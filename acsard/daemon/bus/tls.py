@@ -32,8 +32,8 @@ def require_usable(directory: str) -> None:
     """
     if not Path(directory).is_dir():
         raise CertificateError(
-            f"there is no directory {directory}: name the directory that `acsard tls init` or "
-            f"`acsard tls add` made, with {CA}, {CERTIFICATE} and {KEY} in it"
+            f"there is no directory {directory}: name the directory with {CA}, {CERTIFICATE} and "
+            f"{KEY} that `acsard tls init` or `acsard tls add` made"
         )
     for name in (CA, CERTIFICATE, KEY):
         file = Path(directory) / name
@@ -163,8 +163,8 @@ def ends(directory: str) -> dict[str, int]:
 def peer_ends_ns(endpoint: str, directory: str) -> int | None:
     """Return when the certificate of the program at a TLS endpoint expires, ns since 1970.
 
-    The certificate is not verified, so that this also works if it has expired. Returns None if the
-    program cannot be reached or the optional library is missing. Blocks for up to twice
+    The certificate is not verified, so this function also works for an expired certificate. Returns
+    None if the program cannot be reached or the optional library is missing. Blocks for up to twice
     `PATIENCE_S`.
     """
     try:

@@ -83,8 +83,8 @@ def gateway_session(config: Config) -> zenoh.Session:
 def certificate_trouble(authority: Path, certificate: Path, key: Path) -> str:
     """Return why Zenoh cannot listen with these certificate files, or "" if it can.
 
-    OpenSSL accepts more than Zenoh: certificates without extensions (X.509 version 1), and keys of
-    the curves P-521 and Ed448. This call takes half a second.
+    OpenSSL accepts some files that Zenoh refuses: certificates without extensions (X.509 version
+    1), and keys of the curves P-521 and Ed448. This call takes half a second.
     """
     files = {
         "root_ca_certificate": str(authority),
