@@ -240,7 +240,10 @@ BECAUSE = ", because "
 
 
 def event_of(late: Lateness, clause: str, *, news: bool) -> Event:
-    """Return the event that reports a lateness. `clause` is the text from `causes`."""
+    """Return the event that reports a lateness.
+
+    `clause` is the text from `causes`. `news` is explained at `Event.news`.
+    """
     text = f"by {late.late_ns / NS_PER_S:.2f} s{BECAUSE}{clause}"
     return Event("missed_periods", text, "warning", kind="late", news=news)
 
@@ -256,7 +259,7 @@ STOLEN_SHARE = 0.02
 
 
 def present(before: Reading, after: Reading, within_ns: int) -> list[tuple[str, str]]:
-    """Return the causes that delay every program on this computer now, each with its advice.
+    """Return pairs (cause, advice) for the causes that delay every program on this computer now.
 
     `within_ns` is the time between the two readings, ns.
     """

@@ -140,7 +140,8 @@ class SettingsFile:
             self._box.put(request)
 
     def _look(self) -> None:
-        """Wake the thread, unless it has requests to process, which "look" could displace."""
+        """Wake the thread, unless requests wait for it: the item "look" could displace a
+        request."""
         if not self._box.waiting:
             self._box.put("look")
 

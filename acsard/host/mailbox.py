@@ -107,7 +107,7 @@ class Mailbox(Generic[T]):
         return self.waiting.popleft() if self.waiting else None
 
     def take(self) -> list[T]:
-        """Remove and return the items that wait now. Items that arrive during the call stay."""
+        """Remove and return the items that wait now. Items that arrive meanwhile stay."""
         items = self.waiting
         return [items.popleft() for _ in range(len(items))]
 

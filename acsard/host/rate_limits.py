@@ -101,7 +101,7 @@ class Places:
 
     @contextmanager
     def held(self, name: str = "") -> Iterator[bool]:
-        """Yield whether a place is free. If one is, keep it in use until the block ends."""
+        """Take a place until the block ends, and yield True. If no place is free, yield False."""
         free = self.enter(name)
         try:
             yield free
