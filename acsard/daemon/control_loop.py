@@ -64,8 +64,8 @@ QUERIES_PER_STEP = 8
 a flood of queries does not make the control loop miss a period."""
 
 LATE_NS = 1_000_000
-"""Shortest delay that counts between the start of a step and the write of its line, ns. A shorter
-delay is passed to the robot as 0, because the sample times are not that accurate."""
+"""Shortest delay from the start of a step to the write of its line that counts, ns. A shorter delay
+is passed to the robot as 0, because the estimated sample times are less accurate than that."""
 
 NOT_STORED = (
     "the new state is not stored on the disk yet; if the daemon restarts before that, it may lose "
@@ -108,12 +108,14 @@ class ControlLoop:
             certificate_ends: wall-clock time at which each certificate expires, ns since 1970, by
                 the name of the certificate. None or empty without TLS.
             others: events of the daemon's other parts. Each step takes them and empties the list.
-            beside: returns the present value of a key that another part of the daemon publishes,
-                or None for any other key.
-            adopted: called with each configuration that comes into force after the start.
+            beside: function that returns the present value of a key that another part of the
+                daemon publishes, or None for any other key.
+            adopted: function that is called with each configuration that comes into force after
+                the start.
             latches: the latches with which the robot starts.
-            keeper: keeps the latches over a restart. With None they are not kept.
-            late_watch: names the causes of late periods, or None.
+            keeper: stores the latches, so that they survive a restart. With None the latches are
+                not stored.
+            late_watch: finds the causes of late periods. With None no causes are reported.
         """
         self.robot = Robot(config, latches)
         self.report = Report(config, start, certificate_ends)
@@ -126,7 +128,8 @@ class ControlLoop:
         self._config, self._adopted, self._settings_file = config, adopted, settings_file
         self._recorder, self._handover = recorder, Handover(latches, keeper)
         self._started, self._speed = config.limits, SpeedLimiter(self.robot.config)
-        """The limits at the start of the daemon, and the handler of the key `speed_limit`."""
+        """`_started` has the limits at the daemon's start. `_speed` handles the key
+        `speed_limit`."""
         self._kept: tuple[Latches, LimitsConfig, LimitsConfig, Latches] | None = None
         """Cache of `_to_keep`: the latches and limits of its last computation, and the result."""
         self._step_answers: tuple[Answer, ...] = ()
@@ -147,8 +150,9 @@ class ControlLoop:
         """Gyro samples that have arrived since the last step."""
         self._port, self._bus, self._log, self._mono_ns = port, bus, log, mono_ns
         self._superseded, self._trip, self._late_ns = False, "", 0
-        """Three facts about the last line: whether it was superseded, why the guard replaced it (""
-        if it did not), and its delay from the start of its step, ns (0 below `LATE_NS`)."""
+        """Three facts about the last line. `_superseded` says whether a newer line must replace it.
+        `_trip` says why the guard replaced it; "" if the guard did not. `_late_ns` is its delay
+        from the start of its step, ns; 0 if that is below `LATE_NS`."""
         # Use the longest line of both directions, because answers must not queue in the MCU either.
         period_ns = int(NS_PER_S / config.rate_hz)
         self._pace = Pace(wire_ns(config.mcu.line_bytes, config.mcu.baud_rate), period_ns)
@@ -168,15 +172,15 @@ class ControlLoop:
 
     @property
     def retry_ns(self) -> int | None:
-        """Monotonic time, ns, of the extra step for a command that came too soon after a line.
+        """Monotonic time of the extra step for a waiting command, ns; None if no command waits.
 
-        None if no command waits.
+        A command waits if it came too soon after a line.
         """
         return self._pace.retry_ns(self._port.sent_ns) if self._pace.waits else None
 
     @property
     def listens(self) -> bool:
-        """Whether a command that arrives now gets an extra step before the next period."""
+        """Whether a command that arrives now gets a step of its own, before the next period."""
         return self._pace.listens
 
     def step(self, now: Instant, period: Period = NO_PERIOD) -> Outputs:
@@ -207,8 +211,8 @@ class ControlLoop:
         requests, refused_sets = self._speed.requests(requests, now.mono_ns)
         self._others += self._handover.news()
         port, pace = self._port, self._pace
-        # Call `take` before reading `is_open`, because `take` closes the port after a suspend of
-        # the computer.
+        # Call `take` before reading `is_open`. After a suspend of the computer, `take` closes the
+        # port.
         received = port.take(now if missed else None)
         # Pass the fields by position: creating a struct by seventeen names takes three times as
         # long.
@@ -251,7 +255,7 @@ class ControlLoop:
         return outputs
 
     def _decided(self, inputs: Inputs) -> tuple[Outputs, bool]:
-        """Run the step and send its line. Return the outputs, and whether the line was written.
+        """Run the step and send its line. Return a pair: the outputs, and whether a line was sent.
 
         The recorder gets the step even if this method raises.
         """
@@ -314,8 +318,8 @@ class ControlLoop:
     def _from_bus(
         self, now: Instant
     ) -> tuple[tuple[Command, ...], tuple[Refusal, ...], tuple[Request, ...]]:
-        # Before the first step there are no outputs yet to answer queries. The bus then returns at
-        # most a slow query, which needs none.
+        # Before the first step there are no outputs with which to answer queries. The bus then
+        # returns at most one slow query, whose answer needs no outputs.
         got = self._got = self._bus.take(QUERIES_PER_STEP if self.outputs else 0)
         if got is NOTHING:
             return (), (), ()
@@ -384,7 +388,7 @@ class ControlLoop:
             self._others.append(BUS_STUCK)
 
     def _served(self, query: Query, now: Instant, refusals: list[Refusal]) -> Request | None:
-        """Answer a query and return None, or return its request for the robot to decide.
+        """Answer a query and return None, or return the request about which the robot decides.
 
         A `set` with `keep` goes to the settings file first. A refusal is added to `refusals`.
         """
@@ -419,7 +423,7 @@ class ControlLoop:
     def _keepable(self, now: Instant) -> tuple[Request, ...]:
         """Return each `set` with `keep` that the robot may obey now.
 
-        Queue the answers to those that were written to the file, refused, or overdue.
+        Also queue the answers to the requests that were written to the file, refused or overdue.
         """
         if self._settings_file is None:
             return ()
@@ -428,7 +432,10 @@ class ControlLoop:
         return tuple([one for one in results if isinstance(one, Request)])
 
     def _send(self, outputs: Outputs, now: Instant, tick: bool) -> bytes | None:
-        """Offer the line to the port. Return the line if the port wrote it, else None."""
+        """Let the guard check the line, and offer it to the port.
+
+        Return the line if the port wrote it, else None.
+        """
         line, self._trip = self._guard.check(outputs)
         self._superseded, self._late_ns = False, 0
         if line is None:
@@ -444,8 +451,8 @@ class ControlLoop:
             return line
         self._superseded = True
         if offered == "superseded" and tick:
-            # Count the lines of periods only. After a superseded line between two periods, the line
-            # of the period follows.
+            # Count the lines of periods only. If a line between two periods is superseded, the line
+            # of the period still follows.
             self.robot.counters["lines_superseded"] += 1
         return None
 
@@ -470,7 +477,11 @@ class ControlLoop:
             self._log(event)
 
     def _answer(self, now: Instant, *, last: bool = False) -> None:
-        """Send answers whose latches are stored or that waited `ANSWER_NS`; all if `last`."""
+        """Send the queued answers.
+
+        An answer waits until the latches are stored, but at most `ANSWER_NS`. If `last` is true, no
+        answer waits any longer.
+        """
         held, before_ns = self._handover.held, now.mono_ns - ANSWER_NS
         trouble = "" if held else self._handover.trouble or NOT_STORED
         while self._answers and (held or last or self._answers[0][0] < before_ns):

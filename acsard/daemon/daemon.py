@@ -2,9 +2,9 @@
 
 The daemon enters the contexts of the simulator, the bus, the port and the control loop, in this
 order. The shutdown leaves these contexts in reverse order: the robot ramps to zero, the port writes
-STOP and closes, and the bus closes. The first signal begins the shutdown, and a second one cuts the
-ramp short. After an exception in any task, the daemon leaves the contexts in the same order, but
-without the ramp.
+STOP and closes, and the bus closes. The first signal begins the shutdown, and a second signal cuts
+the ramp short. After an exception in any task, the daemon also leaves the contexts in reverse
+order, but without the ramp.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ from acsard.host.version import version
 from acsard.recording.recorder import Recorder
 
 EXIT_RAMP_S = 0.6
-"""Time limit of the ramp to zero at the shutdown, s. After it, STOP is sent in any case."""
+"""Time limit of the ramp to zero at the shutdown, s. After this time, STOP is sent in any case."""
 
 
 class Departure:
-    """The shutdown. The first signal begins it, and a second signal cuts its ramp short."""
+    """The shutdown. The first signal begins a ramp to zero, and the second cuts the ramp short."""
 
     def __init__(self, log: Log, wake: Callable[[], None], manager: Systemd) -> None:
         self._log, self._wake, self._manager = log, wake, manager
@@ -57,14 +57,14 @@ class Departure:
         self.hurried = False
 
     def __enter__(self) -> Self:
-        """Handle the signals that end the daemon, including SIGHUP from a closed terminal."""
+        """Handle the signals that end the daemon. A closed terminal sends SIGHUP."""
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
             loop.add_signal_handler(number, self._signal, number)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> bool:
-        """Suppress the exception if a signal has cancelled the start, which is not an error."""
+        """Suppress the cancellation if a signal ended the start, because that is not an error."""
         return kind is asyncio.CancelledError and self.begun_ns is not None
 
     def started(self) -> None:
@@ -114,7 +114,7 @@ async def run(
     Raises a `MendableError` if the daemon cannot start.
 
     Args:
-        announce: called once when everything runs.
+        announce: called once, when the start is complete.
         gateway: arguments of the `acsard gateway` process, which this daemon starts if
             `bus.outside` names endpoints. None if the gateway is a service of its own.
         page: arguments of the `acsard web` process, or None for no page.
@@ -167,7 +167,7 @@ async def run(
             lambda adopted: log.use(adopted.log),
             recorder,
             # Read the latches after the bus and the port are open. A second daemon for this robot
-            # then ends before it touches them.
+            # then ends before it touches the latch file.
             Latches() if keeper is None else await keeper.start(clock.now()),
             keeper,
             settings_file,
@@ -175,8 +175,8 @@ async def run(
         )
         control.report.description = urdf
         if (description := control.report.robot_description()) is not None:
-            # Publish it only once, because RViz and the controller manager load the robot again
-            # with each message.
+            # Publish the description only once, because RViz and the controller manager load the
+            # robot again with each message.
             bus.publish(DESCRIPTION, description)
         if settings_file is not None:
             settings_file.start()
@@ -236,10 +236,10 @@ async def _beside(helpers: Iterable[Coroutine[Any, Any, object]]) -> AsyncIterat
 
 
 def _certificates(config: Config, ours: bool) -> dict[str, int]:
-    """Return the expiry time of each certificate that the daemon uses, ns since 1970, by its name.
+    """Return the expiry time of each certificate that the daemon uses, ns since 1970.
 
-    Returns {} if the daemon uses no certificate. `ours` is true if the daemon runs the TLS gateway.
-    Raises a `MendableError` if the certificates cannot be used.
+    The keys are those of `ends`. Returns {} if the daemon uses no certificate. `ours` is true if
+    the daemon runs the TLS gateway. Raises a `MendableError` if the certificates cannot be used.
     """
     bus = config.bus
     if not (any(e.startswith(TLS) for e in bus.connect) or (ours and bus.outside)):

@@ -44,9 +44,9 @@ from acsard.host.mailbox import Mailbox
 from acsard.host.threads import NoThreadError, in_thread
 
 START_S = 2.0
-"""Time limit of one write of the file and of one sync, s. When the daemon starts, it is the limit
-of the first read and write together. If the disk takes longer, the daemon reports that the disk
-hangs."""
+"""Time limit of a write of the file, and of a sync, s. At the start of the daemon, the first read
+and the first write together have this limit. If the disk takes longer, the daemon reports that the
+disk hangs."""
 
 PACE_S = 0.05
 """Pause after each successful write, s. A flood of stops, each of which is a new latch, must not
@@ -61,10 +61,10 @@ CLOSE_S = 0.3
 HANGS = f"the disk did not answer within {START_S:g} s"
 
 EVENTS = 64
-"""Largest number of events that wait for the control loop, which takes them in every step."""
+"""Largest number of events that wait until the control loop takes them in its next step."""
 
 NO_PLACE = "no directory"
-"""Text in messages in place of the path, if no directory for the file can be found."""
+"""Text in messages instead of the path, if no directory for the file can be found."""
 
 
 def place(config: Config, environ: Mapping[str, str]) -> Path:
@@ -122,18 +122,18 @@ class LatchFile:
         self._found: Latches | None = None
         """The latches in the file when the daemon started; None until the file has been read."""
         self._blind = False
-        """True if `start()` could not read the file in time, until the writing thread reads it."""
+        """True if the writing thread must still read the file, which `start()` failed to read."""
         self._missed = Latches()
         """Latches in the file that the robot does not have, because `start()` could not read the
         file in time."""
         self._box = Mailbox[Latches](1)
-        """The newest latches that `keep` was given, until the writing thread takes them."""
+        """The latches of the last call of `keep`, until the writing thread takes them."""
         self._news = Mailbox[Event](EVENTS)
         self._held: Latches | None = None
-        """The latches that the file contains now. None before the first write."""
+        """The latches that this process wrote last. None before the first write."""
         self._failed = ""
         self._handed: Latches | None = None
-        """The latches that the last call of `keep` was given."""
+        """The latches of the last call of `keep`."""
         self._busy_ns: int | None = None
         """Monotonic time at which the present write began, ns; None between two writes."""
         self._syncing_ns: int | None = None
@@ -173,8 +173,8 @@ class LatchFile:
             for thread in threads:
                 thread.start()
         except RuntimeError as error:
-            # The first thread may run already. `_barred` keeps it from writing, and from reporting
-            # a recovery, without the other thread.
+            # The first thread may run already. Without the second thread it must not write, and
+            # must not report a recovery. `_barred` prevents both.
             self._barred = f"this process cannot start another thread ({error})"
             self._fail(self._barred)
             return doubted(latches, at_start(unwritable(self.where, self._failed)), now)
@@ -218,7 +218,7 @@ class LatchFile:
             path.parent.mkdir(parents=True, exist_ok=True)
             lock = os.open(path.with_suffix(".lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         except OSError:
-            # Writing the file will fail too, and that failure is reported.
+            # The write of the file will fail too, and then the failure is reported.
             return
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -248,7 +248,7 @@ class LatchFile:
         self._box.put(latches)
 
     def holds(self, latches: Latches) -> bool:
-        """Return whether the file contains these latches: a kill of the process then loses none."""
+        """Return whether the file has these latches, so that they survive a kill of the process."""
         return self._held is latches
 
     def wait(self, latches: Latches, seconds: float) -> None:
@@ -277,7 +277,10 @@ class LatchFile:
 
     @property
     def _hangs(self) -> bool:
-        """True if a sync, or a write that delays the newest latches, has taken over `START_S`."""
+        """True if the disk hangs: a sync or a needed write has lasted longer than `START_S`.
+
+        A write is needed while the file does not contain the newest latches.
+        """
         if self._failed:
             return False
         busy_ns = None if self._held is self._handed else self._busy_ns
@@ -288,7 +291,7 @@ class LatchFile:
     def _again(self) -> Event:
         return Event(
             "latch_file",
-            f"stops survive a restart of the daemon again: they are stored in {self.where}",
+            f"the daemon can write {self.where} again, so stops survive a restart of the daemon",
         )
 
     def close(self) -> None:

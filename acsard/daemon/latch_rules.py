@@ -34,7 +34,8 @@ BY = "acsard"
 
 
 EMPTY = ("earlier", ())
-"""The field of a latch that has one cause. Most latches have one, so the file leaves it out."""
+"""Name and value of the field `earlier` of a latch that has only one cause. Most latches have only
+one, so the file leaves this field out."""
 
 
 class LatchFileError(AcsardError):
@@ -96,17 +97,19 @@ def at_start(why: str) -> str:
 
 
 def unreadable(where: str, reason: str) -> str:
-    """Return the text of the stop that the daemon sets if it cannot read the latch file."""
+    """Return the reason text of the stop that the daemon sets if it cannot read the latch file."""
     return at_start(f"{where} cannot be read: {reason}; a stop may have been lost")
 
 
 def unwritable(where: str, reason: str) -> str:
     """Return the message for a latch file that cannot be written."""
-    return f"a stop would not survive a restart: {where}: {reason}"
+    return (
+        f"a stop would not survive a restart: the latch file ({where}) cannot be written: {reason}"
+    )
 
 
 def stopped(latches: Latches, why: str, now: Instant, by: str = BY, before: int = -1) -> Latches:
-    """Return these latches with a stop. If they have a stop already, return them unchanged.
+    """Return `latches` with a stop. If `latches` has a stop already, return it unchanged.
 
     `by` is the client that asked for the stop, or `BY` for the daemon itself. `before` is the
     number of the last stop before this one, or -1 if there was none.
@@ -157,9 +160,9 @@ class LatchKeeper(Protocol):
 class Handover:
     """Hands the latches of the control loop to their keeper, and reports when they are stored.
 
-    The robot stops at once, but the answer to a stop waits until the stop would survive a kill of
-    the process. After `ANSWER_NS` the answer is sent in any case, and says that the stop is not
-    stored yet.
+    The robot stops immediately, but the answer to a stop waits until the stop would survive a kill
+    of the process. After `ANSWER_NS` the answer is sent in any case. It then says that the stop is
+    not stored yet.
     """
 
     def __init__(self, latches: Latches, keeper: LatchKeeper | None) -> None:
@@ -177,8 +180,9 @@ class Handover:
     def take_stops(self, latches: Latches, by: list[str], now: Instant) -> None:
         """Hand these latches to the keeper, with a stop if `by` is not empty.
 
-        `by` names the clients of the stops that no control step has processed. The stop has a new
-        number, so that a `clear` of an earlier stop does not release it, and it names all clients.
+        `by` names the clients of the stops that no control step has processed. The new stop names
+        all these clients. It has a new number, so that a `clear` of an earlier stop does not
+        release it.
         """
         for name in reversed(by):
             last, text = latches.stop, f"stopped by {name or 'request'}"
@@ -190,7 +194,10 @@ class Handover:
 
     @property
     def held(self) -> bool:
-        """Whether the latches are stored and survive a kill. Always true without a keeper."""
+        """Whether the latches are stored and survive a kill of the process.
+
+        Always true without a keeper.
+        """
         return self._keeper is None or self._keeper.holds(self.latches)
 
     def wait(self) -> None:

@@ -2,9 +2,9 @@
 
 Each cause in the table `CAUSES` has a rule that compares the counters from before the lateness with
 the counters from after the lateness. A rule returns the cause in words, or "" if its cause does not
-apply. A delay counts as a cause only if it is at least `SHARE` of the lateness, or the cause's own
-share. Otherwise the small delays of normal load would count as causes. Several causes may apply to
-one lateness, or none.
+apply. A delay counts as a cause only if it lasted for at least the share `SHARE` of the lateness.
+Some causes have another share, such as `DISK_SHARE`. Without such a limit, the small delays of
+normal load would count as causes. Several causes may apply to one lateness, or none.
 
 The kernel also reports how the control loop's thread spent the lateness: it ran, it was ready and
 waited for a processor, or it slept. A slow processor delays only a thread that runs or waits for a
@@ -36,9 +36,9 @@ share is low, because in a test a thread wrote to a disk all the time, and the k
 0.28 to 0.45 of this time as waiting."""
 
 LEAST_STOLEN_NS = 3 * NS_PER_S // 100
-"""Shortest steal time (the host used the virtual machine's processor) that counts as a cause, ns:
-three of the kernel's ticks. In a test with 607 late periods that had another cause, the kernel
-counted one tick of steal time in 24 of them, and two ticks in one."""
+"""Shortest steal time that counts as a cause, ns: three of the kernel's ticks. Steal time is time
+in which the host of a virtual machine took the processor away. In a test with 607 late periods that
+had another cause, the kernel counted one tick of steal time in 24 of them, and two ticks in one."""
 
 SUSPENDED_NS = NS_PER_S // 10
 """Shortest time that counts as a suspend, ns. A suspend is measured as a change of the difference
@@ -47,13 +47,13 @@ difference varies a little even without a suspend."""
 
 
 class Lateness(Struct, frozen=True, omit_defaults=True):
-    """A late control period, and the kernel's counters from before and after it."""
+    """The lateness of a control period, with the kernel's counters from before and after it."""
 
     late_ns: int
-    """How late the step came, ns, counted from the due time of the first missed period."""
+    """Time from the due time of the first missed period to the late step, ns."""
     loop: Scheduled
-    """Time that the loop's thread ran, and time that it was ready but waited for a processor. Both
-    times count from the last period before the lateness to the late step."""
+    """For how long the loop's thread ran, and for how long it was ready but waited for a processor.
+    Both times are measured from the last period before the lateness to the late step."""
     before: Reading
     after: Reading
     busiest: Program | None = None
@@ -65,7 +65,7 @@ class Lateness(Struct, frozen=True, omit_defaults=True):
 
     @property
     def computed(self) -> bool:
-        """Whether the thread ran, or was ready to run, for `SHARE` of the lateness."""
+        """Whether the loop's thread ran, or was ready to run, for `SHARE` of the lateness."""
         return self.explains(self.loop.ran_ns + self.loop.waited_ns)
 
     @property
@@ -114,9 +114,10 @@ def heat(late: Lateness) -> str:
 
 
 def hot(now: Conditions, hotter: bool = False) -> str:
-    """Return the cause in words if heat slows the processor now, or if it is `hotter`; else "".
+    """Return the cause in words if heat slows the processor down, else "".
 
-    `hotter` says whether the processor's count of slow-downs by heat has risen.
+    Heat is the cause if `now` says so, or if `hotter` is true: the processor's count of slow-downs
+    by heat has then risen.
     """
     return "the processor is too hot and runs slower" if now.hot or hotter else ""
 
@@ -175,9 +176,9 @@ def memory(late: Lateness) -> str:
 def disk(late: Lateness) -> str:
     """Return the cause in words if the loop's thread waited for a disk, else "".
 
-    The wait of the loop's own thread counts, if the kernel measures it. The wait of all programs
-    counts only if the loop's thread itself read from a disk or wrote to one, because other programs
-    may wait for a disk at any time.
+    The wait of the loop's own thread counts, if the kernel measures that wait. The time in which
+    any program waited counts only if the loop's thread itself read from a disk or wrote to a disk,
+    because other programs may wait for a disk at any time.
     """
     before, after = late.before, late.after
     own_ns, all_ns = after.own_disk_ns - before.own_disk_ns, after.disk_ns - before.disk_ns
@@ -225,7 +226,7 @@ CAUSES = (
 
 
 def causes(late: Lateness) -> tuple[tuple[str, ...], str]:
-    """Return the names of a lateness's causes, and a text that explains them with their advice.
+    """Return a pair: the names of the causes of a lateness, and a text with causes and advice.
 
     Both are empty if the counters show no cause.
     """
@@ -239,13 +240,16 @@ BECAUSE = ", because "
 
 
 def event_of(late: Lateness, clause: str, *, news: bool) -> Event:
-    """Return the event that reports a lateness. `clause` is the text from `causes`."""
+    """Return the event that reports a lateness.
+
+    `clause` is the text from `causes`. `news` is explained at `Event.news`.
+    """
     text = f"by {late.late_ns / NS_PER_S:.2f} s{BECAUSE}{clause}"
     return Event("missed_periods", text, "warning", kind="late", news=news)
 
 
 def cause_in(text: str) -> str:
-    """Return the lateness and its causes from an event's text; "" if the text has no causes."""
+    """Return the part of an event's text with lateness and causes; "" if it names no cause."""
     begin, because, clause = text.partition(BECAUSE)
     return begin.rpartition(": ")[2] + because + clause if because else ""
 
@@ -255,7 +259,7 @@ STOLEN_SHARE = 0.02
 
 
 def present(before: Reading, after: Reading, within_ns: int) -> list[tuple[str, str]]:
-    """Return the causes that delay every program on this computer now, each with its advice.
+    """Return pairs (cause, advice) for the causes that delay every program on this computer now.
 
     `within_ns` is the time between the two readings, ns.
     """

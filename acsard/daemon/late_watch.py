@@ -1,9 +1,9 @@
-"""Watches for late control periods, and reports their cause if the kernel shows one.
+"""Detects late control periods, and reports the cause if the kernel's counters show a cause.
 
 In each period the control loop reads only one small file, `schedstat`, with the processor times of
-its thread. The kernel's other files take longer to read, so a thread of this module reads them. It
-does so four times a second, and once more after a late period. `late_causes.py` compares the
-reading from before the lateness with the one from after the lateness.
+its thread. The kernel's other files take longer to read, so a thread of this module reads these
+files four times a second, and once more after a late period. `late_causes.py` compares the reading
+from before the lateness with the reading from after the lateness.
 
 The event of this module has the name `missed_periods`, like an event of the robot. The robot's
 event comes first and states the number of missed periods. The cause is known only later.
@@ -35,8 +35,8 @@ EVERY_S = 0.25
 the difference between two readings would include more delays from before the lateness."""
 
 HISTORY = 12
-"""Number of readings that are kept. They cover 3 s, so that one of them is from before the lateness
-even if the lateness was long."""
+"""Number of readings that are kept. Together they cover 3 s, so that one reading is from before the
+lateness even if the lateness was long."""
 
 SETTLE_S = 0.03
 """Time from a late period to the reading after it, s. The kernel updates some counters only at its
@@ -58,8 +58,8 @@ LOOK_AGAIN_NS = 10 * NS_PER_S
 process."""
 
 NEWS_NS = 60 * NS_PER_S
-"""Time after which an event with the same causes is logged immediately again, ns. An event that
-comes earlier waits for the next log line about missed periods (`Event.news`)."""
+"""Shortest time between two events with the same causes that are logged immediately, ns. An event
+that comes earlier waits for the next log line about missed periods (`Event.news`)."""
 
 MOST = 16
 """Largest number of late periods that wait for the thread, and of events that wait for `news`. A
@@ -73,7 +73,7 @@ class Late(Struct, frozen=True):
     """Monotonic time of the step of the late period, ns."""
     late_ns: int
     before: bytes
-    """Content of `OWN_TIMES` in the period before the late one; b"" if it is unknown."""
+    """Content of `OWN_TIMES` in the period before the late period; b"" if it is unknown."""
     after: bytes
     """Content of `OWN_TIMES` in the late period; b"" if it is unknown."""
 
@@ -85,7 +85,7 @@ class Late(Struct, frozen=True):
 
 
 class LateWatch:
-    """Watches the periods of one control loop. The loop's thread must create it.
+    """Observer of the periods of one control loop. The loop's thread must create this object.
 
     The loop's thread also calls `period` and `news`. A second thread, which reads the kernel's
     files, runs while this context manager is entered.
@@ -131,8 +131,8 @@ class LateWatch:
     def period(self, now_ns: int, late_ns: int, missed: int) -> None:
         """Process a period. If periods were missed, pass the lateness to the thread.
 
-        The step of this period began `late_ns` ns late, at the monotonic time `now_ns`. Before it,
-        `missed` periods got no step.
+        The step of this period began `late_ns` ns late, at the monotonic time `now_ns`. The
+        `missed` periods before this period got no step.
         """
         before, times = self._times, b""
         # Without these times, the thread still finds some of the causes.
@@ -173,7 +173,7 @@ class LateWatch:
         self._readings.append((clock.mono_ns(), reading))
 
     def _before(self, now_ns: int) -> Reading | None:
-        """Return the newest reading that was complete at monotonic `now_ns`; None if none was."""
+        """Return the newest reading that was complete at monotonic `now_ns`, or None."""
         older = [reading for read_ns, reading in self._readings if read_ns <= now_ns]
         return older[-1] if older else None
 
@@ -192,7 +192,10 @@ class LateWatch:
         self._news.put(event_of(late, clause, news=news))
 
     def _busiest_of(self, kernel: Kernel) -> Program | None:
-        """Return the busiest process or None, from a search that is at most `LOOK_AGAIN_NS` old."""
+        """Return the busiest process, or None if no process is busy.
+
+        Search again only if the last search is older than `LOOK_AGAIN_NS`.
+        """
         now_ns = clock.mono_ns()
         if self._searched_ns is None or now_ns - self._searched_ns >= LOOK_AGAIN_NS:
             self._busiest, self._searched_ns = kernel.busiest(LOOK_S), now_ns

@@ -19,8 +19,8 @@ PER_DECADE = 20
 """Number of buckets of a histogram per factor of ten. A percentile is accurate to 12 %."""
 
 DECADES = 7
-"""Number of factors of ten that the buckets cover, from 1 us on. The first bucket also holds
-shorter durations, and the last bucket also holds longer ones."""
+"""Number of factors of ten that the buckets cover, starting at 1 us. The first bucket also holds
+shorter durations, and the last bucket also holds longer durations."""
 
 LAST = PER_DECADE * DECADES
 """Index of the last bucket."""
@@ -162,7 +162,7 @@ class Stopwatch:
         return self._missed.count(now_ns)
 
     def period(self, now_ns: int, late_ns: int, missed: int = 0) -> None:
-        """Record the lateness of a step, and the number of `missed` periods just before it."""
+        """Record the lateness of a step, and the number of periods `missed` just before it."""
         self.figures["period_lateness"].add(now_ns, late_ns)
         if missed:
             self._missed.add(now_ns, missed)

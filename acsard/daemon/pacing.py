@@ -22,13 +22,12 @@ NO_PERIOD = Period(0, 0)
 
 
 BREATH_NS = 1_000_000
-"""Time that the board has for its reply between two lines, ns. The wire time of a line comes on
-top."""
+"""Time that the board has for its reply between two lines, in addition to the wire time of a line,
+ns."""
 
 IDLE_WAKES = 3
-"""Largest number of steps in a period that had input but no new command or mode. After one more
-such step, further input waits for the next period. This limit bounds the cost of a flood of
-messages."""
+"""If more than this number of steps in a period had input but no new command or mode, further input
+waits for the next period. This limit bounds the cost of a flood of messages."""
 
 
 class Pace:
@@ -44,7 +43,7 @@ class Pace:
         self._ahead = False
         """Whether an early line was written in place of the next period's line."""
         self._tried = False
-        """Whether this period's attempt to write an early line was made."""
+        """Whether an attempt to write an early line has been made in this period."""
         self._waiting = False
         """Whether a new command came too soon after the last line, so it has not been sent yet."""
         self._idle = 0
@@ -52,7 +51,8 @@ class Pace:
     def period_ended(self, missed: int) -> bool:
         """Record the end of a period. Return whether a line must be written for this period.
 
-        No line is needed if an early line has replaced it, unless periods were `missed`.
+        If an early line has replaced the line of this period, a line must be written only if
+        periods were `missed`.
         """
         ahead, self._ahead, self._tried = self._ahead, False, False
         self._idle = 0
@@ -89,5 +89,5 @@ class Pace:
         return self._waiting and self._possible and not self._tried
 
     def retry_ns(self, sent_ns: int) -> int | None:
-        """Return when the waiting command may be written, monotonic ns; None if none waits."""
+        """Return the monotonic time, ns, at which the waiting command may be written, or None."""
         return sent_ns + self._gap_ns if self.waits else None

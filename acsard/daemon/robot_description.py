@@ -19,7 +19,7 @@ MAX_BYTES = 50_000
 bytes for each quotation mark and each line end."""
 
 MAX_JSON = MESSAGE_BYTES - 1024
-"""Largest size of the description as JSON, bytes. The other 1024 bytes of a message are for the
+"""Largest size of the description as JSON, bytes. The remaining 1024 bytes of a message are for the
 Zenoh key and Zenoh's headers."""
 
 XACRO = "/xacro}"
@@ -38,7 +38,7 @@ def robot_description(path: str) -> str:
         return ""
     file = Path(path)
     try:
-        # Reading a pipe would never end.
+        # The read of a pipe would never end.
         if file.exists() and not file.is_file():
             raise _error(path, "it is not a regular file; name the URDF file itself")
         with file.open("rb") as opened:

@@ -44,7 +44,7 @@ s."""
 
 JOBS = 32
 """Largest number of `set` requests with `keep` that wait for their reply. Further requests are
-refused at once."""
+refused immediately."""
 
 Signature = tuple[int, int, int]
 """Inode, size in bytes and modification time in ns of a file."""
@@ -87,7 +87,8 @@ class SettingsFile:
 
         Args:
             file: the file that the daemon has read, or None for the built-in defaults.
-            parse: returns the configuration of a daemon that starts with the given file content.
+            parse: function that returns the configuration of a daemon that starts with the given
+                content of the file.
             started: the configuration with which the daemon has started.
         """
         self.differ = ""
@@ -121,9 +122,9 @@ class SettingsFile:
             self.differ = f"the daemon cannot compare its settings with its file ({error})"
 
     def use(self, config: Config) -> None:
-        """Compare the file with `config`, and again whenever the file changes.
+        """Compare the file with `config` from now on, also after later changes of the file.
 
-        `config` has the settings in force, but not the limit that clients set by the Zenoh key
+        `config` has the settings in force, except the limit that clients set by the Zenoh key
         `speed_limit`.
         """
         self._in_force = config
@@ -139,7 +140,8 @@ class SettingsFile:
             self._box.put(request)
 
     def _look(self) -> None:
-        """Wake the thread, unless it has requests to process, which "look" could displace."""
+        """Wake the thread, unless requests wait for it: the item "look" could displace a
+        request."""
         if not self._box.waiting:
             self._box.put("look")
 
@@ -200,15 +202,15 @@ class SettingsFile:
 
     @property
     def limits(self) -> LimitsConfig:
-        """The limits at the daemon's start, updated with those written to the file since then."""
+        """The limits at the daemon's start, with the values written to the file since then."""
         return self._limits
 
     def latches(self, latches: Latches, now: LimitsConfig) -> Latches:
         """Return the robot's latches as they must be stored for the next start of the daemon.
 
         The next start reads the limits from the configuration file. So if the daemon has written
-        limits to the file, `lowered` in the result has those limits that are lower in `now` than in
-        the file. `now` has the limits in force, but not the limit that clients set by the Zenoh key
+        limits to the file, `lowered` in the result has the limits that are lower in `now` than in
+        the file. `now` has the limits in force, except the limit that clients set by the Zenoh key
         `speed_limit`.
         """
         file = self._limits
@@ -259,7 +261,9 @@ class SettingsFile:
         try:
             keep(edit)
         except MendableError as error:
-            return Answer(answer.id, False, f"{told}, but only until the next start: {error}")
+            return Answer(
+                answer.id, False, f"{told}, but only until the daemon's next start, because {error}"
+            )
         limits = {
             key.removeprefix(TABLE): float(value)  # type: ignore[arg-type]
             for key, value in edit.keys.items()
@@ -304,5 +308,5 @@ def _overdue(pending: _Pending) -> Answer:
     answer = pending.answer
     text = f"nothing is set: {why}"
     if answer is not None:
-        text = f"{answer.message}; {why}: look whether the file has the new value"
+        text = f"{answer.message}, but {why}: check whether the file has the new value"
     return Answer(pending.request.id, False, text)

@@ -1,4 +1,4 @@
-"""Supervises the TLS gateway, a fleet's router or the web page, each a process of its own.
+"""Supervises the process of the TLS gateway, of a fleet's router or of the web page.
 
 A process that sends no signs of life is ended and started again. If the gateway runs as a service,
 systemd supervises it instead (`acsard-gateway.service`), because only systemd can set the limits of
@@ -21,7 +21,7 @@ AGAIN_S = 0.1
 """Pause before a process that has ended is started again, s."""
 
 LATER_S = 2.0
-"""Pause before a restart, s, if the process could not be started or its exit code was above 1."""
+"""Pause before a restart after an exit code above 1, or after a failure to start the process, s."""
 
 
 class Kind(Struct, frozen=True):
@@ -61,10 +61,10 @@ failing must not take processor time from the robot. The process itself reports 
 async def keep_running(
     words: Sequence[str], log: Callable[[Event], None], kind: Kind = GATEWAY
 ) -> int:
-    """Run `acsard` with the arguments `words`, and start it again when it ends, until cancelled.
+    """Run `acsard` with the arguments `words` until cancelled, and restart it when it ends.
 
-    Returns the exit code if `kind` says that it is final, so that there is no restart. `log` gets
-    an event for each restart.
+    If `kind` says that the exit code is final, there is no restart, and this function returns the
+    exit code. `log` gets an event for each restart.
     """
     final = kind.final | kind.final_at_first
     while True:

@@ -56,7 +56,7 @@ class Alarm(_Timer):
         self._at_ns: int | None = None
 
     def set(self, at_ns: int | None) -> None:
-        """Call `wake` at monotonic `at_ns`. None keeps the time that was set before."""
+        """Call `wake` at monotonic `at_ns`, ns. None does not change the time set before."""
         if at_ns is not None and at_ns != self._at_ns:
             self._timer.set(at_ns)
         self._at_ns = at_ns
@@ -82,7 +82,10 @@ class Ticker(_Timer):
         self._timer.set(self._due_ns)
 
     def take(self, now_ns: int) -> Period:
-        """Return the periods that have ended by monotonic `now_ns` since the last call."""
+        """Return how many periods have ended since the last call, and when the first was due.
+
+        `now_ns` is the present monotonic time.
+        """
         if not self._rang and now_ns < self._due_ns:
             return NO_PERIOD
         # `now_ns` is from the daemon's clock. NTP may slew the timer's clock, and the timer then
@@ -101,7 +104,7 @@ class Ticker(_Timer):
 
 
 class Next(Struct, frozen=True):
-    """Result of a step: says whether a command, a retry or a stop may start the next step."""
+    """Result of a step. It says which events may run a step before the next period ends."""
 
     listens: bool
     """Whether a command that arrives gets a step of its own, before the next period."""
@@ -115,7 +118,8 @@ class Next(Struct, frozen=True):
 class Wakeup:
     """Runs the control loop's step when the event loop, a timer or the bus asks for it.
 
-    Calling this object runs a step at once. A call during a step runs another step after it.
+    A call of this object runs a step immediately. During a step, a call instead requests another
+    step, which runs when the present step has ended.
     """
 
     def __init__(self) -> None:
@@ -159,7 +163,7 @@ class Wakeup:
             pass  # the event loop has closed, so nothing is left to wake
 
     async def run(self, step: Callable[[], Next | None]) -> None:
-        """Run `step` on every event until `step` returns None. An exception in `step` is raised."""
+        """Run `step` on every event until `step` returns None, and raise its exceptions."""
         self._over = self._loop.create_future()
         with self._alarm:
             self._step = step

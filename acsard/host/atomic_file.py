@@ -1,4 +1,4 @@
-"""Replaces a file completely or not at all, and waits for the disk."""
+"""Replaces files atomically, and waits until the disk has stored them."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from contextlib import suppress
 from pathlib import Path
 
 NEW_MODE = 0o644
-"""Default mode of a new file: 0o644, because the user of the systemd service must be able to read
-the file."""
+"""Permission bits of a new file, if the caller gives none. The user of the systemd service must be
+able to read the file."""
 
 
 def replace(
@@ -21,15 +21,20 @@ def replace(
     owner: tuple[int, int] | None = None,
     synced: bool = True,
 ) -> None:
-    """Replace a file by a new one. If that fails, raise `OSError` and leave the old file unchanged.
+    """Replace the content of a file, or create the file.
+
+    If that fails, raise `OSError` and leave the old file unchanged.
 
     Args:
-        file: The file. Other processes find the old file or the new one, never a part of it.
+        file: The path. Other processes see the complete old file or the complete new one.
         content: The new content. Only the owner can read the file until its mode is set.
-        mode: The mode. None keeps that of the old file, and gives a new file `NEW_MODE`.
-        owner: The user and the group. None keeps those of the old file, if this process may.
-        synced: True waits for the disk before the rename, so that a power cut leaves the old or the
-            new file. If False, a power cut before `sync` may leave a part of the new file.
+        mode: The permission bits. If None, an existing file keeps its mode, and a new file gets
+            `NEW_MODE`.
+        owner: The numbers of the user and the group that own the new file. If None, the file keeps
+            its owner, as far as this process has the permission to set it.
+        synced: If True, wait before the rename until the disk has stored the new content. A power
+            cut then leaves the complete old or new file. If False, a power cut may leave a part of
+            the new file until the caller has called `sync`.
     """
     kept = owner
     if file.exists():

@@ -3,9 +3,9 @@
 Each child gets a session of its own, so that a Ctrl-C at the terminal reaches only the parent,
 which then ends its children. A child does not outlive its parent.
 
-The parent uses `Child`, and the child uses `Parent`. A socket connects the two processes, and it is
-the child's standard input. The child writes signs of life to the socket, and ends when the parent
-closes the socket. The parent kills a child that falls silent.
+The parent uses `Child`, and the child uses `Parent`. A socket connects the two processes. The child
+uses it as its standard input, writes signs of life to it, and ends when the parent closes it. The
+parent kills a child that falls silent.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ slowly on a busy machine."""
 class Silence:
     """Detects that another process has given no sign of life for longer than `most_ns`, ns.
 
-    Of the time between two calls of `too_long`, at most 0.5 s counts, because during a longer time
-    the computer may have stopped both processes.
+    If more than 0.5 s passes between two calls of `too_long`, only 0.5 s counts as silence. During
+    a longer time, the computer may have stopped both processes.
     """
 
     def __init__(self, most_ns: int) -> None:
@@ -75,7 +75,7 @@ def acsard(*words: str) -> list[str]:
 
 
 def environment(hidden: Collection[str] = ()) -> dict[str, str]:
-    """Return the environment of a child, without the variables `hidden` and those in `OUR_UNIT`."""
+    """Return this process's environment for a child, without `hidden` and `OUR_UNIT`."""
     return {key: value for key, value in os.environ.items() if key not in (*OUR_UNIT, *hidden)}
 
 
@@ -87,7 +87,7 @@ class Limits(Struct, frozen=True):
 
 
 def limit(pid: int, limits: Limits) -> None:
-    """Set a child's limits, and make the kernel end the child first if memory runs out."""
+    """Set a child's limits, and let the kernel kill the child first if memory runs out."""
     try:
         with suppress(OSError):
             Path(f"/proc/{pid}/oom_score_adj").write_bytes(b"1000")
@@ -151,7 +151,7 @@ async def running(
 
 
 class Child:
-    """The parent's side of a child process, which is killed if it stops sending signs of life."""
+    """The parent's connection to a child. It kills a child that stops sending signs of life."""
 
     def __init__(self, command: Sequence[str]) -> None:
         self._command = command
@@ -161,7 +161,11 @@ class Child:
         """Why the child was killed, or "" if it was not killed."""
 
     def run(self) -> int:
-        """Run the child and return its exit code. Raises `OSError` if the child cannot start."""
+        """Run the child until it ends, and return its exit code.
+
+        A negative exit code is the number of the signal that ended the child. Raises `OSError` if
+        the child cannot start.
+        """
         ours, its = socket.socketpair()
         with ours:
             with its:

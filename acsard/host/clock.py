@@ -1,11 +1,11 @@
-"""Reads the clocks of this computer, and detects that it was suspended.
+"""Reads the clocks of this computer, and detects that this computer was suspended.
 
 In the daemon, no other module reads a clock. The monotonic clock is CLOCK_MONOTONIC_RAW, because
 NTP makes CLOCK_MONOTONIC up to 8 % faster or slower. With CLOCK_MONOTONIC, distances and delays
 would be wrong by the same percentage.
 
-The times in an `Instant` are whole microseconds. More precision would be useless, because reading
-the clocks takes about 1 us, and it would make a recording twice as large.
+The times in an `Instant` are whole microseconds. More precision would make a recording twice as
+large. It would also be useless, because reading the clocks takes about 1 us.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from functools import partial
 from acsard.core.values import NS_PER_S, Instant
 
 mono_ns: Callable[[], int] = partial(time.clock_gettime_ns, time.CLOCK_MONOTONIC_RAW)
-"""Read the monotonic clock, ns. A Python function would be slower."""
+"""Function that reads the monotonic clock, ns. A function defined in Python would be slower."""
 
 
 def asleep_ns() -> int:
@@ -34,8 +34,9 @@ def steady_ns() -> int:
 def steady_s() -> float:
     """Return the time of `steady_ns`, s.
 
-    Programs that send commands or show states take the ages of both from this clock. On a clock
-    that stands still in a suspend, a command or a state from before the suspend would seem fresh.
+    Programs that send commands or show states compute the ages of commands and states with this
+    clock. With a clock that stands still during a suspend, a command or a state from before the
+    suspend would seem fresh.
     """
     return steady_ns() / NS_PER_S
 
@@ -44,10 +45,10 @@ NS_PER_US = 1000
 
 
 def now() -> Instant:
-    """Read the monotonic and the wall clock as close together as possible."""
+    """Return the time of the monotonic clock and of the wall clock, read almost simultaneously."""
     for _ in range(5):
         mono, wall = mono_ns(), time.time_ns()
-        # Two readings take 1 us, unless another process gets the core between them.
+        # Two readings take 1 us, unless another process gets the processor between them.
         if mono_ns() - mono < 50_000:
             break
     return Instant(mono - mono % NS_PER_US, wall - wall % NS_PER_US)

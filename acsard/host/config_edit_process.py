@@ -1,8 +1,8 @@
 """Computes the changed text of an `acsard.toml` for the daemon, in a separate process.
 
-tomlkit needs 0.1 s, and holds the interpreter lock for half a millisecond at a time. In a test with
-tomlkit in a thread of the daemon, the control loop was up to 12 ms late, and missed 3 of 559
-periods.
+The library tomlkit needs 0.1 s for a change, and holds the interpreter lock for half a millisecond
+at a time. In a test with tomlkit in a thread of the daemon, the control loop was up to 12 ms late,
+and missed 3 of 559 periods.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ class Task(Struct, frozen=True):
 
 
 class Result(Struct, frozen=True):
-    """Output of the process: the new text, or an `error` that says why it cannot be made."""
+    """Output of the process: the new text, or an `error` that says why the change failed."""
 
     text: str = ""
     error: str = ""
 
 
 def edited_apart(text: str, keys: Mapping[str, object]) -> str:
-    """Return the configuration text with new values, which a separate process sets.
+    """Return the configuration `text` with the values of `keys`, computed in a separate process.
 
     Raises `ValueError` if the text cannot be changed, and `OSError` if no process can start.
     """

@@ -85,9 +85,11 @@ class Edit(Struct, frozen=True):
 
     file: Path
     keys: Keys
+    """The new values."""
     before: bytes
     """The content of the file from which `after` was computed."""
     after: str
+    """The new content of the file."""
 
 
 def keepable(file: Path | None, keys: Keys) -> Edit:
@@ -157,13 +159,14 @@ def _require_writable(place: Path) -> None:
 def is_tracked(place: Path) -> bool:
     """Return whether git tracks the file. `place` has no symbolic links.
 
-    If git cannot tell, only the `acsard.toml` of a clone of acsard counts as tracked.
+    If git is missing or does not answer, only the `acsard.toml` of a clone of acsard counts as
+    tracked.
     """
     if not any((parent / ".git").exists() for parent in place.parents):
         return False
-    # git refuses to read another user's repository, because its configuration could make git run
-    # that user's programs with the rights of the daemon. A file in such a repository counts as not
-    # tracked.
+    # git refuses to read a repository of another user, because the repository's configuration could
+    # make git run that user's programs with the rights of the daemon. A file in such a repository
+    # counts as not tracked.
     words = ["git", "-C", str(place.parent), "ls-files", "--error-unmatch", "--", place.name]
     try:
         asked = subprocess.run(words, capture_output=True, timeout=2.0)

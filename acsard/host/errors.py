@@ -1,8 +1,9 @@
 """Errors with an external cause that a person can fix, and the exit codes of acsard.
 
-Each error class is an `AcsardError`. Most are also the built-in exception for such a case (for
-example `FileNotFoundError`), so a caller may catch either. The text says what is wrong and how to
-fix it. Bugs have no error class here, and neither have states of the robot such as a lost port.
+Each error class derives from `AcsardError`. Most also derive from the built-in exception for the
+same case (for example `FileNotFoundError`), so a caller may catch either. The text says what is
+wrong and how to fix it. Bugs have no error class here, and neither have states of the robot such as
+a lost port.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ class NoAnswerError(MendableError, TimeoutError):
 
 
 class ReplyError(MendableError, RuntimeError):
-    """The reply is a failure, or it cannot be decoded."""
+    """The daemon replied that the request failed, or its reply cannot be decoded."""
 
 
 class NotDrivenError(MendableError, RuntimeError):

@@ -1,7 +1,7 @@
 """Finds the command that installs an extra, a group of optional libraries in `pyproject.toml`.
 
 acsard is not in any package index. So the command names the directory from which acsard was
-installed, or only the libraries.
+installed. If that directory no longer exists, the command names the libraries of the extra.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def missing(library: str, extra: Extra) -> MendableError:
 
 
 def wanted_by(installed: Distribution, extra: Extra) -> list[str]:
-    """Return the arguments of `pip install` for an extra, such as `DIRECTORY[EXTRA]`.
+    """Return the arguments of `pip install` for an extra, such as ["DIRECTORY[EXTRA]"].
 
     If the directory from which `installed` was installed no longer exists, return the names of the
     libraries in the extra instead.

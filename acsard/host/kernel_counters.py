@@ -1,7 +1,7 @@
 """Reads the kernel's counters that can explain why a program was late.
 
 A value is 0 if this computer does not have the value's file, or if this user may not read the file.
-Reading can take a few milliseconds, so the control loop never does it.
+A reading can take a few milliseconds, so the control loop never reads the counters.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class SlowClock(Struct, frozen=True):
 
 
 class Conditions(Struct, frozen=True, omit_defaults=True):
-    """The conditions under which the processor works now."""
+    """Present conditions that slow the processors down: low voltage, heat or a clock limit."""
 
     undervoltage: bool = False
     hot: bool = False
@@ -106,7 +106,10 @@ def steal(text: str, tick_ns: int) -> tuple[int, ...]:
 
 
 def iowait(text: str, tick_ns: int) -> int:
-    """Return the longest time, ns, that one processor was idle while a program waited for I/O."""
+    """Return how long a processor was idle while a program waited for I/O, ns, from `/proc/stat`.
+
+    Each processor has its own counter. The result is the largest of these counters.
+    """
     return max((int(row[5]) * tick_ns for row in _processors(text)), default=0)
 
 
@@ -158,10 +161,11 @@ def program(text: str, tick_ns: int) -> Program:
 def busiest(
     before: Iterable[Program], after: Iterable[Program], within_ns: int, priority: int
 ) -> Program | None:
-    """Return the process that ran longest between two readings, and how long it ran.
+    """Return the process that used the most processor time between two readings.
 
-    The readings are `within_ns` apart. Returns None if no process used a quarter of one processor.
-    Processes that cannot delay a thread of kernel priority `priority` are ignored.
+    The `ran_ns` of the result is the time that the process ran between the readings, which are
+    `within_ns` apart. Returns None if no process used a quarter of one processor. Processes that
+    cannot delay a thread of kernel priority `priority` are ignored.
     """
     # A process whose nice value is higher by 9 can still delay the thread noticeably. At a
     # difference of 10, the kernel gives the process only a tenth of the thread's weight.
@@ -177,7 +181,7 @@ def busiest(
 
 
 def slow_clock(policy: Mapping[str, str]) -> SlowClock | None:
-    """Return the limit of a processor's clock frequency if it is below 0.6 of the full frequency.
+    """Return the clock limit of a processor if it is below 0.6 of the full frequency, else None.
 
     `policy` maps the file names in the processor's `cpufreq` directory to their texts. The present
     frequency does not matter, because an idle processor runs slowly.
@@ -257,8 +261,8 @@ class Kernel:
         """Return the process that uses the most processor time during the next `seconds` s.
 
         This process itself does not count. Returns None if no other process uses a quarter of a
-        processor and has enough priority to delay this one. Processes of other users are not
-        considered if the kernel hides them.
+        processor and has enough priority to delay this process. Processes that the kernel hides
+        from this user are not considered.
         """
         before, began_ns = list(self.programs()), clock.mono_ns()
         time.sleep(seconds)

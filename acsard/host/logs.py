@@ -3,7 +3,8 @@
 A thread writes the lines from a bounded queue, because a full disk, a closed pipe or a stopped
 terminal must not delay the control loop. Lines that do not fit in the queue are dropped.
 
-In the journal, the values are also separate fields, for `journalctl ACSARD_EVENT=link_down`.
+In the journal, each value of an event is also a separate field. For example, the command
+`journalctl ACSARD_EVENT=link_down` finds all events with the name `link_down`.
 """
 
 from __future__ import annotations
@@ -109,7 +110,7 @@ class Writer:
         """Do nothing: the thread flushes each line."""
 
     def close(self, timeout: float) -> None:
-        """Wait until the queued lines are written, for at most `timeout` s."""
+        """Wait for at most `timeout` s until the queued lines are written."""
         try:
             self._lines.put_nowait(None)
         except queue.Full:
@@ -173,7 +174,7 @@ class Log:
         )
 
     def event(self, event: Event) -> None:
-        """Log an event of the robot, with its sender and its count if it has them."""
+        """Log an event of the robot, with the client that caused it and its count, if known."""
         fields: dict[str, object] = {"text": event.text}
         if event.by:
             fields["by"] = event.by
@@ -186,7 +187,7 @@ class Log:
         self._logger.info(name, **fields)
 
     def close(self) -> None:
-        """Wait until the queued lines are written, for at most 0.2 s."""
+        """Wait for at most 0.2 s until the queued lines are written."""
         self._writer.close(0.2)
 
 

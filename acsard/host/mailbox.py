@@ -22,7 +22,7 @@ T = TypeVar("T")
 
 
 class Bell:
-    """Signal that wakes one waiting thread. A `ring` before `wait` ends the next wait at once."""
+    """Signal that wakes one waiting thread. After a `ring`, the next `wait` returns immediately."""
 
     def __init__(self) -> None:
         self._lock = Lock()
@@ -56,7 +56,7 @@ class Mailbox(Generic[T]):
         attribute is public, because a method call for each of forty mailboxes in each step would be
         slow."""
         self.lost = 0
-        """Number of items that newer ones have displaced; approximate with several writers."""
+        """Number of items that newer items have displaced; approximate with several writers."""
         self._bell = Bell()
         self.wake = wake or self._bell.ring
         """Function that wakes the reader. A writer that calls `store` must call `wake`
@@ -93,9 +93,9 @@ class Mailbox(Generic[T]):
     # The reader's side
 
     def wakes(self, wake: Callable[[], object]) -> None:
-        """Make writers call the function `wake` from now on. They then no longer end `self.wait`.
+        """Let writers call the function `wake` from now on, instead of ending `self.wait`.
 
-        `wake` is called at once if an item waits or the mailbox is closed.
+        If an item waits already or the mailbox is closed, `wake` is also called immediately.
         """
         self.wake = wake
         if self.waiting or self.closed:
@@ -107,7 +107,7 @@ class Mailbox(Generic[T]):
         return self.waiting.popleft() if self.waiting else None
 
     def take(self) -> list[T]:
-        """Remove and return the items that wait now. Items that arrive during the call stay."""
+        """Remove and return the items that wait now. Items that arrive meanwhile stay."""
         items = self.waiting
         return [items.popleft() for _ in range(len(items))]
 

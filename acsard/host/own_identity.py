@@ -16,7 +16,7 @@ from acsard.host.processes import called
 
 
 def own_name() -> str:
-    """Return the user, the machine and the program's name if any, like "alice@laptop patrol"."""
+    """Return the name of this process: user, machine and program, like "alice@laptop patrol"."""
     try:
         user = pwd.getpwuid(os.getuid()).pw_name
     except KeyError:
@@ -38,9 +38,9 @@ def new_secret() -> str:
 
 
 def own_addresses() -> list[str]:
-    """Return this machine's IP addresses without loopback and link-local ones.
+    """Return this machine's IP addresses, except loopback and link-local addresses.
 
-    The result is [] if the command `ip` fails.
+    Returns [] if the command `ip` fails.
     """
     try:
         found = json.loads(called(("ip", "-json", "address"), 5.0).stdout or "[]")

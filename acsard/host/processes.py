@@ -1,7 +1,7 @@
 """Finds the processes that have a device open, and runs commands.
 
-The open files of each process are read from /proc, so no device is opened. Only files below /dev
-are examined, because a file on a network disk that hangs would block this process.
+The module reads the open files of each process from /proc, and opens no device. It examines only
+files below /dev, because a call for a file on a network disk that hangs would block this process.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Token buckets that limit rates, and places that limit how many things exist at once.
+"""Token buckets that limit rates, and a limit on how many things exist at the same time.
 
 A bucket with room for one unit enforces a shortest time between two units. This module reads no
-clock.
+clock: the caller passes the time.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from acsard.core.values import NS_PER_S
 
 
 class Rate(NamedTuple):
-    """A permitted rate: `hz` units per second on average, and `most` units at once."""
+    """A permitted rate: `hz` units per second on average, in bursts of up to `most` units."""
 
     hz: float
     most: float = 1.0
@@ -71,7 +71,10 @@ class Buckets:
 
 
 class Places:
-    """A limited number of places, for example for connections: `most` in all, `of_one` per name."""
+    """A limit on how many places, for example connections, may be in use at the same time.
+
+    At most `most` places may be in use in total, and at most `of_one` for each name.
+    """
 
     def __init__(self, most: int, of_one: int) -> None:
         self._most, self._of_one = most, of_one
@@ -98,7 +101,7 @@ class Places:
 
     @contextmanager
     def held(self, name: str = "") -> Iterator[bool]:
-        """Take a place for the time of the block if one is free, and yield whether one was free."""
+        """Take a place until the block ends, and yield True. If no place is free, yield False."""
         free = self.enter(name)
         try:
             yield free

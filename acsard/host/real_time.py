@@ -20,7 +20,7 @@ limit is needed because the loop has priority over all ordinary programs. A step
 of this time."""
 
 DOZE = "/dev/cpu_dma_latency"
-"""The kernel's device through which a process limits how long a processor may take to wake."""
+"""The kernel's device through which a process limits how long a processor may take to wake up."""
 
 _CAP_IPC_LOCK, _CAP_SYS_NICE = 14, 23
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
@@ -34,7 +34,7 @@ def ask() -> str:
     asked = {
         "real-time scheduling": _schedule(),
         "locked memory": _lock(),
-        "an awake processor": _stay_awake(),
+        "keeping the processor awake": _stay_awake(),
     }
     refused = [what for what, granted in asked.items() if not granted]
     if not refused:
@@ -95,15 +95,15 @@ def _stay_awake() -> bool:
         return True
     except OSError:
         return False
-    # The written value is 0 us. It is in force while the file is open, so until this process ends.
+    # The limit is 0 us. It is in force while the file is open, which is until this process ends.
     os.write(wish, bytes(4))
     return True
 
 
 def _lock() -> bool:
-    # Under a finite limit this call might succeed, but a later allocation might fail. So ask only
-    # without a limit or with the capability. Without the capability, as in a container, the limit
-    # also applies to root.
+    # With a finite limit this call might succeed, but a later allocation might fail. So lock memory
+    # only without a limit, or with the capability that overrides the limit. Root lacks the
+    # capability in some containers.
     unlimited = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY
     if not unlimited and not _capable(_CAP_IPC_LOCK):
         return False

@@ -47,7 +47,7 @@ class Systemd:
         self._send("READY=1")
 
     def stopping(self) -> None:
-        """Report that the daemon is ending, so that the watchdog need no longer be fed."""
+        """Report that the daemon is ending. systemd then no longer expects watchdog signals."""
         self._send("STOPPING=1\nSTATUS=ramping to zero")
 
     def waiting(self, why: str) -> None:

@@ -1,4 +1,4 @@
-"""Decides whether output may contain colours, and makes the terminal deliver single key presses."""
+"""Decides whether output may contain colors, and makes the terminal deliver single key presses."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from typing import TextIO
 
 
 def coloured(stream: TextIO) -> bool:
-    """Return whether the stream is a terminal with colours, and NO_COLOR is not set."""
+    """Return whether the stream is a terminal with colors, and NO_COLOR is not set."""
     wanted = not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
     return wanted and stream.isatty()
 
 
 @contextmanager
 def one_by_one() -> Iterator[None]:
-    """Let standard input deliver each key press at once, until the block ends.
+    """Let standard input deliver each key press immediately, without Enter, until the block ends.
 
     Ctrl-S becomes an ordinary key. Otherwise Ctrl-S would block a program that drives the robot.
     """

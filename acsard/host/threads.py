@@ -23,9 +23,9 @@ async def in_thread(
 ) -> T:
     """Call `call` in a thread of its own, and return its result.
 
-    Raises `TimeoutError` after `timeout` s (None waits for ever), and `NoThreadError` at once if no
-    thread can be started. If the caller has stopped waiting when the result comes, a thread calls
-    `late` with the result, so that `late` can release it.
+    Raises `TimeoutError` after `timeout` s (None waits for ever), and `NoThreadError` if no thread
+    can be started. If the caller has stopped waiting when the result comes, a thread calls `late`
+    with the result, for example to close a file that `call` has opened.
     """
     loop = asyncio.get_running_loop()
     future: asyncio.Future[T] = loop.create_future()

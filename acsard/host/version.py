@@ -27,7 +27,7 @@ def version() -> str:
 
 
 def commit_of(clone: Path) -> str:
-    """Return the commit that is checked out in this directory, or "" if it is not a git clone.
+    """Return the commit that is checked out in this directory, or "" if no git clone is there.
 
     This function reads git's files itself, because a computer that runs the daemon may have no git.
     The files do not show whether the source has changed since the commit.

@@ -1,8 +1,9 @@
 """Creates the certificate authority of a robot and the certificates that it signs, all as files.
 
 The keys are P-256 keys, in files that only their owner can read. People make their phones trust the
-authority, so its certificate limits the hosts for which it may sign. A thief of the authority's key
-can pose as a robot or as a host of a private network, but not as any other web site.
+authority, so the authority's certificate limits the hosts for which it may sign. A thief of the
+authority's key can pose as a robot or as a host of a private network, but not as a web site on the
+Internet.
 """
 
 from __future__ import annotations
@@ -47,10 +48,11 @@ class Authority:
     ) -> Authority:
         """Create an authority with the common name `name`, and write its files into `directory`.
 
-        The authority's own certificate is valid for five times `days`. It may sign for the host
-        names in `addresses` and `LOCAL`, with all names below them. It may also sign for the IP
-        addresses in `addresses` and `PRIVATE`. For an IPv6 address in `addresses`, it may sign for
-        the whole /64 network. Common names, which identify clients on the bus, are not limited.
+        The authority's own certificate is valid for five times `days` days. The authority may sign
+        for the host names in `addresses` and `LOCAL`, and for all names below them. It may also
+        sign for the IP addresses in `addresses` and `PRIVATE`. For an IPv6 address in `addresses`,
+        it may sign for the whole /64 network. Common names, which identify clients on the bus, are
+        not limited.
         """
         directory.mkdir(mode=0o755, parents=True, exist_ok=True)
         key = ec.generate_private_key(ec.SECP256R1())
@@ -68,9 +70,10 @@ class Authority:
 
     @classmethod
     def load(cls, directory: Path, password: Callable[[], str]) -> Authority:
-        """Load the authority from `directory`. If the key is encrypted, `password` is called.
+        """Load the authority from `directory`.
 
-        Raises `OSError` or `ValueError` if the authority cannot be loaded.
+        If the key is encrypted, `password` is called and must return the password. Raises `OSError`
+        or `ValueError` if the authority cannot be loaded.
         """
         data = (directory / CA_KEY).read_bytes()
         try:
@@ -108,7 +111,10 @@ class Authority:
         )
 
     def names_in(self, directory: Path) -> list[str]:
-        """Return the names and addresses in the certificate in `directory`; [] if unreadable."""
+        """Return the host names and IP addresses that the certificate in `directory` is valid for.
+
+        Returns [] if the certificate cannot be read.
+        """
         try:
             found = x509.load_pem_x509_certificate((directory / CERTIFICATE).read_bytes())
             names = found.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
@@ -118,10 +124,11 @@ class Authority:
         return [*names.get_values_for_type(x509.DNSName), *map(str, addresses)]
 
     def issue(self, directory: Path, name: str, addresses: list[str], days: float) -> None:
-        """Sign a certificate for servers and clients, and write it into `directory`.
+        """Create a key and a certificate for use as server and client, valid for `days` days.
 
-        The key of the new certificate and the authority's certificate are written too. `name` is
-        the common name. `addresses` are the host names and IP addresses of the certificate's owner.
+        The key, the new certificate and the authority's certificate are written into `directory`.
+        `name` is the common name. `addresses` are the host names and IP addresses of the
+        certificate's owner.
         """
         directory.mkdir(mode=0o755, parents=True, exist_ok=True)
         key = ec.generate_private_key(ec.SECP256R1())
@@ -157,7 +164,7 @@ def _builder(
         .issuer_name(issuer)
         .public_key(key)
         .serial_number(x509.random_serial_number())
-        # The validity begins an hour ago, because a robot's clock may be behind when it starts.
+        # The validity begins an hour ago, because the clock of a robot may be behind at its start.
         .not_valid_before(min(now, now + timedelta(days=days)) - timedelta(hours=1))
         .not_valid_after(now + timedelta(days=days))
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)

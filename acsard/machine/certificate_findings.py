@@ -37,11 +37,11 @@ def certificates(tls: str) -> Iterator[Finding]:
     for name in (CA, CERTIFICATE, KEY):
         file = directory / name
         if not os.access(file, os.R_OK):
-            text = f"{file} is missing, or you may not read it"
+            text = f"{file} is missing, or you have no permission to read it"
             yield Finding("certificates", "failure", text, _mend_of_absent(directory))
         elif name == KEY and file.stat().st_mode & 0o077:
             text, mend = (
-                f"users other than the owner may read the private key {file}",
+                f"users other than the owner can read the private key {file}",
                 f"chmod 600 {shlex.quote(str(file))}",
             )
             yield Finding("certificates", "failure", text, mend)

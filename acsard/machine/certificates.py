@@ -52,7 +52,7 @@ def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -
         raise MendableError(
             f"{directory / CA} exists: `acsard tls add` makes one more certificate with it; "
             "--force makes a new authority, and then the daemon refuses all certificates of the "
-            "old one",
+            "old authority",
         )
     maker = _maker()
     _writable(directory)
@@ -117,10 +117,11 @@ def renew(directory: Path, addresses: Sequence[str], days: int) -> list[str]:
 
 
 def _names_of(name: str) -> list[str]:
-    """Return the host names that a certificate with this common name should contain.
+    """Return the host names that a certificate with the common name `name` should contain.
 
     If a certificate contains no host name, OpenSSL checks its common name, such as `anna.meyer` or
-    `10.0.0.5`, as a host name. It refuses the certificate if the authority may not sign for it.
+    `10.0.0.5`, as a host name. OpenSSL then refuses the certificate if the authority may not sign
+    for that name.
     """
     named = [name] if ADDRESS.match(name) else []
     if not HOST_LIKE.match(name) or name.endswith(".local"):
@@ -149,7 +150,11 @@ def _robot_names(more: Sequence[str]) -> list[str]:
 
 
 def keys(config: Config, directory: Path) -> dict[str, object]:
-    """Return the settings with which the bus uses the certificates and accepts other machines."""
+    """Return the settings `bus.listen` and `bus.tls`, with which other machines can connect.
+
+    `directory` contains the robot's certificate. `bus.listen` keeps the endpoints in `config`, and
+    gets a TLS endpoint if it has none.
+    """
     listen = list(config.bus.listen)
     if not any(endpoint.startswith("tls/") for endpoint in listen):
         listen.append(f"tls/0.0.0.0:{PORT}")
@@ -157,7 +162,7 @@ def keys(config: Config, directory: Path) -> dict[str, object]:
 
 
 def port(config: Config) -> str:
-    """Return the port of the first endpoint with TLS in the settings of `keys`."""
+    """Return the port of the first TLS endpoint in the setting `bus.listen` that `keys` returns."""
     ports = [at.rpartition(":")[2] for at in config.bus.listen if at.startswith("tls/")]
     return ports[0] if ports else str(PORT)
 

@@ -61,15 +61,15 @@ WAYS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = (
     (
         lambda key: key in OPTIONS,
         "ok",
-        "they come from the options of `acsard run` or from another file, or the file has changed "
-        "since the daemon started",
+        "these values come from the options of `acsard run` or from another file, or the file has "
+        "changed since the daemon started",
         "to keep {which} after a restart, write these lines into the file: {lines}",
     ),
     (
         lambda key: key not in OPTIONS and live(key) is None,
         "warning",
-        "they come from another file or from the daemon's environment, or the file has changed "
-        "since the daemon started",
+        "these values come from another file or from the daemon's environment, or the file has "
+        "changed since the daemon started",
         "if the daemon runs with another file, name that file with --config; otherwise either "
         "write the daemon's values into this file, or restart the daemon with this file. The "
         "findings below are about the running daemon",
@@ -77,8 +77,8 @@ WAYS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = (
     (
         lambda key: live(key) is not None,
         "warning",
-        "they were set while the daemon ran, or come from another file, or the file has changed "
-        "since the daemon started",
+        "these values were set while the daemon ran, or come from another file, or the file has "
+        "changed since the daemon started",
         "when the daemon starts again, it uses the file's values; `acsard set KEY VALUE --write` "
         "writes a value into the file",
     ),
@@ -109,8 +109,8 @@ class Running(Struct, frozen=True):
 def asked(config: Config, address: Address) -> Running:
     """Query the daemon at this address. Raises an `AcsardError` if it does not answer.
 
-    `config` is the configuration in the local file. If this client may not query the daemon's
-    configuration, `config` is used instead, corrected by the daemon's `info`.
+    `config` is the configuration in the local file. If this client cannot query the daemon's
+    configuration, `config` is used instead, with the values that the daemon's `info` contains.
     """
     endpoint, robot_id, tls = address
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
@@ -126,7 +126,10 @@ def asked(config: Config, address: Address) -> Running:
 
 
 def _configuration(robot: Client, info: Info, file: Config) -> Config:
-    """Return the daemon's configuration. If unreadable, return `file` with `info`'s values."""
+    """Return the daemon's configuration.
+
+    If it cannot be queried, return `file` with the values that `info` contains.
+    """
     try:
         return from_builtins(robot.get("config"))
     except (AcsardError, msgspec.ValidationError):  # not permitted, or a daemon of another version
@@ -136,7 +139,11 @@ def _configuration(robot: Client, info: Info, file: Config) -> Config:
 
 
 def compared(running: Running, file: Config) -> Iterator[Finding]:
-    """Yield findings that compare the daemon's configuration with the configuration file."""
+    """Yield findings about keys whose value in the running daemon differs from that in `file`.
+
+    Each row of `WAYS` that applies to such keys gives one finding. If no value differs, there is
+    one finding with the level "ok".
+    """
     info, others = running.info, differences(running.config, file)
     who = f"acsard {info.version}, pid {info.pid}"
     if not others:
@@ -166,7 +173,10 @@ def _tables(its: Mapping[str, Difference]) -> str:
 
 
 def answers(endpoint: str) -> bool:
-    """Return whether a program listens at an endpoint. Raises `UsageError` if it is not valid."""
+    """Return whether a program listens at `endpoint`.
+
+    Raises `UsageError` if `endpoint` is not a valid endpoint.
+    """
     host, _, port = reachable(endpoint).partition("/")[2].rpartition(":")
     if not (host and port.isascii() and port.isdigit() and 0 < int(port) < 65536):
         raise no_endpoint(endpoint)
@@ -196,11 +206,11 @@ def link(running: Running) -> Iterator[Finding]:
     passed = {
         key: count - running.before.counters.get(key, 0) for key, count in state.counters.items()
     }
-    # A fault is a warning only if it occurs more than once a day on average. `often` is the number
-    # of days that the daemon has run.
+    # A loss of the link is a warning only if it occurs more than once a day on average. The limit
+    # `often` is therefore the number of days that the daemon has run.
     often = state.counters.get("lines_sent", 0) / config.rate_hz / 86400
     # The built-in simulator runs in the daemon and is never unplugged. So this computer has caused
-    # every loss of a link to it.
+    # every loss of the link to the simulator.
     if late := state.counters.get(f"link_lost{'' if config.mcu.simulated else '_host_stall'}", 0):
         late_times = many(late, "time")
         text = (
@@ -276,7 +286,7 @@ def lost(passed: Mapping[str, int], config: Config) -> Iterator[str]:
     `passed` says by how much each counter rose within a second.
     """
     sent, came = passed.get("lines_sent", 0), passed.get("lines", 0)
-    # With fewer than 40 lines, a fraction means nothing.
+    # Fewer than 40 lines are too few to judge the share of lost lines.
     if config.mcu.reply_period or sent < 40 or came >= (1 - LOST) * sent - 1:
         return
     yield (
@@ -286,7 +296,7 @@ def lost(passed: Mapping[str, int], config: Config) -> Iterator[str]:
 
 
 def refused(counters: Mapping[str, int]) -> list[str]:
-    """Return a warning in a list if the daemon rejected many lines of the board, else []."""
+    """Return a list with one warning if the daemon rejected many lines of the board, else []."""
     kinds = {
         name.removeprefix("line_"): count
         for name, count in counters.items()
@@ -312,7 +322,7 @@ def gone(counters: Mapping[str, int]) -> list[tuple[int, str]]:
 
 
 def check(running: Running) -> str:
-    """Return the command that examines the board, and the preparation that the command needs."""
+    """Return the advice to run `acsard mcu check`, with the preparation that it needs."""
     port = running.config.mcu.port
     return (
         f"`acsard mcu check --port {port}` finds the cause. Before you run it, lift the wheels off "
@@ -472,12 +482,12 @@ def certificate(row: DiagnosticStatus | None, here: bool) -> Iterator[Finding]:
             "acsard`. The daemon uses the new files for its next connection. A restart of the "
             "daemon ends this warning at once, but stops the robot"
         )
-    text = f"the first certificate of the daemon to expire: {row.message}"
+    text = f"the daemon's certificate that expires first: {row.message}"
     yield Finding("certificates", LEVELS[min(row.level, 2)], text, mend)
 
 
 def late(running: Running) -> Iterator[Finding]:
-    """Yield a warning if the daemon misses control periods, and the last known causes.
+    """Yield a warning if the daemon misses control periods, and findings with the latest causes.
 
     The counters cover the time since the daemon's start. The diagnostics cover recent periods.
     """
@@ -504,15 +514,16 @@ def late(running: Running) -> Iterator[Finding]:
 
 
 def clocks(running: Running) -> Iterator[Finding]:
-    """Yield warnings about a daemon's clock that differs from this machine's, and replaced stamps.
+    """Yield a warning if the daemon's clock is wrong, and one if Zenoh has replaced time stamps.
 
-    The daemon read its clock at an unknown moment between the request and the answer. So a clock
-    difference of up to 0.4 s plus half of the time between request and answer is tolerated. Zenoh
-    replaces the stamps of commands from a computer whose clock is more than 0.5 s ahead.
+    The daemon's clock is compared with this machine's clock. The daemon read its clock at an
+    unknown moment between the request and the answer. So a difference of up to 0.4 s plus half of
+    the time between request and answer is tolerated. Zenoh replaces the stamps of commands from a
+    computer whose clock is more than 0.5 s ahead.
     """
     its_ns, counters = running.state.stamp.to_ns(), running.state.counters
     apart = (its_ns - running.looked_ns) / NS_PER_S
-    # If a clock is ahead by more than 0.5 s, Zenoh replaces its stamps.
+    # Zenoh replaces the stamps of a clock that is more than 0.5 s ahead.
     if not running.here and abs(apart) > 0.4 + running.trip_ns / 2 / NS_PER_S:
         way = "ahead of" if apart > 0 else "behind"
         text = f"the daemon's clock is {abs(apart):.1f} s {way} this machine's"
@@ -570,7 +581,7 @@ def linked(rows: Mapping[str, DiagnosticStatus]) -> Iterator[Finding]:
 
 
 def gateway(config: Config) -> Iterator[Finding]:
-    """Yield a finding for each configured endpoint of the TLS gateway: whether it listens there."""
+    """Yield a finding for each endpoint of the TLS gateway that says whether it listens there."""
     for endpoint in config.bus.outside:
         if answers(endpoint):
             yield Finding("gateway", "ok", f"open at {endpoint}")

@@ -1,11 +1,12 @@
 """Runs all examinations of `acsard doctor` in order.
 
 `certificate_findings.py` examines the certificates, and `daemon_findings.py` the daemon and its
-link. The doctor opens no port, and only queries a robot.
+serial link. The doctor opens no serial port, and sends only queries to a robot.
 
-If a daemon runs, the doctor examines the daemon's configuration, which may differ from the file
-after an edit or through options. If the daemon runs on another machine, the doctor examines only
-the daemon's reports, because the daemon's port, files and gateway are on that machine.
+If a daemon runs, the doctor examines the configuration of the daemon instead of that in the file.
+The two differ if the file was edited since the daemon's start, or if the daemon was started with
+options. If the daemon runs on another machine, the doctor examines only the daemon's reports,
+because the daemon's port, files and gateway are on that machine.
 """
 
 from __future__ import annotations
@@ -55,9 +56,9 @@ def meddlers() -> Iterator[Finding]:
 
 
 def clock_set() -> Iterator[Finding]:
-    """Yield a finding that says whether the wall clock, which dates all messages, is set."""
+    """Yield a finding that says whether the wall clock is set. This clock dates all messages."""
     year = time.gmtime(clock.now().wall_ns / NS_PER_S).tm_year
-    if year < 2026:  # boards without a battery start in the past
+    if year < 2026:  # a computer without a battery for its clock starts with an old date
         mend = (
             "set this computer's clock (timedatectl), or run chrony: the time stamps of the "
             "odometry come from this clock"
@@ -92,7 +93,9 @@ def scheduling(wanted: bool, pid: int | None) -> Iterator[Finding]:
     elif real_time.allowed():
         yield Finding("real time", "ok", "this user may use real-time scheduling")
     else:
-        yield Finding("real time", "warning", "this user may not use real-time scheduling", REAL)
+        yield Finding(
+            "real time", "warning", "this user has no permission for real-time scheduling", REAL
+        )
 
 
 LOOK_S = 0.3
@@ -117,7 +120,7 @@ def slowness(kernel: Kernel | None = None) -> Iterator[Finding]:
 
 
 def serial_port(config: Config) -> Iterator[Finding]:
-    """Yield findings about the port: whether it exists, may be opened, and is used by others."""
+    """Yield findings that say whether the port exists, may be opened, and is in use."""
     path = config.mcu.port
     if path == "sim":
         mend = (
@@ -154,7 +157,7 @@ def serial_port(config: Config) -> Iterator[Finding]:
 
 
 def _hardware(name: str) -> Iterator[Finding]:
-    """Yield warnings about an unknown board, and about a USB chip that delays bytes."""
+    """Yield a warning if the board is unknown, and one if its USB chip delays bytes."""
     usb = [port for port in serial_devices() if port.device == f"/dev/{name}"]
     if usb and usb[0].usb_id and not usb[0].board:
         known = ", ".join(sorted(BOARDS))
@@ -186,7 +189,7 @@ def _permission(path: str) -> Finding:
         group = str(os.stat(path).st_gid)
     mend = f"run `sudo usermod -aG {group} $USER`, then log in again"
     if group == "dialout":
-        mend += " (the systemd service needs no such step, because its unit names the group)"
+        mend += " (the systemd service does not need this, because its unit names the group)"
     return Finding(
         "port", "failure", f"{path} belongs to group {group}, but you are not in it", mend
     )
@@ -217,8 +220,8 @@ def examine(
     running = found(config, address)
     if isinstance(running, Running) and not running.here:
         elsewhere = (
-            f"the daemon runs on another machine (here, its pid {running.info.pid} is not a "
-            "process of acsard)"
+            "the daemon runs on another machine (on this machine, no process of acsard has its pid "
+            f"{running.info.pid})"
         )
         yield Finding(
             "daemon", "ok", f"{elsewhere}: check its serial port, files and TLS gateway there"
@@ -238,8 +241,8 @@ def examine(
         config.control.real_time, running.info.pid if isinstance(running, Running) else None
     )
     yield from slowness()
-    # The running daemon may use copies, which systemd made of the certificates at its start. So
-    # also examine the directories with the original files.
+    # The running daemon may use copies of the certificates, which systemd made when the daemon
+    # started. So also examine the directories with the original files.
     for directory in dict.fromkeys((config.bus.tls, address.tls, written)):
         yield from certificates(directory)
     yield from routers(config)

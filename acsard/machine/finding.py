@@ -12,7 +12,7 @@ LEVELS: tuple[Level, ...] = ("ok", "warning", "failure")
 
 
 class Finding(Struct, frozen=True):
-    """Result of `acsard doctor` for one subject. `mend` is the remedy, advice or ""."""
+    """Result of `acsard doctor` for one subject. `mend` is the advice to the user, or ""."""
 
     subject: str
     level: Level

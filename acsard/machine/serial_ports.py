@@ -43,7 +43,7 @@ class SerialDevice(Struct, frozen=True):
 
 
 def serial_devices() -> list[SerialDevice]:
-    """Return the serial ports that are plugged in; ports without hardware are left out."""
+    """Return the serial ports that have hardware, such as USB ports with a device plugged in."""
     links = _links()
     found = []
     for port in sorted(list_ports.comports(), key=lambda p: str(p.device)):

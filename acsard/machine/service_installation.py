@@ -1,8 +1,8 @@
 """Installs acsard as a system service, or removes it.
 
-The files come from `deploy/`, with the path of this installation in the units. A file that another
-person or program has written is neither overwritten nor removed without force. The user can read
-the text of every step before the steps are carried out.
+The files come from `deploy/`, with the path of this installation in the units. Without `force` or
+`purge`, the module neither replaces nor removes a file that another person or program has changed.
+The user can read the text of every step before the steps are carried out.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ GROUP, SETPRIV = "dialout", "/usr/bin/setpriv"
 """
 
 OUT_OF_SIGHT = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
-"""Directories that are hidden from the service."""
+"""Directories that systemd hides from the service."""
 
 
 def misplaced(
@@ -60,24 +60,24 @@ def misplaced(
         closed = _closed(path)
         if closed:
             return (
-                f"the service's user may not enter {closed}, but needs {path}; run `chmod o+rx "
-                f"{closed}`, or {_anew(prefix)}"
+                f"the service's user has no permission to enter {closed}, but needs {path}; run "
+                f"`chmod o+rx {closed}`, or {_anew(prefix)}"
             )
     return ""
 
 
 def lacking(group: str = GROUP, program: str = SETPRIV) -> str:
-    """Return what the units need and this system does not have, or "" if it has all of it."""
+    """Return which group or program this system lacks but the units need, in words; else ""."""
     if not os.access(program, os.X_OK):
         return (
-            f"{program} is missing, with which the service stops the wheels after the daemon's "
+            f"{program} is missing, but the service needs it to stop the wheels after the daemon's "
             "end; install the package util-linux"
         )
     try:
         grp.getgrnam(group)
     except KeyError:
         return (
-            f"this system has no group {group}, which gives the service the serial port; run "
+            f"this system has no group {group}, which lets the service use the serial port; run "
             f"`groupadd --system {group}`, or see deploy/systemd/README.md for another group"
         )
     return ""
@@ -102,7 +102,7 @@ def _closed(path: Path) -> Path | None:
         except PermissionError:
             return place
         except OSError:
-            # The path does not exist, so nothing keeps the service out.
+            # The path does not exist, so no permission keeps the service out.
             return None
         if not mode & stat.S_IXOTH:
             return place
@@ -110,8 +110,7 @@ def _closed(path: Path) -> Path | None:
 
 
 OURS = ("bin", "acsard", "acsard.service.d", "acsard-gateway.service.d", "acsard-web.service.d")
-"""Names of the directories that the removal of the service also removes if they have become
-empty."""
+"""Names of the directories that the removal of the service also removes, if they are then empty."""
 
 
 class File(Struct, frozen=True):
@@ -136,7 +135,8 @@ class File(Struct, frozen=True):
     def is_as_written(self) -> bool:
         """Return whether the existing file has the mode of the installation, and root owns it.
 
-        Return True for a `kept` file and for a symbolic link: the user decides about these.
+        Also return True for a `kept` file and for a symbolic link, because the user decides about
+        such a file.
         """
         status = self.path.lstat()
         if self.kept or stat.S_ISLNK(status.st_mode):
@@ -361,9 +361,9 @@ def installing(
 ) -> list[Step]:
     """Return the steps that install the service; `found` has the present contents of the files.
 
-    `wrong` are the files with a wrong mode or owner. Such a file is written again if its content
-    is that of the installation. Raises `MendableError` if a step would replace a changed file,
-    unless `force` is set.
+    `wrong` contains the files with a wrong mode or owner. If only the mode or the owner of a file
+    is wrong, the file is written again. Raises `MendableError` if a step would replace a file with
+    changed content, unless `force` is set.
     """
     steps: list[Step] = []
     changed: list[str] = []
@@ -415,8 +415,8 @@ def uninstalling(
     missing.
     """
     wanted, stateful = list(wanted), list(stateful)
-    # systemd knows the real path of a state directory, but only while the unit is installed. An
-    # earlier uninstallation may have removed the unit and kept the directory.
+    # Only systemd knows the real path of a state directory, and only while the unit is installed.
+    # An earlier uninstallation may have removed the unit and kept the directory.
     again = [
         file for file in wanted if purge and file.path.name in stateful and found[file.path] is None
     ]

@@ -81,6 +81,10 @@ REWORDED: tuple[tuple[str, str], ...] = (
     (": only straight", ": the robot drives only straight"),
     ("stopped at the start, because", "stopped when the daemon started, because"),
     ("a stop cannot be kept over a restart", "a stop would not survive a restart"),
+    (
+        "a stop would not survive a restart: (?!the latch file)(.+?): ",
+        r"a stop would not survive a restart: the latch file (\1) cannot be written: ",
+    ),
     ("it is of another version", "another version of acsard wrote the file"),
     (
         r"what else runs here\? \(`top`; as a service it goes first\)",

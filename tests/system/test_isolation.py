@@ -435,5 +435,5 @@ def test_who_takes_all_connections_is_in_the_log_and_in_the_state(
     # A quiet machine makes the 255 handshakes in less than 5 s, a busy one in more.
     robot.attacked("sessions", "unlisted", 40.0, "gateway_full")
     (line,) = robot.daemon.events("gateway_full")
-    assert line["text"].startswith("all 255 connections are taken, 255 by unlisted")
+    assert line["text"].startswith("all 255 connections are in use, 255 by unlisted")
     assert robot.counters["gateway_full"] > 0

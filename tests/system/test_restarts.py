@@ -294,7 +294,7 @@ def test_a_state_directory_that_takes_no_file_starts_the_robot_stopped_and_says_
     with running(tmp_path, peer.path, config) as (daemon, bus):
         state = bus.state()
         assert state["mode"] == "stopped"
-        assert "a stop would not survive a restart: /sys/acsard/" in state["reason"]
+        assert "a stop would not survive a restart: the latch file (/sys/acsard/" in state["reason"]
         assert state["latch_file_error"].startswith("a stop would not survive")
         until(lambda: daemon.events("latch_file"), 5.0, "the log says so")
         release(bus, "stop")

@@ -2,9 +2,9 @@
 
 Zenoh denies every message that no rule allows.
 
-- Zenoh checks the rules where a client's link ends: in the daemon's session or, over TLS, in that
-  of the TLS gateway. This session knows only the neighbour on the link, so a client that connects
-  through a router has the permissions of the router.
+- Zenoh checks the rules in the session at the end of a client's link. That is the daemon's session
+  or, over TLS, the session of the TLS gateway. This session knows only the neighbor on the link, so
+  a client that connects through a router has the permissions of the router.
 - A rule allows a message only if one of the rule's key expressions includes the whole key
   expression of the message. A query with a wildcard therefore needs a rule with a wildcard.
 - A client over TLS may use exact keys only, unless `access.wildcards` is set. A few wildcards can
@@ -12,7 +12,8 @@ Zenoh denies every message that no rule allows.
 - The daemon checks the exact key, the kind (PUT) and the source of each command again.
 
 Zenoh does not tell the daemon the certificate of a sample's sender. Therefore each certificate that
-may command has separate keys, which end with its name. Only that certificate may put on them.
+may command has command keys of its own, which end with the name of the certificate. The rules let
+only a client with that certificate put on these keys.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ def _grants(role: Role) -> tuple[str, ...]:
 
 
 USES = ("subscribes", "queries", "publishes")
-"""Uses of keys. Each is the last word in the name of a rule, as in "viewer queries"."""
+"""Words for the uses of keys. The name of a rule ends with such a word, as in "viewer queries"."""
 
 GRANTS: dict[Role, tuple[str, ...]] = {role: _grants(role) for role in ROLES}
 """The names of the rules of each role. `_rules` defines the rules."""
@@ -75,7 +76,7 @@ WIDE: dict[Role, tuple[str, ...]] = {
     "operator": ("roam", "recall"),
     "maintainer": ("roam", "recall", "browse", "attend"),
 }
-"""The names of the rules that `access.wildcards` adds to each role."""
+"""The names of the rules that each role gets in addition if `access.wildcards` is true."""
 
 LOCAL = (
     *GRANTS["maintainer"],
@@ -89,8 +90,8 @@ LOCAL = (
 )
 """The names of the rules of a client on the robot's own machine: a maintainer's rules and more.
 Such a client may also subscribe with any wildcard and receive the commands of other clients. It may
-put on wrong keys, so that the daemon can count its sample and refuse it with a reason. It may not
-put on the keys on which the robot publishes."""
+put on keys that do not exist, so that the daemon can count such a sample and refuse it with a
+reason. It may not put on the keys on which the robot publishes."""
 
 Flow = Literal["ingress", "egress"]
 
@@ -162,8 +163,8 @@ class _Keys:
     def commands_by(self, certificate: str) -> list[str]:
         """Return the command keys of all sources for the certificate with this common name.
 
-        "*" gives the keys of all certificates. A router needs these keys, because it forwards the
-        commands of every client.
+        For the name "*", the result is key expressions that include the keys of all certificates. A
+        router needs these key expressions, because it forwards the commands of every client.
         """
         return [full_key(self._robot, key) for key in source_keys(self._sources, certificate)]
 
@@ -213,7 +214,10 @@ def gateway_access(config: Config) -> dict[str, object]:
 
 
 def _access(config: Config, local: tuple[str, ...], *, gateway: bool) -> dict[str, object]:
-    """Return `access_control`. `local` names the rules for links without a certificate."""
+    """Return the value of `access_control`.
+
+    `local` contains the names of the rules for links without a certificate.
+    """
     keys = _Keys(config)
     rules = _rules(keys)
     access = config.access
@@ -261,8 +265,8 @@ def _access(config: Config, local: tuple[str, ...], *, gateway: bool) -> dict[st
 
 def _rules(keys: _Keys) -> dict[str, Rule]:
     tokens = [keys.alive, *keys.claims, *keys.kept, *TOKENS]
-    # The gyro's key is not forbidden, although the simulator publishes on it. So the daemon
-    # receives a client's sample on this key, and can refuse it with a reason.
+    # The gyro's key is not forbidden, although the daemon of a simulator publishes on it. So the
+    # daemon receives a client's sample on this key, and can refuse the sample with a reason.
     forged = [key for key in keys.answered if key != keys.imu]
     following = ["declare_subscriber", "declare_liveliness_subscriber", "liveliness_query"]
     rules = [

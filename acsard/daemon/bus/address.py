@@ -1,4 +1,4 @@
-"""Finds the endpoint, the robot id and the certificate directory for a tool that connects."""
+"""Finds the endpoint, the robot id and the certificate directory for a client of a robot."""
 
 from __future__ import annotations
 
@@ -88,8 +88,8 @@ def require_id(robot_id: str) -> None:
         convert(robot_id, Name)
     except ValidationError:
         raise UsageError(
-            f"{robot_id!r} is not a robot's id: write 1 to 32 characters of A-Z a-z 0-9 _ -, like "
-            "robot.id in its acsard.toml"
+            f"{robot_id!r} is not a robot's id: an id has 1 to 32 characters of A-Z a-z 0-9 _ -; "
+            "write the value of robot.id in the robot's acsard.toml"
         ) from None
 
 

@@ -63,7 +63,10 @@ class ZenohBus:
         return self._outlets.wanted
 
     def take(self, queries: int) -> BusInput:
-        """Return the input since the last call, with at most `queries` queries (`Inbox.take`)."""
+        """Return the input from the bus since the last call.
+
+        `Inbox.take` explains `queries`, the limit on the number of returned queries.
+        """
         taken = self._inbox.take(queries)
         routers = self._links.changed()
         if routers is not None:
@@ -106,7 +109,8 @@ class ZenohBus:
             if conflict:
                 session.close()
                 raise InUseError(conflict)
-        # Set `own_id` before the first key is declared, because a sample may arrive at once.
+        # Set `own_id` before the first key is declared, because a sample may arrive immediately
+        # afterwards.
         self._inbox.own_id = session.new_timestamp().get_id()
         self._replies.start(session)
         self._declare_native(session)
@@ -160,8 +164,9 @@ class ZenohBus:
     def _declare_json(self, session: zenoh.Session, topic: Topic) -> None:
         """Declare the topic's JSON key, for clients without msgpack.
 
-        Its publisher is never latched, because a latched publisher must encode every message even
-        without subscribers. A query on the key returns the present value instead.
+        The publisher on this key is never latched, because a latched publisher must encode every
+        message even without subscribers. A late subscriber can query the key for the present value
+        instead.
         """
         below = json_key(topic.key)
         key, encoding = full_key(self._id, below), encoding_name("json", topic.type)
@@ -205,7 +210,7 @@ class ZenohBus:
 
 
 def _others(session: zenoh.Session, alive: str, claims: tuple[str, ...]) -> set[str]:
-    """Return the tokens among `alive` and `claims` that other sessions hold.
+    """Return the liveliness tokens among `alive` and `claims` that other sessions hold.
 
     Blocks for up to `TWIN_TIMEOUT_S`.
     """

@@ -1,4 +1,4 @@
-"""Watches the certificate files of the bus: whether they are replaced, and when they expire.
+"""Detects that the certificate files of the bus were replaced, and reads when they expire.
 
 Zenoh reads the files of a listening endpoint only when it opens the endpoint. So a process that
 listens must know when its files have been replaced (`CertificateFiles.renewed`). Three files cannot
@@ -73,34 +73,35 @@ ENDS_LOOK_S = 60.0
 """Pause between two readings of the expiry times, s."""
 
 ROUTER_LOOKS = 60
-"""The routers' certificates are read once in this many readings of the robot's files, because each
-reading takes one of the router's connections. If a router did not answer, all routers are tried
-again at the next reading of the robot's files."""
+"""Number of readings of the robot's files for each reading of the routers' certificates. The
+routers' certificates are read more rarely, because each reading uses one of the router's
+connections. If a router did not answer, all routers are tried again at the next reading of the
+robot's files."""
 
 
 def ends_of(routers: Iterable[str], directory: str) -> dict[str, int]:
     """Return the expiry time of each router's certificate, ns since 1970.
 
-    A router that does not answer is left out. The dict keys of the result are names of the routers
-    for messages, like "the router tls/HOST:PORT". `directory` contains the certificate with which
-    this machine connects.
+    A router that does not answer is left out. The keys of the returned dict are texts for messages,
+    like "the router tls/HOST:PORT". `directory` contains the certificate with which this machine
+    connects.
     """
     found = {f"the router {one}": peer_ends_ns(one, directory) for one in routers}
     return {whose: ends_ns for whose, ends_ns in found.items() if ends_ns is not None}
 
 
 async def watch_certificates(bus: BusConfig, known: MutableMapping[str, int]) -> None:
-    """Update the expiry times in `known`, ns since 1970, again and again until cancelled.
+    """Update the expiry times in `known`, ns since 1970, every `ENDS_LOOK_S` until cancelled.
 
-    The value of a certificate that cannot be read stays unchanged.
+    If a certificate cannot be read, its value in `known` stays unchanged.
     """
     routers = [endpoint for endpoint in bus.connect if endpoint.startswith(TLS)]
     answered, look = 0, 0
     while True:
         found: dict[str, int] = {}
         try:
-            # Wait without a time limit. With one, each attempt to read a disk that hangs would
-            # leave one more blocked thread.
+            # Wait without a time limit. With a limit, each attempt to read from a disk that hangs
+            # would leave one more blocked thread.
             if answered < len(routers) or look % ROUTER_LOOKS == 0:
                 found |= await in_thread(lambda: ends_of(routers, bus.tls), None)
                 answered = len(found)

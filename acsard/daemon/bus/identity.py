@@ -30,7 +30,7 @@ Ask = Callable[[str, Callable[[zenoh.Sample], object]], None]
 
 
 class Identity(Struct, frozen=True):
-    """Role, certificate and name of a client, as the daemon sees them."""
+    """The identity of a client at a robot: its role, its certificate and its name."""
 
     role: Role | Literal[""]
     """The role of the client; "" if no key answered."""
@@ -42,9 +42,10 @@ class Identity(Struct, frozen=True):
     endpoint: str = ""
 
     def lacks(self, key: str) -> str:
-        """Return why this client may not use a robot's key, in words; "" if it may use it.
+        """Return why this client may not use the robot's key `key`, in words; "" if it may.
 
-        Also returns "" if no key answered and the client has no certificate: its role is unknown.
+        Also returns "" if no key answered and the client has no certificate, because the role is
+        then unknown.
         """
         least = least_role(key)
         if not self.role:
@@ -57,7 +58,7 @@ class Identity(Struct, frozen=True):
     def silence(self) -> str:
         """The likeliest reasons why no key answered, in words.
 
-        "" if a key answered (the client then has a role) or if the client has no certificate. A
+        The text is "" if a key answered, or if the client has no certificate. A
         client cannot distinguish a robot that is absent, a robot that hangs, and a robot that does
         not list the client's certificate.
         """
@@ -104,8 +105,8 @@ def identity(ask: Ask, tls: str, sender: str, robot: str = "", endpoint: str = "
     while best < len(ROLES) - 1 and (left := end - _now_s()) > 0:
         with suppress(Empty):
             name = answers.get(timeout=left).rpartition("/")[2]
-            # The keys of higher roles never answer, and all other answers arrive at about the same
-            # time. So wait only a little longer after the first answer.
+            # The keys of roles above the client's own never answer, and all other answers arrive
+            # at about the same time. So wait only a little longer after the first answer.
             end = min(end, _now_s() + WHOAMI_MORE_S)
             best = max(best, next((n for n, role in enumerate(ROLES) if role == name), -1))
     certificate = common_name(tls) if tls else ""

@@ -4,8 +4,8 @@ Zenoh's threads fill the buffers, and every buffer is bounded. A callback in thi
 its input. It never calls back into Zenoh: even a refusal is queued for `Replies`.
 
 `Replies` sends the replies in a separate thread, because a client that hangs would block the
-control loop. Each query gets a number when it arrives, its ticket. A reply names the ticket of its
-query. When a ticket is retired, Zenoh's query is dropped, and the client stops waiting.
+control loop. Each query gets a number, called its ticket, when it arrives. A reply names the ticket
+of its query. When a ticket is retired, Zenoh's query is dropped, and the client stops waiting.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Replies:
         self._queue.put(ticket)
 
     def start(self, session: zenoh.Session) -> None:
-        """Start the thread that sends the replies. It also sends those that are queued already."""
+        """Start the thread that sends the replies, beginning with the queued replies."""
         self._thread = BusThread("replies", partial(self._run, session))
         self._thread.start()
 
@@ -136,8 +136,9 @@ full, further queries are refused with `BUSY`. One slow query is answered per st
 256 waits 2.6 s at 100 Hz."""
 
 ATTACHMENT_BYTES = 256
-"""Largest number of bytes of an attachment that are used. An attachment of rmw_zenoh has 33 bytes,
-and one of acsard up to 140. A longer one is cut off, so that no sender can be decoded from it."""
+"""Largest size of an attachment, bytes. An attachment of rmw_zenoh has 33 bytes, and an attachment
+of acsard has up to 140. A longer attachment is cut off, so that no sender can be decoded from
+it."""
 
 STOP, SET = service_key("stop"), service_key("set")
 STOP_ALL = full_key("*", "stop")
@@ -150,8 +151,8 @@ class Inbox:
         self, prefix: str, replies: Replies, sources: tuple[str, ...], waker: Waker
     ) -> None:
         self.own_id: zenoh.TimestampId | None = None
-        """The id that the daemon's session writes into timestamps. A timestamp with this id is not
-        from the sender: the session stamps each sample that comes without a timestamp."""
+        """The id in the timestamps that the daemon's session makes. The session stamps each sample
+        that comes without a timestamp, so a timestamp with this id is not from the sender."""
         self._prefix, self._replies = prefix, replies
         self._arrivals: dict[str, Mailbox[Arrival]] = {
             key: Mailbox(ARRIVALS, self._commanded)
@@ -166,20 +167,20 @@ class Inbox:
         self._others: deque[Query] = deque()
         """Native queries that are neither services nor slow."""
         self._slow: deque[Query] = deque()
-        """Slow queries: ROS parameters and settings. To answer one of them takes as long as to
-        answer all other queries of a step."""
+        """Slow queries: ROS parameters and settings. The answer to one slow query takes as long as
+        the answers to all other queries of a step."""
         self._lost = dict.fromkeys(self._arrivals, 0)
         """For each buffer, the number of displaced samples at the last `take`."""
         self._any = False
-        """True if an item waits. Set after the item is queued, so that `take` misses no item."""
+        """True if an item waits. It is set after the item is queued, so `take` misses no item."""
         self._waker = waker
 
     def take(self, queries: int) -> BusInput:
         """Return the samples since the last call, and at most `queries` of the waiting queries.
 
         The stops come before the other samples, which are in the order of their arrival. Of the
-        queries, service calls come first, then one slow query, even if this exceeds `queries`, then
-        the others.
+        queries, service calls come first, then one slow query, and then the other queries. The slow
+        query is returned even if the number of queries then exceeds `queries`.
         """
         if not self._any:
             return NOTHING
@@ -320,7 +321,7 @@ class Inbox:
 
 
 def _bytes(payload: zenoh.ZBytes | None, most: int) -> bytes:
-    """Return at most `most` + 1 bytes of a payload. The extra byte shows that it is too long."""
+    """Return at most `most` + 1 bytes of a payload. With `most` + 1 bytes it is too long."""
     return b"" if payload is None else payload.to_bytes()[: most + 1]
 
 

@@ -1,4 +1,4 @@
-"""Publishes each topic on those of its keys that have a subscriber.
+"""Publishes each topic on the keys of the topic that have a subscriber.
 
 A topic has native keys and perhaps ROS keys. Each key has an outlet, which is the publisher on that
 key. A message is encoded once per encoding, and only if an outlet with that encoding has a
@@ -119,7 +119,7 @@ class Outlets:
         return self._began_ns is not None or self._stuck or self._dropped > 0
 
     def losses(self, now_ns: int) -> tuple[int, bool]:
-        """Return the number of dropped messages, and whether the bus has begun to block.
+        """Return a pair: the number of dropped messages, and whether the bus has begun to block.
 
         Both values cover the time since the last call. `now_ns` is the monotonic time.
         """
@@ -129,7 +129,7 @@ class Outlets:
         return dropped, self._stuck and not was_stuck
 
     def start(self) -> None:
-        """Start the thread that sends the messages, first those that wait in the slots already."""
+        """Start the thread that sends the messages, beginning with the messages in the slots."""
         self._thread.start()
 
     def stop(self, timeout: float) -> None:
@@ -176,8 +176,9 @@ class Outlets:
         Args:
             encoding: Zenoh's name of the encoding.
             latched: whether the publisher keeps its last sample for late subscribers.
-            gid: identity of a ROS publisher. With it, the samples carry an attachment of rmw_zenoh.
-            signed: attachment of the samples if there is no `gid`.
+            gid: identity of a ROS publisher; b"" for any other publisher. The samples of a ROS
+                publisher carry an attachment of rmw_zenoh.
+            signed: attachment of the samples if `gid` is b"".
         """
         if latched:
             publisher: Any = zenoh.ext.declare_advanced_publisher(

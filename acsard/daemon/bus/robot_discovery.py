@@ -48,9 +48,10 @@ def named(text: str) -> tuple[str, ...]:
 
 
 def present(session: zenoh.Session, ids: Sequence[str], endpoint: str) -> list[str]:
-    """Return those of `ids` whose daemon is running, sorted. "*" stands for all robots.
+    """Return the ids in `ids` whose daemon is running, sorted. "*" stands for all robots.
 
-    Raises `NoAnswerError`, which names `endpoint`, if `ids` contains "*" and no robot is visible.
+    Raises `NoAnswerError` if `ids` contains "*" and no robot is visible. The error names
+    `endpoint`.
     """
     found = set()
     for robot_id in ids:
@@ -63,7 +64,7 @@ def present(session: zenoh.Session, ids: Sequence[str], endpoint: str) -> list[s
 
 
 def presence(session: zenoh.Session, robot_id: str, endpoint: str) -> Presence | None:
-    """Return the robots that this client sees, or None if the session is closing."""
+    """Return which robots this client sees on the bus, or None if the session is closing."""
     try:
         if not session.info.links():
             return Presence(linked=False, here=False)

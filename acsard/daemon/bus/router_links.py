@@ -20,7 +20,7 @@ STOP_S = 0.05
 
 
 class RouterLinks:
-    """The watch of the connections to the endpoints of `bus.connect`.
+    """Observer of the connections to the endpoints of `bus.connect`.
 
     Zenoh reconnects by itself, but does not report that a connection is lost or restored. A
     separate thread polls Zenoh, because the call may block.
@@ -91,7 +91,7 @@ def unreached(mode: str, endpoints: tuple[str, ...], ends: set[str]) -> tuple[st
 
 
 def _leads_there(endpoint: str, ends: set[str]) -> bool:
-    """Return whether a far end, such as "tcp/192.168.0.2:7447", belongs to the endpoint."""
+    """Return whether `ends` contains an address of the endpoint, like "tcp/192.168.0.2:7447"."""
     bare = endpoint.partition("?")[0].partition("#")[0]
     protocol, _, address = bare.partition("/")
     host, _, port = address.rpartition(":")

@@ -19,7 +19,7 @@ QUEUED = 1000
 
 
 class Arrivals(Mailbox[zenoh.Sample]):
-    """The queue from Zenoh's thread to the reader of a subscription."""
+    """Queue in which Zenoh's thread puts the samples of a subscription for their reader."""
 
     def __init__(self) -> None:
         super().__init__(QUEUED)
@@ -27,7 +27,10 @@ class Arrivals(Mailbox[zenoh.Sample]):
         """The Zenoh subscribers that fill this queue."""
 
     def try_recv(self) -> zenoh.Sample | None:
-        """Return the next sample, None if none waits; raise `ZError` if the session has closed."""
+        """Return the next sample, or None if none waits.
+
+        Raises `ZError` if the session has closed and no sample waits.
+        """
         sample = self.pop()
         if sample is None and self.closed and not self.waiting:
             raise zenoh.ZError("the Zenoh session has been closed")
@@ -46,7 +49,10 @@ class Subscription:
         self._queue, self._key = queue, key
 
     def try_recv(self) -> zenoh.Sample | None:
-        """Return the next sample, None if none waits; raise `ZError` if the session has closed."""
+        """Return the next sample, or None if none waits.
+
+        Raises `ZError` if the session has closed and no sample waits.
+        """
         # The loop is bounded, because a flood of samples on other keys must not block the caller.
         for _ in range(QUEUED):
             sample: zenoh.Sample | None = self._queue.try_recv()
@@ -59,7 +65,7 @@ class Subscription:
         self._queue.wakes(wake)
 
     def add(self, sample: zenoh.Sample) -> None:
-        """Append a sample that a query has returned, as if it had been published now."""
+        """Append a sample from the reply to a query, as if it had been published now."""
         self._queue.put(sample)
 
     def until_silence(self, timeout: float | None) -> Iterator[zenoh.Sample]:
@@ -88,7 +94,7 @@ class Subscription:
             self.undeclare()
 
     async def arriving(self) -> AsyncGenerator[zenoh.Sample, None]:
-        """Yield samples until the session closes, and finally undeclare the subscribers."""
+        """Yield samples until the session closes. Undeclare the subscribers at the end."""
         arrived, loop = asyncio.Event(), asyncio.get_running_loop()
 
         def wake() -> None:

@@ -32,8 +32,8 @@ def require_usable(directory: str) -> None:
     """
     if not Path(directory).is_dir():
         raise CertificateError(
-            f"there is no directory {directory}: name the directory that `acsard tls init` or "
-            f"`acsard tls add` made, with {CA}, {CERTIFICATE} and {KEY} in it"
+            f"there is no directory {directory}: name the directory with {CA}, {CERTIFICATE} and "
+            f"{KEY} that `acsard tls init` or `acsard tls add` made"
         )
     for name in (CA, CERTIFICATE, KEY):
         file = Path(directory) / name
@@ -94,13 +94,13 @@ def shown_at(endpoint: str, directory: str) -> str:
 
 
 def names_in(directory: str) -> list[str]:
-    """Return the host names and addresses that the certificate in `directory` is valid for."""
+    """Return the host names and IP addresses that the certificate in `directory` is valid for."""
     alternative: Any = _decoded(directory).get("subjectAltName", ())
     return [_plain(str(name)) for _, name in alternative]
 
 
 def _plain(name: str) -> str:
-    """Shorten an IPv6 address, which `ssl` decodes with all its zeros. Return others unchanged."""
+    """Return an IPv6 address without the zeros that `ssl` adds; return other names unchanged."""
     try:
         return str(ipaddress.ip_address(name))
     except ValueError:
@@ -163,8 +163,8 @@ def ends(directory: str) -> dict[str, int]:
 def peer_ends_ns(endpoint: str, directory: str) -> int | None:
     """Return when the certificate of the program at a TLS endpoint expires, ns since 1970.
 
-    The certificate is not verified, so that this also works if it has expired. Returns None if the
-    program cannot be reached or the optional library is missing. Blocks for up to twice
+    The certificate is not verified, so this function also works for an expired certificate. Returns
+    None if the program cannot be reached or the optional library is missing. Blocks for up to twice
     `PATIENCE_S`.
     """
     try:
@@ -222,7 +222,8 @@ AWAY = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN)
 """Error numbers that mean that no machine answers at the address."""
 
 EXPIRED, NOT_YET, WRONG_NAME, WRONG_ADDRESS = 10, 9, 62, 64
-"""OpenSSL's verify codes (X509_V_ERR_...). Other codes mean a certificate of another authority."""
+"""OpenSSL's verify codes (X509_V_ERR_...). Every other code is reported as a certificate of another
+authority."""
 
 
 def trouble(endpoint: str, directory: str) -> str:
@@ -274,7 +275,9 @@ def _tls_trouble(plain: socket.socket, host: str, directory: str) -> str:
         # The server waits for data, so both ends have accepted the certificates.
         return ""
     except OSError:
-        return f"{host} closes the connection at once: does a TLS endpoint of acsard listen there?"
+        return (
+            f"{host} closes the connection immediately: does a TLS endpoint of acsard listen there?"
+        )
     return ""
 
 
@@ -322,4 +325,7 @@ def _client_rejected(reason: str, host: str, directory: str) -> str:
             f"{host} does not accept {certificate}: this certificate comes from another authority "
             "than the robot's; get a certificate that `acsard tls add` made for this robot"
         )
-    return f"{host} does not speak TLS here ({reason}); a plain endpoint begins with tcp/"
+    return (
+        f"{host} does not speak TLS on this port ({reason}); an endpoint without TLS begins with "
+        "tcp/"
+    )

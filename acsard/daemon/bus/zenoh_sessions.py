@@ -22,8 +22,8 @@ from acsard.host.errors import CertificateError, InUseError, UnreachableError, U
 from acsard.host.terminal_modes import coloured
 
 COMMAND_RATE_HZ = 1000.0
-"""Largest number of commands per second that a session accepts on each key. It allows a zero
-command 1 ms after another command. It is so low that a flood does not make the daemon miss a
+"""Largest number of commands per second that a session accepts on each key. The limit allows a zero
+command 1 ms after another command, and is low enough that a flood does not make the daemon miss a
 control period. The TLS gateway also applies the limit to stops. Dropping a stop beyond the
 limit is safe, because another stop came less than a millisecond before."""
 
@@ -59,7 +59,10 @@ def daemon_session(config: Config) -> zenoh.Session:
 
 
 def gateway_session(config: Config) -> zenoh.Session:
-    """Open the TLS gateway's session, a router. Raise `InUseError` if it cannot listen."""
+    """Open the TLS gateway's session, which is a Zenoh router.
+
+    Raises `InUseError` if the session cannot listen.
+    """
     bus = config.bus
     settings = _base("router") | PATIENT | _tls(bus.tls) | _listening()
     # Limit only PUT messages. Otherwise a flood of DELETE messages, which are not stops, would use
@@ -70,7 +73,8 @@ def gateway_session(config: Config) -> zenoh.Session:
         "listen/endpoints": list(bus.outside),
         "connect/endpoints": [reachable(bus.plain[0])],
         "scouting/gossip/enabled": False,
-        # The gateway must not stamp samples: the daemon would take the gateway for their sender.
+        # The gateway must not stamp samples. Otherwise the daemon would take the gateway for the
+        # sender of these samples.
         "timestamping/enabled": False,
     }
     return _opened(settings, bus.outside)
@@ -79,8 +83,8 @@ def gateway_session(config: Config) -> zenoh.Session:
 def certificate_trouble(authority: Path, certificate: Path, key: Path) -> str:
     """Return why Zenoh cannot listen with these certificate files, or "" if it can.
 
-    OpenSSL accepts more than Zenoh: certificates without extensions (X.509 version 1), and keys of
-    the curves P-521 and Ed448. This call takes half a second.
+    OpenSSL accepts some files that Zenoh refuses: certificates without extensions (X.509 version
+    1), and keys of the curves P-521 and Ed448. This call takes half a second.
     """
     files = {
         "root_ca_certificate": str(authority),
@@ -123,12 +127,12 @@ PATIENT = {"connect/timeout_ms": -1, "connect/exit_on_failure": False}
 
 
 def _listening() -> dict[str, object]:
-    """Return the settings that limit clients that stay silent, send too much or do not read."""
+    """Return the settings against clients that stay silent, send too much or do not read."""
     return {
         "transport/link/rx/max_message_size": MESSAGE_BYTES,
         "transport/unicast/accept_timeout": 1000,
-        # If only 32 connections may be pending, 300 idle connections keep an operator out for 2 s.
-        # With 512 they do not, and they cost 3 MB.
+        # With a limit of 32 pending connections, 300 idle connections keep an operator out for 2 s.
+        # With a limit of 512 they do not. 512 pending connections take 3 MB.
         "transport/unicast/accept_pending": 512,
         "transport/unicast/max_sessions": MAX_SESSIONS,
         "transport/link/tx/lease": 2000,
@@ -150,8 +154,8 @@ def _opened(settings: dict[str, object], where: tuple[str, ...]) -> zenoh.Sessio
     except zenoh.ZError as error:
         raise InUseError(
             f"cannot listen on {', '.join(where)}: {first_line(error)}; if another daemon or "
-            "router uses the address, stop that program, or choose another one with --listen or in "
-            "bus.listen",
+            "router uses the address, stop that program, or choose another address with --listen "
+            "or in bus.listen",
         ) from error
 
 
@@ -236,8 +240,8 @@ def _tls(directory: str) -> dict[str, object]:
 def _command_limits(config: Config) -> dict[str, object]:
     """Return the rate limits of commands, speed limits and gyro samples, on native and ROS keys.
 
-    Each configured source has a limit that all its certificates share. All other sources share one
-    limit. Zenoh counts each connection separately.
+    All certificates of a configured source share a limit. All sources that are not configured
+    share one more limit. Zenoh applies each limit to each connection separately.
     """
     names = [*(source.name for source in config.commands.sources), "*"]
     below = [*source_keys(names), *source_keys(names, "*"), IMU, SPEED_LIMIT]
@@ -272,7 +276,7 @@ def log_from_environment() -> None:
     if "RUST_LOG" not in os.environ:
         return
     before = os.environ.get("NO_COLOR")
-    # Zenoh reads only NO_COLOR, and would write colours to pipes and files too.
+    # Zenoh reads only NO_COLOR, and would write colors to pipes and files too.
     if not coloured(sys.stdout):
         os.environ["NO_COLOR"] = "1"
     zenoh.try_init_log_from_env()

@@ -4,9 +4,9 @@ As with zenohd, the access rules in the file say what each client may do. Within
 client with a certificate can still make a router hang. This router detects that and restarts within
 2 s (`listener_process.py`).
 
-The template `deploy/zenoh/router.json5` is for one robot. `router_file` repeats its lines between
-the marks ROBOT and END for each robot. It repeats the lines between PERSON and END PERSON for each
-certificate that may command.
+The template `deploy/zenoh/router.json5` is for one robot. `router_file` repeats the template's
+lines between the marks ROBOT and END for each robot. It repeats the lines between PERSON and END
+PERSON for each certificate that may command.
 """
 
 from __future__ import annotations
@@ -30,32 +30,34 @@ EXAMPLE = "robot1"
 """Id of the robot in the template."""
 
 IS_FOR = "// It is for {}. For yours:\n"
-"""Line near the top of the template and of the router's file. The robots' ids replace {}."""
+"""Line near the top of the template and of the router's file, in which {} stands for the ids."""
 
 _BLOCK = re.compile(r"^ *// ROBOT\n(.*?)^ *// END\n", re.M | re.S)
 _NAME = re.compile(rf"\b{EXAMPLE}\b")
 
 PERSON: Role = "operator"
-"""Example name in the template's lines between PERSON and END PERSON. Real names replace it."""
+"""Example name in the template's lines between PERSON and END PERSON, which real names replace."""
 
 _PERSONS = re.compile(r"^ *// PERSON\n(.*?)^ *// END PERSON\n", re.M | re.S)
-# Match a whole name, or the last part of a key, because a robot may be called operator-1.
+# Match a whole name or the last part of a key, but not the beginning of a robot's id "operator-1".
 _PERSON = re.compile(rf'(?<=[/" ]){PERSON}(?=")')
 
 
 def router_file(template: str, robots: Sequence[str], people: Mapping[Role, Sequence[str]]) -> str:
     """Return the text of the router's configuration file.
 
-    `template` is the text of `deploy/zenoh/router.json5`. `people` gives for each role the common
-    names of the certificates with this role, besides the certificate with the role's name. Raises
-    `UsageError` if a name occurs twice: a certificate belongs to one robot or to one role.
+    `template` is the text of `deploy/zenoh/router.json5`. `people` maps each role to the common
+    names of the certificates with this role, without the certificate that has the role's own name.
+    Raises `UsageError` if a name occurs twice, because a certificate belongs either to one robot or
+    to one role.
     """
     names = [*robots, *ROLES, *(name for role in ROLES for name in people.get(role, ()))]
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
         raise UsageError(
-            f"{', '.join(twice)}: named twice; name each certificate once, as a robot or in the "
-            f"list of one role. {', '.join(ROLES)} have their roles already: leave them out"
+            f"these names occur more than once: {', '.join(twice)}. Name each certificate once, "
+            "either as a robot or in the list of one role. Leave out the names "
+            f"{', '.join(ROLES)}: these certificates have their roles already"
         )
     text = _BLOCK.sub(
         lambda block: "".join(_with(_NAME, robot, block[1]) for robot in robots), template
@@ -107,7 +109,7 @@ _SYNTAX_ERROR = re.compile(
 
 
 def reason(error: zenoh.ZError) -> str:
-    """Return the readable part of Zenoh's error, with the line and the column if it names them."""
+    """Return the readable part of Zenoh's error, with line and column if the error names them."""
     text = str(error)
     if match := _VALUE_ERROR.search(text):
         message = re.sub(r"\\(.)", r"\1", match[1])
@@ -126,7 +128,7 @@ class Router(Listener):
         """Read the file; raise `RouterFileError` if Zenoh does not accept it."""
         self._file = file
         try:
-            # Read the file here, because Zenoh would not say why it cannot open it.
+            # Read the file here, because Zenoh's error would not say why the file cannot be opened.
             file.read_bytes()
         except OSError as error:
             raise RouterFileError(
@@ -177,7 +179,7 @@ class Router(Listener):
     def _opens_elsewhere(self) -> bool:
         """Return whether Zenoh accepts the configuration with free loopback ports as addresses.
 
-        If it does, only the configured addresses are at fault. Zenoh's own error does not say so.
+        If Zenoh does, only the configured addresses are wrong. Zenoh's own error does not say so.
         """
         config = zenoh.Config.from_file(str(self._file))
         free = [AN_ADDRESS.sub(r"\1/127.0.0.1:0", endpoint) for endpoint in self._endpoints]

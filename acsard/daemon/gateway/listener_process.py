@@ -1,6 +1,6 @@
 """Runs a Zenoh session that is open to the network, in a process of its own that can be restarted.
 
-A malicious client can make Zenoh compare key expressions for ever, keep all connections, or take
+A malicious client can make Zenoh compare key expressions for ever, use all connections, or use much
 memory. All of that happens in this process, and not in the daemon. During such an attack a call to
 Zenoh may never return. Therefore a separate thread observes the session. The main thread checks
 that new observations keep coming.
@@ -36,26 +36,27 @@ millisecond."""
 
 FIRST_NS = 5 * NS_PER_S
 """Time within which the daemon must connect after the session has been opened, ns; otherwise this
-process restarts. It is longer than `ALONE_NS`, because all other clients connect then too."""
+process restarts. It is longer than `ALONE_NS`, because all other clients also connect then."""
 
 ALONE_NS = NS_PER_S
 """Time within which the daemon must connect again after its connection was lost, ns. If it does
 not, this process restarts."""
 
 REPORTS = Rate(1 / 60)
-"""Largest rate of events that report that all connections are taken: one a minute."""
+"""Largest rate of events that report that all connections are in use: one a minute."""
 
 MAX_UNANSWERED = 4
 """If the daemon leaves this number of consecutive queries unanswered for 1 s each, the connection
-to it counts as dead. Such a connection is still open, but its data does not reach the daemon."""
+to the daemon counts as dead. Such a connection is still open, but its data does not reach the
+daemon."""
 
 NAMES = 5
-"""Largest number of clients that an event names: those with the most connections."""
+"""Largest number of clients that an event names. It names the clients with the most connections."""
 
 Incident = Literal["open", "full", "stuck", "alone"]
 
 Events = dict[Incident, EventName]
-"""Name of the log event for each incident: the session listens (`open`), all connections are taken
+"""Name of the log event for each incident: the session listens (`open`), all connections are in use
 (`full`), Zenoh hangs (`stuck`), or the daemon is not connected (`alone`)."""
 
 GATEWAY_EVENTS: Events = {
@@ -93,17 +94,17 @@ class SessionHealth:
         self._last_ns, self._silence = 0, Silence(STUCK_NS)
         self._reports = Bucket(REPORTS)
         self.full = 0
-        """Number of observations in which all connections were taken."""
+        """Number of observations in which all connections were in use."""
 
     def full_event(self, observed: Observation) -> Event | None:
-        """Return an event if all connections are taken, at most once a minute; otherwise None."""
+        """Return an event if all connections are in use, at most once a minute; otherwise None."""
         if len(observed.holders) < self._most:
             return None
         self.full += 1
         if not self._reports.take(observed.at_ns):
             return None
         text = (
-            f"all {self._most} connections are taken, {connection_counts(observed.holders)}: no "
+            f"all {self._most} connections are in use, {connection_counts(observed.holders)}: no "
             "other client can connect; close client programs that are not needed"
         )
         return Event(self._events["full"], text, "warning")
@@ -112,7 +113,7 @@ class SessionHealth:
         """Return an event that says why the process must restart, or None if it need not.
 
         `observed` is the latest observation, which may be the same as in the last call of this
-        method. `passed_ns` is the time since that call, ns.
+        method. `passed_ns` is the time since the last call, ns.
         """
         new, self._last_ns = observed.at_ns != self._last_ns, observed.at_ns
         stuck = self._silence.too_long(new, passed_ns)
@@ -154,7 +155,7 @@ connections in use. An attack can take 600 MB a second, too fast for a check. Th
 memory above the limit, which ends the process."""
 
 NICE = 5
-"""Nice value of this process. The daemon and ordinary programs have priority over it."""
+"""Nice value of this process, so that the daemon and ordinary programs have priority over it."""
 
 
 class Listener:
@@ -185,7 +186,7 @@ class Listener:
 
 
 class ListenerProcess:
-    """The process of one listener, from its start until it ends or must be started again."""
+    """The process of one listener, from its start until it ends or must be restarted."""
 
     def __init__(self, listener: Listener, log: Log, manager: Systemd, parent: int | None) -> None:
         """Prepare the process.
@@ -237,7 +238,10 @@ class ListenerProcess:
         return Exit.OK
 
     def _renewed(self) -> bool:
-        """Return whether to open the session again for a new certificate. Log an unusable one."""
+        """Return whether the process must restart to use a new certificate.
+
+        If a new certificate is unusable, log the reason and return False.
+        """
         files = self._listener.files
         if files is None or not files.renewed():
             return False

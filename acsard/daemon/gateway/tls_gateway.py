@@ -1,8 +1,8 @@
 """The TLS gateway between clients on other machines and the daemon on loopback.
 
 The gateway is a Zenoh router in a process of its own. It forwards only the messages that the access
-rules allow. The worst that a client can cause is a restart of the gateway (`listener_process.py`),
-after which all clients reconnect.
+rules allow. The worst effect that a client can have is a restart of the gateway
+(`listener_process.py`), after which all clients reconnect.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ counts as unanswered."""
 
 QUERY_TIMEOUT_S = 60.0
 """Time after which Zenoh itself ends a query to the daemon, s. It is much longer than `PROBE_NS`,
-so that the query has counted as unanswered long before."""
+after which the query counts as unanswered."""
 
 
 class Gateway(Listener):
-    """The TLS gateway: opens once the daemon runs, and reports its connections to the daemon."""
+    """The TLS gateway. It opens when the daemon runs, and reports its connections to the daemon."""
 
     most = MAX_SESSIONS - 1
-    """Largest number of connections from the network. One more connection is for the daemon."""
+    """Largest number of connections from the network. The daemon needs the remaining connection."""
     events = GATEWAY_EVENTS
 
     def __init__(self, config: Config) -> None:
@@ -85,7 +85,8 @@ class Gateway(Listener):
         """Publish the state of the gateway, which the daemon includes in the message `state`.
 
         This state contains the number of connections, the opening time of the gateway, the earliest
-        expiry time of its certificates, and how often all connections were taken.
+        expiry time of its certificates, and the number of observations in which all connections
+        were in use.
         """
         if self._publisher is None:
             self._ends_ns = min(ends(self._config.bus.tls).values(), default=0)
@@ -99,7 +100,7 @@ class Gateway(Listener):
 class DaemonProbe:
     """A probe that queries the daemon repeatedly, because an open connection may carry no data.
 
-    A test on an overloaded machine observed this: a connection stayed open for minutes, although
+    In a test on an overloaded machine, a connection stayed open for minutes, although
     the daemon's Zenoh did not read from it.
     """
 
@@ -107,8 +108,8 @@ class DaemonProbe:
         """Prepare queries of `key`, which the daemon answers."""
         self._key, self._asked_ns, self._unanswered = key, 0, 0
         self._ended = threading.Event()
-        """Set when the last query has ended, with or without a reply. A query that ends within
-        `PROBE_NS` has reached the daemon."""
+        """This event is set when the last query has ended, with or without a reply. A query that
+        ends within `PROBE_NS` has reached the daemon."""
 
     def unanswered(self, session: zenoh.Session, now_ns: int) -> int:
         """Send the next query if it is due. Return the number of consecutive unanswered queries."""

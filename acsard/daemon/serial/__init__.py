@@ -1,1 +1,1 @@
-"""Access to the serial port, which is opened raw and locked, and closed after a last STOP line."""
+"""Access to the serial port: opens it in raw mode and locked, and sends STOP before it closes."""

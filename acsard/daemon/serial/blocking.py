@@ -57,7 +57,8 @@ class BlockingPort:
             raise WireLostError(f"{self._path}: {error}") from error
 
     def close(self) -> None:
-        """Send the last bytes, then unlock and close. Every wait for the driver is limited."""
+        """Send the last bytes, then unlock and close the port. No wait for the driver is
+        endless."""
         device, self._device = self._device, None
         if device is None:
             return
@@ -72,7 +73,7 @@ class BlockingPort:
     def late_ns(self) -> int:
         """Return how long the program at the pty's other end waited for a processor, ns.
 
-        Only waiting since the last call counts. The result is 0 for a real device.
+        Only the time since the last call counts. The result is 0 for a real device.
         """
         if self._program is None:
             return 0
@@ -95,7 +96,7 @@ class BlockingPort:
                 raise WireLostError(f"{self._path} was lost: {error.strerror}") from error
 
     def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
-        """Return the data received before monotonic `until_ns`, with the time of each read, ns.
+        """Read until monotonic `until_ns`. Return a pair for each read: its time, ns, and its data.
 
         Raises `WireLostError` if the port is lost.
         """

@@ -45,8 +45,9 @@ class _Device(serial.Serial):  # type: ignore[misc]
 
 
 def open_raw(path: str, baud_rate: int) -> serial.Serial:
-    """Open the port raw, with empty buffers and locked. Raises `OSError` if that fails."""
-    # Close the devices that `close` could not. Two threads may empty the list at the same time.
+    """Open the port in raw mode, locked and with empty buffers. Raises `OSError` if that fails."""
+    # Close the devices that `close` could not close. Two threads may empty the list at the same
+    # time.
     with suppress(IndexError):
         while True:
             _end(_left_open.pop())
@@ -64,7 +65,7 @@ def open_raw(path: str, baud_rate: int) -> serial.Serial:
             unlock(device.fileno())
         device.close()
         # If the device vanishes or is not a tty, the cause is a `termios.error`, which is not an
-        # OSError. pyserial passes that error on unchanged, or only its text.
+        # OSError. pyserial either raises that error unchanged, or raises an error with its text.
         hidden = error.__context__
         known = hidden if isinstance(hidden, termios.error) else error
         raise OSError(*known.args) from error
@@ -75,8 +76,9 @@ def _set_up(device: serial.Serial) -> None:
     fd = device.fileno()
     fcntl.ioctl(fd, termios.TIOCEXCL)
     attributes = termios.tcgetattr(fd)
-    # pyserial leaves some input processing on. A tty that echoes would command the robot with its
-    # own feedback. Closing must not drop DTR, which resets many boards, so HUPCL is off.
+    # pyserial leaves some input processing on. A tty that echoes would send the board's own
+    # feedback back to it as commands. Closing must not drop DTR, because that resets many boards,
+    # so HUPCL is off.
     attributes[0] = attributes[1] = attributes[3] = 0
     attributes[2] &= ~termios.HUPCL
     termios.tcsetattr(fd, termios.TCSANOW, attributes)
@@ -89,7 +91,7 @@ def _set_up(device: serial.Serial) -> None:
 
 
 def unsent(fd: int) -> int:
-    """Return how many bytes the driver has not sent, or 0 if it does not report this (a pty)."""
+    """Return how many bytes the driver has not sent, or 0 if that is unknown, as for a pty."""
     waiting = array.array("i", [0])
     try:
         fcntl.ioctl(fd, termios.TIOCOUTQ, waiting)
@@ -99,13 +101,13 @@ def unsent(fd: int) -> int:
 
 
 def draining(fd: int, deadline_ns: int) -> Iterator[float]:
-    """Yield pauses, s, for the caller to sleep, until all bytes are sent or `deadline_ns` comes."""
+    """Yield pauses, s, for the caller to sleep, until all bytes are sent or until `deadline_ns`."""
     while unsent(fd) and clock.mono_ns() < deadline_ns:
         yield DRAIN_STEP_S
 
 
 def unlock(fd: int) -> None:
-    """Unlock the device for other processes. Otherwise a pty stays locked after this one ends."""
+    """Unlock the device. Otherwise a pty stays locked for others after this process ends."""
     try:
         fcntl.ioctl(fd, termios.TIOCNXCL)
     except OSError:
@@ -115,10 +117,10 @@ def unlock(fd: int) -> None:
 def close(device: serial.Serial, *, lost: bool = False, wait_s: float = 0.0) -> None:
     """Discard unsent bytes, and unlock and close the device in a thread.
 
-    The thread is needed because a driver may take 30 s to close. This call waits for the thread for
-    at most `wait_s` seconds. If no thread can be started, the next `open_raw` closes the device.
-    After the call, the descriptor of `device` refers to /dev/null, so the owner can drain and close
-    `device` without delay.
+    The thread is needed because a driver may take 30 s to close. This call waits for at most
+    `wait_s` seconds until the thread has ended. If no thread can be started, the next `open_raw`
+    closes the device. After the call, the descriptor of `device` refers to /dev/null, so the owner
+    can drain and close `device` without delay.
 
     If `lost` is true, the device has failed. Its output buffer is then discarded even if the driver
     reports no unsent bytes.
@@ -171,15 +173,15 @@ _LISTED = "`acsard ports` lists the serial ports"
 _FREE = "stop that process first (`systemctl stop acsard` if it is the service of acsard)"
 _JOIN = (
     "add the user to the device's group (`sudo usermod -aG dialout $USER`), then log in again; "
-    "the systemd service of acsard is in the group dialout already; if it lacks permission, the "
-    "device has another group, or acsard.service does not allow this type of device"
+    "the systemd service of acsard is in the group dialout already; if the service lacks "
+    "permission, the device has another group, or acsard.service does not allow this type of device"
 )
 
 
 def require(path: str) -> None:
     """Raise the error of `refusal` unless `path` is a character device.
 
-    Only the tools call this function. The daemon waits for a device that is absent.
+    Only the tools call this function. The daemon does not, because it waits for an absent device.
     """
     try:
         if not stat.S_ISCHR(os.stat(path).st_mode):

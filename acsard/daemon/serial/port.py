@@ -36,13 +36,13 @@ short, because udev sets the group of a new device within a short time."""
 
 PERMISSION_PATIENCE_S = 2.0
 """Time for which the start of the daemon waits for udev to grant access to the device, s. If access
-is still denied after it, the start fails."""
+is still denied after this time, the start fails."""
 
 HUNG = "the driver of the serial port did not answer"
 
 FAREWELL_S = 0.15
-"""Time limit for sending the last STOP, s. It is twice the time that a line takes at the lowest
-baud rate, plus a margin."""
+"""Time limit for sending the last STOP, s. The limit is twice the time that a line takes at the
+lowest baud rate, plus a margin."""
 
 
 AT_ONCE = 4096
@@ -52,8 +52,8 @@ AT_ONCE = 4096
 class SerialPort:
     """The port to the board, as an asynchronous context manager.
 
-    Entering opens the port. `keep_open` reopens it for ever. Leaving sends STOP and closes the
-    port.
+    Entering the context opens the port. `keep_open` reopens the port whenever it is lost. Leaving
+    the context sends STOP and closes the port.
     """
 
     def __init__(
@@ -96,9 +96,8 @@ class SerialPort:
         reads the bytes that wait in the kernel. Otherwise the delay of the step would look like
         silence of the board.
 
-        After a suspend of the computer, this method closes the port so that it is opened again,
-        even if the device did not notice. A new session then begins: every sender must return to
-        neutral.
+        After a suspend of the computer, this method closes the port, even if the device still
+        works. `keep_open` then opens the port again, and every sender must return to neutral.
         """
         if self._asleep.was():
             self._leave(OSError(errno.EIO, "this computer was suspended"))
@@ -196,7 +195,7 @@ class SerialPort:
             self._transport, _ = await serial_asyncio.connection_for_serial(
                 loop, lambda: _Reader(self), device
             )
-        except OSError:  # setting up the port again may fail
+        except OSError:  # the library sets up the port again, which may fail
             close(device, lost=True)
             raise
         self.is_open, self.trouble = True, ""
@@ -216,17 +215,20 @@ class SerialPort:
         self._wake()
 
     def _leave(self, error: BaseException | None) -> None:
-        """Close the port and discard unsent bytes. `error` is the cause of a loss, else None."""
+        """Close the port and discard unsent bytes.
+
+        `error` is the reason if the port was lost, or None if the daemon ends.
+        """
         if not self.is_open:
             return
         self.is_open = False
         transport, self._transport = self._transport, None
         if transport is not None and transport.serial is not None:
-            # The transport would drain and close the device on the event loop, so it gets /dev/null
-            # instead.
+            # The transport would drain and close the device on the event loop. `close` gives
+            # /dev/null to the transport instead.
             transport.pause_reading()
             close(transport.serial, lost=error is not None)
-            # The reader may have seen the hang-up just before. The transport then closes already.
+            # The transport is closing already if its reader has just detected a hang-up.
             if not transport.is_closing():
                 transport.abort()
         if error is not None:

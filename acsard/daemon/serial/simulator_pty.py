@@ -1,4 +1,4 @@
-"""The simulated board at the end of a pty, in real time, so that the real serial code runs.
+"""The simulated board at the end of a pty, in real time, for the daemon's real serial code.
 
 A pty carries data at any baud rate. If the host's rate differs from the board's, this module
 garbles the data in both directions, as a real wire would.
@@ -42,20 +42,20 @@ class PtyEnd:
         return self._master
 
     def read(self) -> bytes:
-        """Return the bytes that the host has written, b"" if there are none."""
+        """Return the bytes that the host has written, or b"" if no bytes wait."""
         try:
             data = os.read(self._master, 4096)
         except OSError as error:
             if error.errno in (errno.EAGAIN, errno.EIO):
                 return b""
             raise
-        # A killed host leaves its exclusive mark on the pty. Remove it, because a real port would
-        # not keep it.
+        # A host that is killed leaves its lock on the pty. Remove the lock, because a real port
+        # would not keep it.
         unlock(self.slave)
         return data
 
     def write(self, data: bytes) -> bool:
-        """Write to the host. Return False, and lose the data, if the buffer is full."""
+        """Write to the host. If the pty's buffer is full, drop the data and return False."""
         try:
             os.write(self._master, data)
         except BlockingIOError:
@@ -109,7 +109,7 @@ class SimPty:
         termios.tcsetattr(self._end.slave, termios.TCSANOW, attributes)
 
     def _speed(self) -> int:
-        """Return the host's baud rate, or the board's if acsard does not support the host's."""
+        """Return the host's baud rate, or the board's rate if acsard does not know the host's."""
         return _RATES.get(termios.tcgetattr(self._end.slave)[5], self.mcu.baud_rate)
 
     def _advance(self) -> None:
@@ -144,7 +144,7 @@ class Simulated(SimPty):
         self._bus = bus
 
     def current(self, key: str) -> Message | None:
-        """Return the newest true pose; None before the first, or if `key` is not `sim/pose`."""
+        """Return the newest true pose, or None if there is none or `key` is not `sim/pose`."""
         return true_pose(*self._last) if key == POSE and self._last is not None else None
 
     def _see(self, sight: Sight) -> None:

@@ -642,7 +642,8 @@ def test_a_disk_that_hangs_later_is_reported_once_and_so_is_its_answer(
     file.keep(STOP)
     until(lambda: file.trouble)
     path = tmp_path / NAME
-    assert file.trouble == f"a stop would not survive a restart: {path}: {module.HANGS}"
+    where = f"the latch file ({path}) cannot be written"
+    assert file.trouble == f"a stop would not survive a restart: {where}: {module.HANGS}"
     (event,) = file.news()
     assert (event.name, event.level) == ("latch_file", "warning")
     assert module.HANGS in event.text
@@ -651,7 +652,8 @@ def test_a_disk_that_hangs_later_is_reported_once_and_so_is_its_answer(
     until(lambda: file.trouble == "")
     assert file.news() == [
         Event(
-            "latch_file", f"stops survive a restart of the daemon again: they are stored in {path}"
+            "latch_file",
+            f"the daemon can write {path} again, so stops survive a restart of the daemon",
         )
     ]
 
@@ -694,7 +696,10 @@ def test_a_disk_that_fills_up_is_reported_once_and_tried_until_it_takes(
     until(lambda: len(tries) > 3)
     news = file.news()
     path = tmp_path / NAME
-    said = f"a stop would not survive a restart: {path}: No space left on device"
+    said = (
+        f"a stop would not survive a restart: the latch file ({path}) cannot be written: No space "
+        "left on device"
+    )
     assert file.trouble == said
     again = f"{said}; the daemon tries again every {module.RETRY_S:g} s"
     assert news == [Event("latch_file", again, "warning")]
@@ -702,7 +707,8 @@ def test_a_disk_that_fills_up_is_reported_once_and_tried_until_it_takes(
     until(lambda: file.trouble == "")
     assert file.news() == [
         Event(
-            "latch_file", f"stops survive a restart of the daemon again: they are stored in {path}"
+            "latch_file",
+            f"the daemon can write {path} again, so stops survive a restart of the daemon",
         )
     ]
     assert path.read_bytes() == encode("acsar", STOP)

@@ -296,7 +296,8 @@ def test_a_failure_after_the_robot_has_obeyed_is_no_success(file: Path, made: Se
     read_only(file)
     assert made.obeyed(OBEYED)
     message = refusal(made)
-    assert message.startswith(f"{OBEYED.message}, but only until the next start: {file} was not")
+    only = "but only until the daemon's next start, because"
+    assert message.startswith(f"{OBEYED.message}, {only} {file} was not")
 
 
 @pytest.mark.parametrize("obeyed", [False, True])

@@ -212,7 +212,10 @@ def test_samples_of_a_gyro_that_do_not_count_are_told_by_their_reasons() -> None
 
 
 def test_a_stop_that_would_be_lost_at_a_restart_is_a_warning_with_its_mend() -> None:
-    trouble = "a stop would not survive a restart: /x/a.latches.json: Read-only file system"
+    trouble = (
+        "a stop would not survive a restart: the latch file (/x/a.latches.json) cannot be written: "
+        "Read-only file system"
+    )
     running = seen(0.0)
     running = replace(running, state=replace(running.state, latch_file_error=trouble))
     (finding,) = (one for one in daemon(running) if one.subject == "latch file")

@@ -80,7 +80,7 @@ def test_a_directory_that_others_may_not_enter_is_named(tmp_path: Path) -> None:
     venv.mkdir()
     tmp_path.chmod(0o700)
     told = misplaced(str(venv), "/usr", PROGRAM, hidden=())
-    assert "may not enter" in told
+    assert "no permission to enter" in told
     assert "chmod o+rx" in told
 
 

@@ -256,7 +256,7 @@ def test_each_commanding_certificate_has_keys_of_its_own_on_each_robot(
 def test_a_name_may_occur_only_once(
     robots: list[str], people: Mapping[Role, Sequence[str]]
 ) -> None:
-    with pytest.raises(UsageError, match="named twice"):
+    with pytest.raises(UsageError, match="occur more than once"):
         router_file(TEMPLATE, robots, people)
 
 

@@ -39,7 +39,9 @@ def test_a_full_gateway_names_its_clients_once_a_minute_and_counts_every_observa
     assert [at for at, _ in told] == [0, 60 * S, 120 * S]
     _, event = told[0]
     assert (event.name, event.level) == ("gateway_full", "warning")
-    assert event.text.startswith("all 4 connections are taken, 2 by ben, 1 by ann, 1 by an unnamed")
+    assert event.text.startswith(
+        "all 4 connections are in use, 2 by ben, 1 by ann, 1 by an unnamed"
+    )
     assert health.full == 2 * 60 * 4 + 1
 
 
