@@ -372,7 +372,7 @@ def _remove_repeats(drives: Iterable[tuple[str, Streams]], notes: Notes) -> None
             continue
         notes.add(
             f"the columns {what} repeat their last value between samples: such rows are left out "
-            "({} of them with turning wheels)",
+            "({} of them while the wheels turn)",
             rolling,
         )
         for streams, again, _ in found:

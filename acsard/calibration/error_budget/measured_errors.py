@@ -314,8 +314,8 @@ def _gaps(
 
 
 TOGETHER = 0.8
-"""If two wheels have equal speeds in at least this fraction of lines, they are assumed to have equal
-rounding errors."""
+"""Two wheels are assumed to have equal rounding errors if their speeds are equal in at least this
+fraction of lines."""
 
 LEAST_VALUES = 3
 """Minimum number of different speeds that are needed to find a quantization step."""

@@ -79,9 +79,9 @@ def guide(
     method = METHODS[name]
     longest = method.longest_s(setup)
     prompt.say(
-        f"Calibration with {NEEDS[name]}. The robot drives several legs, for at most "
-        f"{longest:.0f} s in total. The robot repeats a leg that is disturbed. Stay near the "
-        "robot: any key stops the robot immediately."
+        f"Calibration with {NEEDS[name]}. The robot drives for at most {longest:.0f} s in total, "
+        "in several legs. The robot repeats a leg that is disturbed. Stay near the robot: any key "
+        "stops the robot immediately."
     )
     rides: dict[str, Run] = {}
     answers: Answers = {}

@@ -168,7 +168,7 @@ def test_a_few_messages_make_no_candidate() -> None:
 
 
 def test_odometry_that_is_computed_from_the_wheels_is_refused() -> None:
-    with pytest.raises(LogError, match=r"/odom .Odometry. turns exactly as the wheels do"):
+    with pytest.raises(LogError, match=r"/odom .Odometry. shows exactly the same turns as"):
         of(joint_states(SHORT), wheel_odometry(SHORT))
 
 
