@@ -163,9 +163,10 @@ def report(log: str, calibration: Calibration, drive: DriveConfig, written: str)
 
 
 def _noise(calibration: Calibration) -> tuple[BeforeAfter, BeforeAfter]:
-    """Return a pair: the standard deviations that noise causes after `METRES` m of driving.
+    """Return the standard deviations that noise causes after `METRES` m of driving.
 
-    The first is that of the heading, deg, and the second that of the distance, m.
+    The first of the pair is for the heading, deg, the second for the distance, m. Each has the
+    values with the configured and with the new noise settings.
     """
     noise = calibration.noise
     if noise is None or not noise.better:

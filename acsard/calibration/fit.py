@@ -181,7 +181,7 @@ def student_factor(free: Floats | float) -> Floats:
 
 
 class Fit(Struct, frozen=True):
-    """The result of a fit: the parameters, and the normal equations linearized at them."""
+    """The result of a fit: the fitted parameters, and the normal equations at these parameters."""
 
     parameters: Floats
     normal: Floats
@@ -229,7 +229,7 @@ class Fit(Struct, frozen=True):
         """
         alone = np.arange(len(self.score))
         change, size = self._changes(alone)
-        # Leaving out neighbouring blocks or whole runs shows errors that last longer than a block.
+        # Leaving out neighboring blocks or whole runs shows errors that last longer than a block.
         if len(alone) >= MANY:
             size = np.maximum(size, self._changes(alone // 2)[1])
         if len(set(runs)) >= LEAST_BLOCKS:

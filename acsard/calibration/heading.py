@@ -37,7 +37,8 @@ LEAST_SAMPLES = 5
 """Minimum number of gyro samples in a rest of the robot."""
 
 OUTLIER = 6.0
-"""Deviation of a gyro sample at rest, in median deviations, above which the sample is left out."""
+"""A gyro sample at rest is left out if its deviation from the median exceeds `OUTLIER` times the
+median deviation."""
 
 WALK = 5e-5
 """Smallest random walk assumed for the gyro bias, rad/s per square root of a second."""

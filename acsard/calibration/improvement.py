@@ -83,7 +83,8 @@ class Improvement(Struct, frozen=True):
     gain: float = np.inf
     """Natural logarithm of (error before / error after); inf if it was not computed.
 
-    The logarithms for headings and for positions (RMS errors over whole drives) are added.
+    It is the sum of two such logarithms: one for the RMS error of the heading over whole drives,
+    and one for that of the position. The log may show only one of them.
     """
     chance: float = 0.0
     """Standard deviation of `gain`, from the differences between drives; inf for a single drive."""

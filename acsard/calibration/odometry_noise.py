@@ -1,9 +1,9 @@
 """Fits the noise settings of `[odometry]` to drives that the fit of the geometry did not use.
 
 A window is about half a minute of a drive. A residual is the heading or the position that a sensor
-measured at one time, minus that of the wheels. Some errors last for a whole turn, for example if
-the track changes with the turn rate. The residuals of a window are therefore seconds apart, so that
-each contains the whole of such an error.
+measured at one time, minus the heading or the position that the wheels give. Some errors last for a
+whole turn, for example if the track changes with the turn rate. The residuals of a window are
+therefore seconds apart, so that each contains the whole of such an error.
 
 The residuals are modelled as normal with mean 0. Their covariance V is linear in the noise x, which
 contains one number x_i for each `Source`. C_i is the covariance that noise of x_i = 1 causes. K is
@@ -46,7 +46,7 @@ class Source(IntEnum):
     DISTANCE = 0
     """Variance of the distance per metre driven, m2/m."""
     YAW = 1
-    """Variance of the heading per metre that the two sides roll on average, rad2/m."""
+    """Variance of the heading per metre that the wheels roll (mean of both sides), rad2/m."""
     SKID = 2
     """Variance of the heading per radian turned, rad2/rad."""
     SLIP = 3
@@ -122,7 +122,8 @@ one robot in eight had no width in some direction.
 TWICE = math.log(2.0) - 3 / 8
 """A `Noise.gain` above this value always counts as sure, even if `Noise.chance` is large.
 
-A standard deviation stated at twice its true value loses this much log likelihood per residual.
+If a standard deviation is stated at twice its true value, the log likelihood per residual is lower
+by this amount.
 """
 
 MOST = 1.0
@@ -183,9 +184,9 @@ class Windows(Struct, frozen=True):
     def at_least(self, noise: Floats) -> Floats:
         """Return `noise`, increased so that it is safe to state for other drives.
 
-        The minima are those of `FLOOR` and `CHANGES`. If few residuals show the noise of
-        `DISTANCE`, `YAW` or `SKID`, this noise is increased like the variance of Student's t.
-        Windows overlap by half, so each residual counts as half a degree of freedom.
+        `FLOOR` and `CHANGES` give minima. If few residuals show the noise of `DISTANCE`, `YAW` or
+        `SKID`, this noise is also increased like the variance of Student's t. Windows overlap by
+        half, so each residual counts as half a degree of freedom.
         """
         shares = np.linalg.inv(self.covariance(noise))[:, None] @ self.effects
         free = noise * np.einsum("wkii->k", shares) / 2

@@ -216,7 +216,7 @@ def turns_the_right_way(source: str, sides: Floats | None, begun: StartingPoint 
         )
     if by_heading:
         sensor = source or "the positions"
-        # If both sensors agree, the wheels are wrong. Otherwise the only sensor may be wrong.
+        # If two sensors agree, the wheels are wrong. If there is only one sensor, it may be wrong.
         or_sensor = (
             ""
             if begun is not None and sides is not None

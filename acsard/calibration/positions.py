@@ -9,7 +9,7 @@ that is nearly right. The search tries tracks from a tenth to thirty times the c
 also tries reversed turns, and wheels of one side that roll backwards. For each of these trials, the
 size of the path gives the wheel radius.
 
-Positions often determine a turn on the spot only up to whole turns: the robot faces the same way
+Positions often determine a turn in place only up to whole turns: the robot faces the same way
 after 90 deg to the left as after 270 deg to the right. If several starting points explain the
 positions about equally well, the search chooses the one that describes the more usual robot.
 """
@@ -187,7 +187,7 @@ def place(steps: WheelSteps, base: Base, parameters: Floats) -> Complexes:
 
 
 def _directions(turns: Floats) -> tuple[Floats, Complexes]:
-    """Return a pair: the headings at the begin and end of each step, rad, and the steps' chords.
+    """Return a pair: the heading before the first and after each step, rad, and each step's chord.
 
     A chord is a complex number, computed for an arc of length 1.
     """
@@ -298,7 +298,7 @@ WRONG_WAY = 4.0
 """Penalty factor if the wheels of one side, or the turns of the robot, seem to be reversed."""
 
 NOTHING = 1e-3
-"""Number that is added to each `StartingPoint.unexplained` before they are compared.
+"""Number that is added to each `StartingPoint.unexplained` before these values are compared.
 
 Differences below this number, which are only noise of the positions, then hardly matter.
 """

@@ -6,8 +6,8 @@ fit, or if one of them should not be used, the user names the topics to use with
 
 An `Odometry` is usually computed from the wheels, and such a pose cannot calibrate them. An
 `Odometry` is therefore used only if the user names its topic, or if the bag has neither turn rates
-nor other positions. An `Odometry` that the user did not name is refused if its turns are
-exactly those that follow from the wheels.
+nor other positions. An `Odometry` that the user did not name is refused if its turns are exactly
+the turns that the wheels show.
 """
 
 from __future__ import annotations
@@ -56,9 +56,9 @@ STEP_S = 1.0
 """Length of the intervals in which a sensor's turns are compared with those of the wheels, s."""
 
 UPRIGHT, LYING = 0.5, 0.8
-"""Limits for the absolute correlation between the robot's turns that an IMU axis measures and those
-that the wheels show. If the correlation is below `UPRIGHT` for the chosen axis and above `LYING`
-for another axis, the IMU lies on its side, and the log is refused."""
+"""Limits for the absolute correlation between the turns about an IMU axis and the turns that the
+wheels show. If the correlation is below `UPRIGHT` for the chosen axis and above `LYING` for another
+axis, the IMU lies on its side, and the log is refused."""
 
 OWN = 3e-3
 """RMS difference between the turns of an `Odometry` and of the wheels, divided by the RMS turn. If

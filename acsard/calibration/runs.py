@@ -48,8 +48,9 @@ ROUNDED_S, REPEATED = 0.2, 4.0
 
 ROLLING, AGAIN = 0.2, 0.4
 """The wheels roll if the absolute speeds of the left and the right side add up to more than
-`ROLLING` rad/s. If more than the fraction `AGAIN` of the positions (or yaws) of rolling wheels
-equal those of the row before, the logger has repeated old values. Such rows are removed."""
+`ROLLING` rad/s. The logger has repeated old positions (or yaws) if, while the wheels roll, more
+than the fraction `AGAIN` of the rows have the same value as the row before. Such rows are
+removed."""
 
 WHEELS = "left right"
 COMMANDS = " ".join(APPLIED)
@@ -185,7 +186,7 @@ class Notes:
 
 
 class Log(Struct, frozen=True):
-    """The runs of a log, and sentences about its data that were left out or changed."""
+    """The runs of a log, and sentences about the data that were left out or changed."""
 
     runs: tuple[Run, ...]
     notes: tuple[str, ...]

@@ -116,7 +116,7 @@ class Calibration(Struct, frozen=True):
     feedback: dict[str, float] = {}
     """New settings of `[feedback]`; empty unless the present ones cause false wheel faults."""
     noise: Noise | None = None
-    """None if the log does not show the noise of the odometry."""
+    """Noise of the odometry in this log; None if the log does not show it."""
 
 
 def calibrate(

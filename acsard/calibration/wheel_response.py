@@ -72,7 +72,7 @@ class WheelResponse(Struct, frozen=True):
         return {"response_time": self.proposed}
 
     def sentences(self) -> list[str]:
-        """Return a sentence about the response time, and one about `fastest` if that is finite."""
+        """Return a sentence about the response time. If `fastest` is finite, add one about it."""
         follow = f"the wheels follow their commands with a response time of {self.seconds:.2g} s"
         if self.false_fault:
             then = (

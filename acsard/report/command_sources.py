@@ -17,7 +17,7 @@ STATES = ("refused", "waits", "sends", "drives")
 """States of a command source that is not silent.
 
 In the state `sends`, the robot accepts the source's commands, but the source does not drive. If
-short spans of time are merged, the merged span has that of their states which comes first here.
+short spans of time are merged, the merged span has the first of their states in this order.
 """
 
 MOVES = ("ready", "driving")

@@ -61,11 +61,11 @@ Otherwise the scale of a robot that never moves would be empty."""
 
 BENEATH = 3.4
 """Width of a curve that another curve nearly covers, px. The wide curve stays visible on both sides
-of the other one."""
+of the other curve."""
 
 
 class Clip(NamedTuple):
-    """A time for which a curve is beyond the scale of its diagram, and is drawn at its edge."""
+    """An excursion: a time in which a curve exceeds the scale, and is drawn at the edge."""
 
     t: float
     """Time at which the curve leaves the diagram, s."""

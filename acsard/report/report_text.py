@@ -61,7 +61,7 @@ OF_THE_BOARD = {
     "bumper_pressed": "bumper hit",
     "battery_stop": "battery stop",
 }
-"""Maps the name of each event in which the board caused a stop to words for this event."""
+"""Words for the events in which the board caused a stop. The keys are the names of the events."""
 
 
 def differences(config: Config) -> list[Setting]:

@@ -51,9 +51,9 @@ MOST_STEPS = 20_000
 
 STRAIGHT = Steps(np.array([[0.05, 0.0] + [0.0] * 7]))
 SPIN = Steps(np.array([[0.0, 0.05] + [0.0] * 7]))
-"""Steps of 0.05 m ahead (`STRAIGHT`) and of 0.05 rad on the spot (`SPIN`), without errors.
+"""A step of 0.05 m ahead (`STRAIGHT`) and a step of 0.05 rad in place (`SPIN`), without errors.
 
-If the robot stood still, its budget is computed for these steps.
+If the robot stood still, its budget is computed for repetitions of these steps.
 """
 
 

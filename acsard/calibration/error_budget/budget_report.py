@@ -110,7 +110,7 @@ def _table(budget: Budget) -> Table:
         (name, _number(mm, 0), _number(deg, 2), *words)
         for name, mm, deg, *words in [*causes, total]
     ]
-    return table(rows, ("", "mm in 100 m", "deg a turn", "", "based on"), right={1, 2})
+    return table(rows, ("", "mm in 100 m", "deg per turn", "", "based on"), right={1, 2})
 
 
 def _track(budget: Budget, learned: float) -> str:

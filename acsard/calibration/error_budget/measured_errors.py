@@ -77,7 +77,7 @@ def line_times(t: Floats, sent: Floats) -> LineTimes:
 
     `t` contains the stamps of at least 3 feedback lines, s, and `sent` the times of the daemon's
     lines, s. The function makes two estimates: one for a board that sends at a fixed period, one
-    for a board that answers each line of the daemon. It returns the one with the smaller delays.
+    for a board that answers each line of the daemon. It returns the estimate with smaller delays.
     """
     even = _even(t)
     asked = _asked(t, sent)

@@ -74,7 +74,7 @@ UNITS = {"m": 1.0, "mm": 1e-3, "deg": math.pi / 180}
 
 
 Quantity = Literal["turned", "angle", "distance", "ahead", "aside"]
-"""The quantity that a tape reading gives about the robot's motion since its last known pose.
+"""The quantity that a tape reading gives about the motion since the last known pose of the robot.
 
 - `turned`: the turn in rad, positive to the left, including whole turns.
 - `angle`: the turn in rad, positive to the left, with an unknown number of whole turns.
@@ -89,7 +89,7 @@ class Mean(Struct, frozen=True):
 
     quantity: Quantity
     answers: tuple[str, ...]
-    """Names of the answers."""
+    """Names of the answers of which the mean is computed."""
     deviation: float
     """Standard deviation of the measurement, m or rad."""
     plus: float = 0.0
@@ -271,7 +271,8 @@ the ratio.
 TRACKS = [1.0 + 0.05 * step for step in range(round((WIDEST - 1.0) / 0.05) + 1)]
 """Ratios of effective track to wheel separation for which the driving time is computed.
 
-The largest ratio need not take longest: with a smaller one, a leg may have one more full turn.
+The largest ratio does not always need the longest time. With a smaller ratio, a leg may have one
+more full turn.
 """
 
 

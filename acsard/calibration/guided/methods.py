@@ -1,9 +1,10 @@
 """The table of the methods of calibration by a guided drive, and the legs of each.
 
 UMBmark is by Borenstein & Feng, UMBmark: A Benchmark Test for Measuring Odometry Errors in Mobile
-Robots (1995). The robot drives squares, and a person measures how far from its start it ends. The
-paper evaluates this distance with two formulas for small errors. Here the fit in `tape_readings.py`
-evaluates it instead, because the track of a robot that skids is far from the configured track.
+Robots (1995). The robot drives squares, and a person measures the displacement between the start
+and the end of each square. The paper evaluates these measurements with two formulas for small
+errors. Here they go into the fit of `tape_readings.py` instead, because the track of a robot that
+skids is far from the configured track.
 """
 
 from __future__ import annotations
