@@ -226,7 +226,9 @@ def test_a_tilted_pose_gives_the_yaw_of_its_quaternion() -> None:
 def test_an_imu_on_its_side_is_told_with_the_axis_that_follows_the_wheels(
     axis: int, sign: float, option: str
 ) -> None:
-    with pytest.raises(LogError, match=rf"z axis .* but its {'xyz'[axis]} axis .*={option}$"):
+    with pytest.raises(
+        LogError, match=rf"z axis .* but the rate about its {'xyz'[axis]} axis .*={option}$"
+    ):
         of(joint_states(SHORT), imu(SHORT, axis=axis, sign=sign))
     bag = of(joint_states(SHORT), imu(SHORT, axis=axis, sign=sign), axis=option)
     rate = bag.columns["yaw_rate"]
