@@ -156,7 +156,7 @@ class Prepared(Struct, frozen=True):
     parts: list[Block]
     rows: Rows
     """Motion in intervals of about 1 s. The gyro's bias has been subtracted from the turns, unless
-    the bias is unknown because the robot never rested."""
+    the bias is unknown (`Headings.bias_unknown`)."""
     segments: list[Segment]
     """The measured positions; empty if the log has none."""
     steps: list[WheelSteps]
