@@ -24,7 +24,8 @@ NAMES = (
 """Settings of `[drive]` in the order of `Multipliers.values`."""
 
 DIGITS = 5
-"""Decimals of multipliers, and significant digits of `[odometry]` settings, in `acsard.toml`."""
+"""Decimals of the multipliers and significant digits of the `[odometry]` settings, as they are
+written into `acsard.toml`."""
 
 
 class Refusal(Struct, frozen=True):
@@ -48,7 +49,10 @@ class Report(Struct, frozen=True):
     reference: str
     """Sensors or measuring tool with which the wheels were compared, in words."""
     scale: str
-    """Measurements that show the size of the wheels; "" if the mean radius stays as configured."""
+    """Measurements that show the size of the wheels, in words; "" if none does.
+
+    If none does, the mean radius stays as configured.
+    """
     wheel_separation_multiplier: float
     left_wheel_radius_multiplier: float
     right_wheel_radius_multiplier: float
@@ -61,10 +65,10 @@ class Report(Struct, frozen=True):
     covariance: Sequence[Sequence[float]]
     """Covariance of the multipliers of wheel separation, left radius and right radius."""
     odometry: dict[str, float]
-    """New settings of `[odometry]`: the uncertainty of the wheel radii and of the track, and also
-    the noise if the new noise settings are surely better."""
+    """New settings of `[odometry]`: the uncertainty of the wheel radii and of the track. They also
+    contain the noise if the new noise settings are surely better."""
     feedback: dict[str, float]
-    """New settings of `[feedback]`; empty unless the old ones make good wheels look faulty."""
+    """New settings of `[feedback]`; empty unless the present ones cause false wheel faults."""
     effective_track: float
     """Effective track, m."""
     effective_track_std: float | None
@@ -159,7 +163,11 @@ def report(log: str, calibration: Calibration, drive: DriveConfig, written: str)
 
 
 def _noise(calibration: Calibration) -> tuple[BeforeAfter, BeforeAfter]:
-    """Return the standard deviations due to noise after `METRES`: heading (deg), distance (m)."""
+    """Return the standard deviations that noise causes after `METRES` m of driving.
+
+    The first of the pair is for the heading, deg, the second for the distance, m. Each has the
+    values with the configured and with the new noise settings.
+    """
     noise = calibration.noise
     if noise is None or not noise.better:
         return NOTHING, NOTHING

@@ -2,9 +2,9 @@
 
 The fit is a Gauss-Newton fit. The evidence of a sensor is its contribution to the normal equations,
 summed over each block (a few seconds of driving). The standard deviations come from a jackknife
-over the blocks (Quenouille and Tukey): each block is left out in turn, and one linear step from the
-fit to all blocks gives the parameters without this block. These deviations are right even if the
-errors within a block are correlated.
+over the blocks (Quenouille and Tukey), which leaves out each block in turn. The parameters without
+a block are found by one linear step, which starts at the parameters that fit all blocks. These
+deviations are right even if the errors within a block are correlated.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class P(IntEnum):
     TRACK_GROWTH = 3
     """Fraction by which the effective track grows for each rad/s of turn rate."""
     DELAY = 4
-    """Delay of the positions' recorded times behind those of the wheels, s."""
+    """Time by which the recorded times of positions are later than those of the wheels, s."""
     SENSOR_X = 5
     """Distance by which the position sensor is ahead of the robot's middle, m."""
     SENSOR_Y = 6
@@ -50,7 +50,7 @@ class P(IntEnum):
 COUNT = len(P)
 
 HUBER = 2.0
-"""Size of a residual, in standard deviations, above which it gets a smaller weight (Huber)."""
+"""Size of a residual, in standard deviations, above which the residual weighs less (Huber)."""
 
 
 class Base(Struct, frozen=True):
@@ -73,13 +73,13 @@ class Base(Struct, frozen=True):
         )  # fmt: skip
 
     def start(self) -> Floats:
-        """Return parameters that contain the configured multipliers, and 0 for everything else."""
+        """Return parameters that describe the configured multipliers. All others are 0."""
         return np.array([self.left, self.right, 1 / self.track, *[0.0] * (COUNT - P.TRACK_GROWTH)])
 
     @property
     def gain(self) -> float:
-        """Wheel radius / wheel separation: turn per radian that the right wheels roll more than the
-        left ones."""
+        """Wheel radius / wheel separation. This is the robot's turn, rad, if the right wheels roll
+        1 rad further than the left wheels."""
         return self.radius / self.separation
 
 
@@ -109,6 +109,7 @@ def of_rows(
         jacobian: derivatives of each prediction by the parameters, shape (measurements, COUNT).
         residual: measured minus predicted values.
         block: index of the block of each measurement.
+        blocks: number of blocks.
     """
     normal = np.zeros((blocks, COUNT, COUNT))
     score = np.zeros((blocks, COUNT))
@@ -121,9 +122,10 @@ def of_rows(
 
 
 def condition(normal: Floats) -> float:
-    """Return the condition number of `normal`, scaled so that units do not matter.
+    """Return the condition number of the matrix `normal` after it was scaled to a diagonal of 1.
 
-    It is infinite if a parameter has no influence (0 on the diagonal).
+    The units of the parameters then do not matter. The number is infinite if a parameter has no
+    influence (0 on the diagonal).
     """
     size = np.sqrt(np.diag(normal))
     if not np.all(size > 0.0):
@@ -132,7 +134,7 @@ def condition(normal: Floats) -> float:
 
 
 def huber(residuals: Floats | Complexes, least: float) -> Floats:
-    """Return Huber's weight of each residual: 1 up to `HUBER` standard deviations, above it less.
+    """Return Huber's weight of each residual: 1 up to `HUBER` standard deviations, less above.
 
     The standard deviation is the scaled median absolute residual, but at least `least`.
     """
@@ -148,7 +150,8 @@ MOST_STEPS = 30
 SMALL, SETTLED = 1e-5, 0.02
 """Limits for the largest change of radii and track, as fractions, in the latest step of the fit.
 
-Below `SMALL`, no further step is made. Below `SETTLED`, the fit has converged.
+After a change below `SMALL`, the fit ends. If the last change is below `SETTLED`, the fit counts as
+converged.
 """
 
 USUAL = {P.TRACK_GROWTH: 0.06, P.DELAY: 1.0, P.SENSOR_X: 0.5, P.SENSOR_Y: 0.5}
@@ -161,23 +164,24 @@ HELD = 1e9
 """Weight of a constraint (`Held`) in the normal equations, large enough to enforce it."""
 
 Held = tuple[Floats, float]
-"""Constraint on a weighted sum of the parameters: their weights, shape (COUNT,), and the sum."""
+"""Constraint on a weighted sum of the parameters: a pair of the weights, shape (COUNT,), and the
+value that the sum must have."""
 
 MANY = 16
-"""Minimum number of blocks for a jackknife that also leaves out pairs of neighbouring blocks."""
+"""Minimum number of blocks for a jackknife that also leaves out pairs of neighboring blocks."""
 
 LEAST_BLOCKS = 5
 """Minimum number of blocks (or runs) for a jackknife that leaves out each of them in turn."""
 
 
 def student_factor(free: Floats | float) -> Floats:
-    """Return the variance of Student's t with `free` degrees of freedom, but with at least 3."""
+    """Return the variance of Student's t with `free` degrees of freedom; less than 3 count as 3."""
     free = np.maximum(3.0, free)
     return np.asarray(free / (free - 2))
 
 
 class Fit(Struct, frozen=True):
-    """The result of a fit: the parameters, and each block's normal equations at that point."""
+    """The result of a fit: the fitted parameters, and the normal equations at these parameters."""
 
     parameters: Floats
     normal: Floats
@@ -185,7 +189,8 @@ class Fit(Struct, frozen=True):
     score: Floats
     """Right-hand sides of the normal equations, shape (blocks, COUNT)."""
     known: Floats
-    """Prior information as normal equations, shape (COUNT, COUNT)."""
+    """Left-hand side of the normal equations of constraints and prior information, shape
+    (COUNT, COUNT)."""
     active: tuple[P, ...]
     """Indices of the parameters that were fitted."""
     converged: bool
@@ -193,9 +198,9 @@ class Fit(Struct, frozen=True):
     """Prior standard deviation of each parameter that has one."""
 
     def without(self, blocks: Mask) -> Floats:
-        """Return approximately the parameters of a fit that leaves out the masked blocks.
+        """Return the parameters without the blocks in the mask `blocks`, approximately.
 
-        One linear step from this fit gives them.
+        They are computed by one linear step from `parameters`, without another fit.
         """
         rest = self.normal[~blocks].sum(axis=0) + self.known
         found = self.parameters.copy()
@@ -203,10 +208,10 @@ class Fit(Struct, frozen=True):
         return found
 
     def marginal(self) -> Floats:
-        """Return the normal equations of radii and inverse track; other parameters are eliminated.
+        """Return the normal equations (left-hand side) of the left radius, right radius and track.
 
-        If no positions show the size of the wheels, the unknowns are the difference of the radii
-        and the inverse track.
+        All other parameters are eliminated. If no positions show the size of the wheels, only two
+        unknowns remain: the difference of the radii, and the inverse track.
         """
         total = self.normal.sum(axis=0) + self.known
         rest = [index for index in self.active if index > P.INVERSE_TRACK]
@@ -224,7 +229,7 @@ class Fit(Struct, frozen=True):
         """
         alone = np.arange(len(self.score))
         change, size = self._changes(alone)
-        # Leaving out neighbouring blocks or whole runs shows errors that last longer than a block.
+        # Leaving out neighboring blocks or whole runs shows errors that last longer than a block.
         if len(alone) >= MANY:
             size = np.maximum(size, self._changes(alone // 2)[1])
         if len(set(runs)) >= LEAST_BLOCKS:
@@ -239,11 +244,12 @@ class Fit(Struct, frozen=True):
         return np.asarray(chance + pull @ np.diag(1 / np.where(usual, usual, np.inf)) @ pull.T)
 
     def _changes(self, group: npt.NDArray[np.int64]) -> tuple[Floats, Floats]:
-        """Return the parameters' changes without each group of blocks, and the jackknife variances.
+        """Return a pair: the changes of the parameters, and their jackknife variances.
 
-        `group` gives the group of each block. The variances are widened to those of Student's t,
-        with the degrees of freedom of Satterthwaite (An approximate distribution of estimates of
-        variance components, 1946).
+        `group` contains the number of each block's group. The changes have a row for each group:
+        the parameters without this group minus `parameters`. The variances are widened to those of
+        Student's t, with the degrees of freedom of Satterthwaite (An approximate distribution of
+        estimates of variance components, 1946).
         """
         change = np.array(
             [self.without(group == number) - self.parameters for number in np.unique(group)]
@@ -264,6 +270,7 @@ def fit(
         start: the parameters to start from, which must be nearly right.
         places, gyro: whether positions and a gyro are among the sources.
         bias_std: standard deviation of the gyro bias, rad/s; 0 if the fit must not change the bias.
+        held: constraints on the parameters.
     """
     active: tuple[P, ...] = tuple(P)[: P.BIAS_ERROR if places else P.DELAY]
     usual = dict(USUAL)
@@ -282,8 +289,8 @@ def fit(
         step = np.zeros(COUNT)
         step[list(active)] = _solved(normal.sum(axis=0) + known, score.sum(axis=0) + prior, active)
         # Far from the solution, take only a part of the step, because the linearization holds only
-        # nearby. After a third of the steps, halve each step. Otherwise a residual could be an
-        # outlier in every other step only, and the fit would not converge.
+        # nearby. After a third of the steps, halve each step. Otherwise a residual could become an
+        # outlier in every second step, and the fit would not converge.
         size = float(np.max(np.abs(step[: P.DELAY])))
         whole = 1.0 if at < MOST_STEPS // 3 else 0.5
         parameters = parameters + step * min(whole, 0.3 / size if size else 1.0)
@@ -295,10 +302,11 @@ def fit(
 
 
 def _sum(evidence: Sequence[Evidence]) -> tuple[Floats, Floats]:
-    """Return the weighted sums of the normal equations and of the scores of all sensors.
+    """Return the normal equations of all sensors: a pair of their left-hand and right-hand sides.
 
-    The weight of a sensor follows from the scatter of its scores from block to block. Unlike the
-    size of the residuals, this scatter becomes larger if the residuals are correlated.
+    Both are weighted sums over the sensors. The weight of a sensor follows from the scatter of its
+    right-hand sides from block to block. Unlike the size of the residuals, this scatter becomes
+    larger if the residuals are correlated.
     """
     normal, score = np.zeros_like(evidence[0].normal), np.zeros_like(evidence[0].score)
     for part in evidence:
@@ -324,7 +332,10 @@ def _weight(part: Evidence) -> float:
 def _known(
     parameters: Floats, held: Sequence[Held], usual: Mapping[P, float]
 ) -> tuple[Floats, Floats]:
-    """Return the normal equations of the constraints `held` and the prior deviations `usual`."""
+    """Return the normal equations of constraints and priors: a pair of left and right-hand side.
+
+    `held` contains the constraints. `usual` contains the prior standard deviations.
+    """
     normal, score = np.zeros((COUNT, COUNT)), np.zeros(COUNT)
     for index, deviation in usual.items():
         normal[index, index] = deviation**-2

@@ -28,16 +28,17 @@ Samples in the margins are not used, because the robot may shake there.
 """
 
 TURNED_BY_HAND = 0.05
-"""Limit for the gyro's mean rate in one rest minus the median of all rests, rad/s.
+"""Limit for the gyro's mean rate in one rest minus the median rate of all rests, rad/s.
 
-Above it, a person turned the robot during this rest, so the rest is not used.
+If the difference is larger, a person turned the robot during this rest, so the rest is not used.
 """
 
 LEAST_SAMPLES = 5
 """Minimum number of gyro samples in a rest of the robot."""
 
 OUTLIER = 6.0
-"""Deviation of a gyro sample at rest, in median deviations, above which the sample is left out."""
+"""A gyro sample at rest is left out if its deviation from the median exceeds `OUTLIER` times the
+median deviation."""
 
 WALK = 5e-5
 """Smallest random walk assumed for the gyro bias, rad/s per square root of a second."""
@@ -77,9 +78,9 @@ class Headings(Struct, frozen=True):
     bias: float
     """Median of the gyro's bias in all rests, rad/s; 0 without a gyro or without a rest."""
     bias_unknown: bool
-    """True if the robot never rested, so that the gyro's bias is not known from rests.
+    """True if no rest of the robot shows the gyro's bias.
 
-    It must then be found by a comparison with the wheels.
+    The bias must then be found by a comparison with the wheels.
     """
     bias_std: float = 0.0
     """Standard deviation of the bias while the robot moves, rad/s; 0 if no bias is known."""
@@ -193,10 +194,11 @@ def _biases(run: Run) -> Rests:
 
 
 def _mean(samples: Floats) -> tuple[float, float]:
-    """Return the mean of a rest's gyro samples without outliers, and the variance of this mean.
+    """Return a pair: the mean of a rest's gyro samples without outliers, and its variance.
 
     The variance comes from the means of five parts, so it is right for correlated noise as well.
-    The median is not used: for a coarse gyro it would always be one of the few reported values.
+    The median is not used instead of the mean, because for a coarse gyro it would always be one of
+    the few reported values.
     """
     off = np.abs(samples - np.median(samples))
     steps = np.diff(np.unique(samples))
@@ -211,7 +213,8 @@ def _mean(samples: Floats) -> tuple[float, float]:
 def _bias_std(rested: Sequence[Rests], seconds: Sequence[float]) -> float:
     """Return the standard deviation of the mean bias over all runs, rad/s.
 
-    Its causes are the noise in the rests, and the random walk of the bias outside of the rests.
+    The deviation has two causes: the noise in the rests, and the random walk of the bias outside
+    of the rests.
     """
     count = sum(len(t) for t, _, _ in rested)
     noise = sum(float(variance.sum()) for _, _, variance in rested) / max(1, count) ** 2
@@ -238,8 +241,8 @@ def _sums(rate: Floats, steps: Floats) -> Floats:
 def offset(found: Sequence[Heading], driven: Sequence[Run]) -> float:
     """Return the delay of the sensor, s, for which its turns correlate best with the wheels'.
 
-    A turn of the wheels is the right minus the left angle. Their sum is tried as well, because the
-    speeds of one side may have the wrong sign.
+    The turn according to the wheels is the right minus the left angle. The sum of both angles is
+    tried as well, because the speeds of one side may have the wrong sign.
     """
     reach = round(FURTHEST_S / GRID_S)
     scores, sizes = np.zeros((2, 2 * reach + 1)), np.zeros(2)
@@ -279,7 +282,8 @@ def _correlation(later: Floats, earlier: Floats, reach: int) -> Floats:
 def rows(headings: Headings | None, driven: Sequence[Run], parts: Sequence[Block]) -> Rows:
     """Divide the blocks `parts` into intervals of about `ROW_S` s. Return the motion in each.
 
-    Intervals without samples of the sensor are left out. If `headings` is None, all are returned.
+    Intervals without samples of the heading sensor are left out. If `headings` is None, no interval
+    is left out.
     """
     fast = [_fast(run) for run in driven]
     found: list[tuple[Floats, ...]] = []
@@ -305,7 +309,11 @@ def rows(headings: Headings | None, driven: Sequence[Run], parts: Sequence[Block
 
 
 def rates(rows: Rows, by_wheels: Floats) -> Rates:
-    """Return the turn rates of a log. `by_wheels` is the wheels' turn in each interval, rad."""
+    """Return the turn rates of a log.
+
+    `by_wheels` contains the turn of the robot in each interval of `rows` according to the wheels,
+    rad.
+    """
     turned = np.abs(by_wheels)
     rate = turned / rows.seconds
     turning = rate > TURNING
@@ -360,7 +368,10 @@ def _by_growth(rows: Rows, base: Base, parameters: Floats) -> Floats:
 
 
 def evidence(rows: Rows, base: Base, parameters: Floats, blocks: int) -> Evidence:
-    """Return the evidence of a heading sensor in `rows`, linearized at `parameters`."""
+    """Return the evidence of a heading sensor in `rows`, linearized at `parameters`.
+
+    `blocks` is the number of blocks.
+    """
     turn = parameters[P.INVERSE_TRACK]
     by_wheels = turned(rows, base, parameters)
     jacobian = np.zeros((len(rows.turned), COUNT))

@@ -26,17 +26,20 @@ LEAST_RUNS = 3
 """Minimum number of runs for leaving out whole runs. With fewer, fifths of the log are left out."""
 
 STRAIGHT = 0.1
-"""Largest curvature that counts as straight, rad/m, computed from the rolling of the wheels."""
+"""Largest curvature of the path that the wheels show, rad/m, that counts as straight."""
 
 STRAIGHT_M = 1.0
-"""Minimum distance of straight driving, m, from which a heading error is computed.
+"""Minimum total distance of straight driving in a log, m.
 
-With less, the error per 10 m would be only noise.
+With less, the heading error per 10 m would be only noise, so it is not computed.
 """
 
 
 class BeforeAfter(Struct, frozen=True):
-    """One odometry error with the configured and with the new multipliers; None if unmeasured."""
+    """An odometry error with the configured multipliers, and with the new multipliers.
+
+    Both are None if the log does not show this error.
+    """
 
     before: float | None
     after: float | None
@@ -45,7 +48,7 @@ class BeforeAfter(Struct, frozen=True):
 NOTHING = BeforeAfter(None, None)
 
 SURE = 2.0
-"""A gain counts as sure (95 %) if it exceeds this many of its standard deviations."""
+"""A gain counts as sure (95 %) if it is above `SURE` times its standard deviation."""
 
 HALVED = float(np.log(2.0))
 """The value of `Improvement.gain` if the calibration halves one error.
@@ -57,9 +60,9 @@ show nearly all of the error. The standard deviation is then large although the 
 NEAR, FAR = 2.0, 3.0
 """Limits for the distance of the new multipliers from the configured ones, in standard deviations.
 
-Up to `NEAR`, the configured multipliers are kept. Above `FAR`, the new multipliers are accepted
-with a smaller gain: at twice `FAR`, with half of the usual gain. By chance alone, the distance
-exceeds `FAR` in one log of thirty.
+Up to `NEAR`, the configured multipliers are kept. Above `FAR`, a smaller `Improvement.gain` is
+enough to accept the new multipliers. At twice `FAR`, half of the usual gain is enough. By chance
+alone, the distance exceeds `FAR` in one log of thirty.
 """
 
 LEAST_SQUARE = 1e-9
@@ -72,7 +75,7 @@ class Improvement(Struct, frozen=True):
     turn: BeforeAfter
     """Heading error after a turn of 360 deg, deg."""
     straight: BeforeAfter
-    """Heading error after 10 m straight ahead, deg: the turn that the wheels do not show."""
+    """Heading error after 10 m straight ahead, deg."""
     heading: BeforeAfter
     """RMS heading error over whole drives, deg. Each drive is first rotated to fit best."""
     place: BeforeAfter
@@ -80,7 +83,8 @@ class Improvement(Struct, frozen=True):
     gain: float = np.inf
     """Natural logarithm of (error before / error after); inf if it was not computed.
 
-    The logarithms for headings and for positions (RMS errors over whole drives) are added.
+    It is the sum of two such logarithms: one for the RMS error of the heading over whole drives,
+    and one for that of the position. The log may show only one of them.
     """
     chance: float = 0.0
     """Standard deviation of `gain`, from the differences between drives; inf for a single drive."""
@@ -98,7 +102,7 @@ UNMEASURED = Improvement(NOTHING, NOTHING, NOTHING, NOTHING)
 
 
 class Fold(Struct, frozen=True):
-    """One step of the cross-validation: a drive, and the fit that leaves out this drive."""
+    """One step of the cross-validation: a drive, and parameters fitted without this drive."""
 
     drive: Block
     blocks: Mask
@@ -107,7 +111,10 @@ class Fold(Struct, frozen=True):
 
 
 def drives(driven: Sequence[Run]) -> list[Block]:
-    """Return the drives to leave out in turn: whole runs, or fifths of a log with few runs."""
+    """Return the drives that the cross-validation leaves out, one at a time.
+
+    A drive is a whole run, or a fifth of the log if the log has fewer than `LEAST_RUNS` runs.
+    """
     longest = np.inf
     if len(driven) < LEAST_RUNS:
         longest = sum(float(run.t[-1]) for run in driven) / FOLDS
@@ -130,8 +137,8 @@ def folds(fit: Fit, parts: Sequence[Block], left_out: Sequence[Block], rate: Rat
     """Return a fold for each drive in `left_out`, with the parameters that fit all other drives.
 
     `parts` are the blocks of the fit. A fold leaves out the blocks that overlap its drive. If no
-    block or every block overlaps, the drive gets no fold. The fitted parameters are returned with
-    a constant track, the one at `rate.mean`.
+    block or every block overlaps a drive, this drive gets no fold. The parameters of a fold have
+    the same track for all turn rates (`with_constant_track`).
     """
     run, begin, end = (
         np.array(column) for column in zip(*((p.run, p.begin, p.end) for p in parts), strict=True)
@@ -162,10 +169,10 @@ def improvement(
     """Return the odometry errors before and after the calibration, on drives that were left out.
 
     Args:
-        held: the folds: each drive, with the parameters that were fitted without it.
+        held: the folds. Each contains a drive, and parameters that were fitted without this drive.
         configured: the parameters with the configured multipliers.
-        rows: the motion in intervals of about a second. The measured turns are 0 without
-            a heading sensor.
+        rows: the motion in intervals of about a second. `rows.turned` is 0 if the log has no
+            heading sensor.
         places: for each fold, the measured positions of its drive.
         steps: the wheel steps of each run; empty if the log has no positions.
     """
@@ -200,8 +207,8 @@ def improvement(
 def rms(sums: Floats) -> BeforeAfter:
     """Return the RMS errors before and after the calibration.
 
-    `sums` contains the sum of the squared errors before, the same sum after, and the number of
-    samples.
+    `sums` contains three numbers: the sum of the squared errors before the calibration, the sum
+    after it, and the number of samples.
     """
     before, after, count = sums.tolist()
     if not count:
@@ -210,10 +217,11 @@ def rms(sums: Floats) -> BeforeAfter:
 
 
 def per_amount(sums: Floats, unit: float) -> BeforeAfter:
-    """Return the errors before and after, divided by the driven angle or distance, times `unit`.
+    """Return the errors before and after the calibration, per driven angle or distance.
 
-    `sums` contains the sum of errors before, the same sum after, and the driven angle or distance.
-    For example, a `unit` of 360 gives the error in deg for a full turn.
+    `sums` contains three numbers: the sum of the errors before, the sum after, and the driven angle
+    or distance. The quotients are multiplied by `unit`. For example, if errors and angle are in
+    rad, a `unit` of 360 gives the error for a full turn in deg.
     """
     before, after, amount = sums.tolist()
     if not amount:
@@ -222,10 +230,10 @@ def per_amount(sums: Floats, unit: float) -> BeforeAfter:
 
 
 def _gain(kinds: Sequence[Floats]) -> tuple[float, float]:
-    """Return `Improvement.gain` and `Improvement.chance`.
+    """Return a pair: `Improvement.gain` and `Improvement.chance`.
 
-    `kinds` has an array for each kind of error. Each row is a drive, with the
-    three numbers that `rms()` takes.
+    `kinds` has an array for each kind of error (of headings, of positions), shape (folds, 3). A row
+    contains the three numbers that `rms()` takes, for the drive of one fold.
     """
     drives = np.any([squares[:, 2] > 0.0 for squares in kinds], axis=0)
     if not np.any(drives):
@@ -239,9 +247,10 @@ def _gain(kinds: Sequence[Floats]) -> tuple[float, float]:
 
 
 def with_chance(gain: Callable[[Mask], float], drives: Mask) -> tuple[float, float]:
-    """Return `gain(drives)` and its standard deviation, which is infinite for a single drive.
+    """Return a pair: `gain(drives)`, and the standard deviation of this gain.
 
-    The deviation is that of a jackknife over the drives, widened to that of Student's t.
+    `gain` computes a gain from the drives in a mask. The deviation comes from a jackknife over the
+    drives, and is widened to that of Student's t. It is infinite for a single drive.
     """
     count = int(drives.sum())
     if count == 1:
@@ -254,18 +263,21 @@ def with_chance(gain: Callable[[Mask], float], drives: Mask) -> tuple[float, flo
 def _by_group(
     before: Floats, after: Floats, group: npt.NDArray[np.int64], among: Mask, amount: float
 ) -> Floats:
-    """Return the sum of the groups' absolute errors before, the same sum after, and `amount`.
+    """Return the three numbers for `per_amount`: total error before, total error after, `amount`.
 
-    The error of a group is the sum over its intervals in the mask `among`.
+    `before` and `after` contain the error of the turn in each interval, rad. Only the intervals in
+    the mask `among` count. Within a group, the errors are added with their signs. The absolute
+    values of the groups' sums then give the total.
     """
     sums = (np.abs(np.bincount(group[among], errors[among])).sum() for errors in (before, after))
     return np.array([*sums, amount])
 
 
 def _of_headings(held: Sequence[Fold], before: Floats, after: Floats, rows: Rows) -> Floats:
-    """Return the sums of squared heading errors before and after, deg2, and the number of samples.
+    """Return the squared heading errors of each fold, shape (folds, 3).
 
-    The result has a row for each fold. `before` and `after` contain the errors of turns, rad.
+    A row contains the sum before the calibration, the sum after it (both in deg2), and the number
+    of samples. `before` and `after` contain the error of the turn in each interval, rad.
     """
     found = np.zeros((len(held), 3))
     for number, fold in enumerate(held):
@@ -281,7 +293,11 @@ def _of_positions(
     held: Sequence[Fold], configured: Floats, base: Base,
     places: Sequence[Sequence[Segment]], steps: Sequence[WheelSteps],
 ) -> Floats:  # fmt: skip
-    """Return per fold the squared position errors before and after, m2, and the sample count."""
+    """Return the squared position errors of each fold, shape (folds, 3).
+
+    A row contains the sum before the calibration, the sum after it (both in m2), and the number of
+    positions.
+    """
     found = np.zeros((len(held), 3))
     present = [path(run, base, configured) for run in steps]
     for number, (fold, out) in enumerate(zip(held, places, strict=True)):
@@ -294,7 +310,7 @@ def _of_positions(
 
 
 def no_better(found: Improvement) -> str:
-    """Return the message if the new multipliers are not surely better than the configured ones."""
+    """Return the message that the new multipliers are not surely better than the old ones."""
     errors = ", ".join(
         f"{name} {error.before * factor:.2g} {unit} now and {error.after * factor:.2g} {unit} "
         "with the new values"

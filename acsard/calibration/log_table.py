@@ -45,7 +45,8 @@ _NAME = re.compile(r"(?P<name>[^\[(]*)[\[(]?(?P<unit>[^\])]*)")
 def parted(cell: str) -> tuple[str, str]:
     """Return the name and the unit of a column from its header cell, such as "t [ms]".
 
-    The name is in snake case. The unit is the text in brackets up to a comma; "" without brackets.
+    The name is in snake case. The unit is the text in brackets up to a comma, or "" if the cell has
+    no brackets.
     """
     found = _NAME.match(cell.strip().lower())
     assert found is not None
@@ -77,7 +78,7 @@ RATES = frozenset((*WHEELS, "yaw_rate"))
 SPIKE, FEW_VALUES, SLOW = 10.0, 0.02, 0.02
 """Definition of a spike, which is a rate that was recorded wrongly.
 
-A spike is more than `SPIKE` times as large as each neighbouring sample and as the usual rate. The
+A spike is more than `SPIKE` times as large as each neighboring sample, and as the usual rate. The
 usual rate is the quantile 1 - `FEW_VALUES` of all rates above `SLOW` rad/s.
 """
 
@@ -101,8 +102,8 @@ def bounded(columns: dict[str, Floats]) -> Iterator[str]:
 def spikes(values: Floats, order: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
     """Return a mask of the values that are spikes. `order` contains the indices sorted by time.
 
-    A spike stands out both in the order of the file and in the order of time. In one order alone, a
-    true value may stand out as well, for example if the file is shuffled.
+    A spike stands out both in the order of the file and in the order of time. A true value may
+    stand out in one of these orders, for example if the file is shuffled.
     """
     sizes = np.abs(values)
     moving = sizes[sizes > SLOW]
@@ -125,11 +126,11 @@ def _alone(sizes: Floats, usual: float) -> npt.NDArray[np.bool_]:
 
 
 FOUR, TWO = ("fr", "fl", "rl", "rr"), ("left", "right")
-"""Columns of wheel speeds, rad/s. `FOUR` are those of each wheel, `TWO` the means of each side."""
+"""Columns of wheel speeds, rad/s: `FOUR` has one for each wheel, `TWO` one for each side's mean."""
 
 NUMBERS = ("t", *FOUR, *TWO, "yaw_rate", "x", "y", "yaw", *APPLIED)
 COLUMNS = (*NUMBERS, "run")
-"""Columns that a log can have: numbers, and the name of the run."""
+"""Columns that a log can have: the columns of numbers, and the column with the name of the run."""
 
 MISSING = frozenset(("", "nan", "-nan(ind)", "null", "none", "na", "n/a", "#n/a", "-", "--"))
 """Contents of a cell without a value, in lower case."""
@@ -144,7 +145,8 @@ BEHIND = re.compile(r"(?:^|\s)#")
 """Pattern for the start of a comment after a number, but not for "1.#QNAN", which means NaN."""
 
 FEW, SHARE = 3, 0.01
-"""Limits for unreadable rows: number, and share of the readable rows. The larger one applies."""
+"""Limits for unreadable rows: their number, and their share of the readable rows. The larger limit
+applies."""
 
 EXAMPLE = '"t,left,right,yaw_rate" or "t,fr,fl,rl,rr,x,y"'
 
@@ -178,8 +180,8 @@ class Table(Struct, frozen=True):
     def joined(cls, sensors: Sequence[Mapping[str, Floats]]) -> Table:
         """Return the table of one run: a row for each sample of each sensor, sorted by time.
 
-        Each element of `sensors` maps the column names of one sensor to values. All have "t". Any
-        other column belongs to only one sensor.
+        Each element of `sensors` maps the column names of one sensor to values. Every sensor has
+        the column "t". Any other column belongs to only one sensor.
         """
         ends = np.cumsum([0, *(len(sensor["t"]) for sensor in sensors)])
         columns = {name: np.full(ends[-1], math.nan) for sensor in sensors for name in sensor}
@@ -214,9 +216,10 @@ def _text(data: bytes) -> str:
 
 
 def _header(lines: Sequence[str]) -> tuple[int, list[tuple[str, str]], str]:
-    """Return the number of lines above the data, the names with their units, and the separator.
+    """Return three values: the number of lines above the data, the columns, and the separator.
 
-    The header may be the last comment above a table of numbers, as numpy writes it.
+    A column is a pair of its name and its unit. The header may be the last comment above a table of
+    numbers, as numpy writes it.
     """
     comment = ""
     for at, line in enumerate(lines):
@@ -264,9 +267,9 @@ def _is_number(cell: str) -> bool:
 
 
 def _columns(header: list[str], number: int) -> list[str]:
-    """Return the names of the columns, "" if unused.
+    """Return the names of the columns, with "" for each unused column.
 
-    Raise `LogError` if a column that the calibration needs is missing.
+    Raises `LogError` if a column that the calibration needs is missing.
     """
     where = f"line {number} (the header)"
     twice = {name for name in header if name in COLUMNS and header.count(name) > 1}
@@ -326,7 +329,7 @@ def _unknown_units(header: list[tuple[str, str]], names: list[str]) -> list[str]
 
 
 class _Reader:
-    """Parses the lines below the header. It must be fast for logs with a million lines."""
+    """Parses the lines below the header. It is fast, because a log may have a million lines."""
 
     def __init__(self, names: list[str], separator: str, factors: list[float]) -> None:
         self._names, self._separator, self._factors = names, separator, factors
@@ -397,7 +400,7 @@ class _Reader:
                 row.append(float(cell))
             except ValueError:
                 if parted(cell)[0] == self._names[i]:
-                    return []  # a header in the middle of the file: logs were concatenated
+                    return []  # the line repeats the header, because several logs were concatenated
                 shown = printable(cell if len(cell) <= 30 else cell[:27] + "...")
                 date = self._names[i] == "t" and ":" in cell
                 why = "a date, but t must be in seconds" if date else "not a number"
@@ -415,7 +418,7 @@ class _Reader:
         if self._bad > max(FEW, SHARE * rows) or (self._bad and not rows):
             raise LogError(
                 f"{self._first}, and {self._bad} of {self._bad + rows} rows have such errors: "
-                "write numbers with a point, or leave a cell empty if there is no value"
+                "write numbers with a decimal point, or leave a cell empty if it has no value"
             )
         if not rows:
             raise LogError("there are no rows below the header: record a drive")
@@ -438,7 +441,8 @@ KEYS = ("wheel_states", "imu", "sim/pose")
 def row(message: Message, arrived_ns: int) -> str:
     """Return the CSV row for a message from one of `KEYS`. Raises `ValueError` for other messages.
 
-    `arrived_ns` is the wall-clock time of arrival, ns since 1970. It replaces a missing stamp.
+    `arrived_ns` is the wall-clock time of arrival, ns since 1970. It is used if the message has no
+    stamp.
     """
     if isinstance(message, JointState) and len(message.velocity) == len(FOUR):
         cells = [*(f"{speed:.6g}" for speed in message.velocity), "", "", "", ""]

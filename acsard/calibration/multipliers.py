@@ -1,7 +1,7 @@
 """Computes the multipliers of wheel separation and radii, and corrects them with a measured length.
 
-A log of turn rates alone shows only the ratios of the multipliers. A distance that was measured by
-tape shows how large the wheels are.
+A log with turn rates but without positions shows only the ratios of the multipliers. A distance
+that was measured by tape then shows how large the wheels are.
 """
 
 from __future__ import annotations
@@ -91,8 +91,9 @@ def configured(base: Base) -> Multipliers:
 def multipliers(parameters: Floats, covariance: Floats, rate: Rates) -> Multipliers:
     """Return the multipliers that fit best at the turn rates of the log.
 
-    The multiplier of the separation describes a track that is the same for all turn rates. Its
-    variance does not cover skidding that differs from turn to turn, which is noise of the odometry.
+    The multiplier of the separation describes a track that is the same for all turn rates. The
+    variance of this multiplier does not cover skidding that differs from turn to turn, because that
+    is noise of the odometry.
     """
     inverse, growth = parameters[P.INVERSE_TRACK], parameters[P.TRACK_GROWTH]
     slower = 1.0 - growth * rate.mean
@@ -147,7 +148,7 @@ class Extent(Struct, frozen=True):
 
 
 Follow = Callable[[Floats, int], Extent]
-"""Function of `Multipliers.values` and the index of a run. It returns the extent of the run."""
+"""Function of `Multipliers.values` and the index of a run. It returns the `Extent` of this run."""
 
 
 def scaled(
@@ -156,10 +157,10 @@ def scaled(
     """Correct the multipliers with a distance that was measured by tape.
 
     The correction is the update step of a Kalman filter on the logarithms of the multipliers.
-    `known` tells whether positions have already shown the size of the wheels.
+    `known` is true if positions have already shown the size of the wheels.
 
     Returns:
-        The corrected multipliers, and the name of the run that the distance belongs to.
+        A pair: the corrected multipliers, and the name of the run that the distance belongs to.
 
     Raises:
         RefusedError: the log has no such run, the run is not straight enough, or the distance

@@ -1,9 +1,9 @@
 """Fits the noise settings of `[odometry]` to drives that the fit of the geometry did not use.
 
-A window is about half a minute of a drive. Its residuals are the headings or the positions of a
-sensor minus those of the wheels. Some errors last for a whole turn, for example if the track
-changes with the turn rate. The residuals are therefore seconds apart, so that each contains the
-whole of such an error.
+A window is about half a minute of a drive. A residual is the heading or the position that a sensor
+measured at one time, minus the heading or the position that the wheels give. Some errors last for a
+whole turn, for example if the track changes with the turn rate. The residuals of a window are
+therefore seconds apart, so that each contains the whole of such an error.
 
 The residuals are modelled as normal with mean 0. Their covariance V is linear in the noise x, which
 contains one number x_i for each `Source`. C_i is the covariance that noise of x_i = 1 causes. K is
@@ -46,13 +46,14 @@ class Source(IntEnum):
     DISTANCE = 0
     """Variance of the distance per metre driven, m2/m."""
     YAW = 1
-    """Variance of the heading per metre that the two sides roll on average, rad2/m."""
+    """Variance of the heading per metre that the wheels roll (mean of both sides), rad2/m."""
     SKID = 2
     """Variance of the heading per radian turned, rad2/rad."""
     SLIP = 3
     """Variance of the fraction of the distance that is lost in a window (half a minute)."""
     RATIO = 4
-    """Relative variance of right / left wheel radius from window to window (half a minute)."""
+    """Relative variance of the ratio of the right to the left wheel radius, from window to window
+    (half a minute)."""
     TRACK = 5
     """Relative variance of the effective track from window to window (half a minute)."""
     HEADING = 6
@@ -73,10 +74,10 @@ WINDOW_S, APART_S = 32.0, 4.0
 """Length of a window, and time between its residuals, s. A shorter drive is one window."""
 
 LEAST = 4
-"""Minimum number of intervals between the residuals of a window."""
+"""Minimum number of intervals into which the residuals divide a window."""
 
 MOST_WINDOWS = 80
-"""Largest number of windows that are used. From a longer log, only every n-th window is used."""
+"""Maximum number of windows that are used. From a longer log, only every n-th window is used."""
 
 FINE_S = 0.5
 """Duration of the steps into which a window is divided, s.
@@ -86,7 +87,10 @@ Errors from other sources are independent from step to step.
 """
 
 MOST_FOLDS = 10
-"""Largest number of groups of drives. Each group is left out once, which takes two searches."""
+"""Maximum number of groups into which the drives are divided for the cross-validation.
+
+Each group is left out once, which takes two searches.
+"""
 
 STEPS, FEWER_STEPS = 150, 60
 """Number of iterations in a search for the noise.
@@ -95,37 +99,38 @@ STEPS, FEWER_STEPS = 150, 60
 """
 
 OUTLIER = 9.0
-"""Mean square of a window's normalized residuals above which the window weighs less."""
+"""Mean square of the normalized residuals of a window above which the window weighs less."""
 
 ROUNDING = 1e-12
 """Variance added to each residual, so that even a perfect sensor's covariance can be inverted."""
 
 FLOOR = 0.25
-"""Minimum of the noise `DISTANCE`, `YAW` and `SKID`, in standard deviations of its estimate.
+"""Minimum for the noise of `DISTANCE`, `YAW` and `SKID`, in standard deviations of its estimate.
 
-In a short log, the fit often finds a noise of 0, which would make the pose exact.
+In a short log, the fit often finds a noise of 0, and the odometry would then state an exact pose.
 """
 
 CHANGES = 0.1
-"""Minimum of the noise `DISTANCE`, as a fraction of the noise `SLIP`.
+"""Minimum for the noise of `DISTANCE`, as a fraction of the noise of `SLIP`.
 
-`Windows.lasting` first converts `SLIP` to the unit of `DISTANCE`. In the same way, `RATIO` gives
-the minimum of `YAW`, and `TRACK` gives the minimum of `SKID`. A window does not show how long an
-error lasts beyond the window's end. Without this minimum, the pose covariance of one robot in eight
-had no width in some direction.
+`Windows.lasting` first converts the noise of `SLIP` to the unit of `DISTANCE`. In the same way,
+`RATIO` gives the minimum for `YAW`, and `TRACK` gives the minimum for `SKID`. A window does not
+show how long an error lasts beyond the window's end. Without this minimum, the pose covariance of
+one robot in eight had no width in some direction.
 """
 
 TWICE = math.log(2.0) - 3 / 8
 """A `Noise.gain` above this value always counts as sure, even if `Noise.chance` is large.
 
-A standard deviation stated at twice its true value loses this much log likelihood per residual.
+If a standard deviation is stated at twice its true value, the log likelihood per residual is lower
+by this amount.
 """
 
 MOST = 1.0
-"""Limit of each setting that a calibration proposes. The configuration accepts this value."""
+"""Largest value of a setting that a calibration proposes. The configuration accepts this value."""
 
 METRES = 10.0
-"""Distance for which the report states the uncertainty that noise causes, m."""
+"""Distance after which the report states the uncertainty that noise causes, m."""
 
 
 class Windows(Struct, frozen=True):
@@ -140,7 +145,8 @@ class Windows(Struct, frozen=True):
     effects: Floats
     """Covariance of the residuals if the noise of a source is 1, shape (windows, COUNT, n, n)."""
     known: Floats
-    """Covariance of the residuals due to geometry and gyro bias, shape (windows, n, n)."""
+    """Covariance of the residuals due to the uncertain geometry and gyro bias, shape
+    (windows, n, n)."""
     lasting: Floats
     """Factors that convert the noise of one source to equivalent noise of another source.
 
@@ -176,11 +182,11 @@ class Windows(Struct, frozen=True):
         return noise
 
     def at_least(self, noise: Floats) -> Floats:
-        """Return the noise to state for other drives, with the minima of `FLOOR` and `CHANGES`.
+        """Return `noise`, increased so that it is safe to state for other drives.
 
-        If few residuals show the noise `DISTANCE`, `YAW` or `SKID`, that noise is increased like
-        the variance of Student's t. Windows overlap by half, so each residual counts as half a
-        degree of freedom.
+        `FLOOR` and `CHANGES` give minima. If few residuals show the noise of `DISTANCE`, `YAW` or
+        `SKID`, this noise is also increased like the variance of Student's t. Windows overlap by
+        half, so each residual counts as half a degree of freedom.
         """
         shares = np.linalg.inv(self.covariance(noise))[:, None] @ self.effects
         free = noise * np.einsum("wkii->k", shares) / 2
@@ -211,14 +217,14 @@ class Noise(Struct, frozen=True):
     gain: float
     """Log likelihood per residual with the found noise, minus that with the configured noise.
 
-    It is measured on drives that the fit did not use.
+    Both are computed on drives that the fit did not use.
     """
     chance: float
     """Standard deviation of `gain`, from the differences between drives."""
     places: bool
     """Whether the log has positions. Only positions show the noise of the distance."""
     turning: float
-    """Turn of the robot per metre driven in this log, rad/m."""
+    """Total turned angle per metre driven in this log, rad/m."""
     track: float
     """Effective track, m."""
 
@@ -228,14 +234,14 @@ class Noise(Struct, frozen=True):
         return self.gain > min(SURE * self.chance, TWICE)
 
     def heading(self) -> tuple[float, float]:
-        """Return the standard deviations of the heading after `METRES`, rad.
+        """Return a pair of standard deviations of the heading after `METRES` m, rad.
 
         The first is due to the configured noise, the second to the found noise.
         """
         return self._after(Source.YAW, Source.RATIO, Source.SKID)
 
     def distance(self) -> tuple[float, float]:
-        """Return the standard deviations of the distance after `METRES`, m.
+        """Return a pair of standard deviations of the distance after `METRES` m, m.
 
         The first is due to the configured noise, the second to the found noise.
         """
@@ -256,7 +262,7 @@ def settings(
     known: Deviations, track: float, kept: Collection[str], odometry: OdometryConfig,
     shown: Noise | None = None, *, scaled: bool,
 ) -> dict[str, float]:  # fmt: skip
-    """Return the settings of `[odometry]` that a calibration gives.
+    """Return the new settings of `[odometry]` by name.
 
     Args:
         known: the standard deviations of the new geometry.
@@ -271,7 +277,7 @@ def settings(
         found["wheel_separation_multiplier_std"] = track * std
     if RATIO not in kept or shown is not None:
         found["wheel_radius_ratio_std"] = math.hypot(known.ratio, math.sqrt(x[Source.RATIO]))
-        # The deviation of the ratio of both radii replaces those of the single radii.
+        # The deviation of the ratio of both radii replaces the deviations of the single radii.
         for side in ("left_wheel_radius_multiplier_std", "right_wheel_radius_multiplier_std"):
             if getattr(odometry, side):
                 found[side] = 0.0
@@ -305,8 +311,8 @@ def noise(
 ) -> Noise | None:
     """Return the noise that a log shows, or None if fewer than two drives show it.
 
-    `held` contains the drives, each with parameters that were fitted without it. `known` contains
-    the standard deviations of track and wheel radii in these parameters.
+    `held` contains the drives, each with parameters that were fitted without this drive. `known`
+    contains the standard deviations of track and wheel radii in these parameters.
     """
     motions: list[_Motion] = []
     windows = _windows(held, seen, known, motions)
@@ -369,7 +375,7 @@ class _Motion(Struct, frozen=True):
 
 
 class _Window(Struct, frozen=True):
-    """The residuals of half a minute of a drive, and the effect of each step's errors on them."""
+    """The residuals of half a minute of a drive, and the effects of errors on these residuals."""
 
     residual: Floats
     start: Floats
@@ -380,15 +386,16 @@ class _Window(Struct, frozen=True):
     yaw: Floats
     """Effect of an error of each step's turn on each residual, shape (residuals, steps)."""
     sensor: dict[Source, Floats]
-    """Covariance of the residuals if the noise of a sensor is 1, by the source of the noise."""
+    """Maps each source of sensor noise to the covariance of the residuals if this noise is 1."""
     bias: Floats | float = 0.0
     """Covariance of the residuals due to the uncertain bias of the gyro; 0 without a gyro."""
 
     def projected(self, known: Deviations) -> tuple[Floats, Floats, Floats]:
-        """Return the residuals, their covariance by source of noise, and their known covariance.
+        """Return three arrays: residuals, their covariance by source of noise, known covariance.
 
-        The unknown start pose is projected out of all three. The known covariance is due to the
-        uncertainty `known` of track and wheel radii, and to the gyro's bias.
+        The unknown start pose is projected out of all three. The second contains, for each
+        `Source`, the covariance of the residuals if the noise is 1. The known covariance is due to
+        the uncertainty `known` of track and wheel radii, and to the gyro's bias.
         """
         distance, turn, track = self.motion.distance, self.motion.turn, self.motion.track
         sides = np.maximum(np.abs(distance), track / 2 * np.abs(turn))
@@ -463,7 +470,7 @@ def _of_drive(fold: Fold, seen: Reference) -> Iterator[_Window]:
 
 
 def _times(begin: float, end: float) -> Iterator[Floats]:
-    """Yield the times, s, of the residuals of each window. Neighbouring windows overlap by half."""
+    """Yield the times, s, of the residuals of each window. Neighboring windows overlap by half."""
     whole = min(end - begin, WINDOW_S)
     if whole > 0.0:
         count = max(1, round(2 * (end - begin) / WINDOW_S) - 1)
@@ -497,8 +504,9 @@ def _by_places(
 ) -> Iterator[_Window]:
     """Yield the window of the positions `place` (x + iy, m), measured at the times `at`, s.
 
-    Each residual is the median over the positions that are nearest to one of the times `t`. If one
-    of these times has no position, no window is yielded.
+    There is a residual for each of the times `t`. It is the median over the positions that are
+    nearer to this time than to the others. If one of the times has no position, no window is
+    yielded.
     """
     group = np.searchsorted((t[1:] + t[:-1]) / 2, at)
     numbers = range(len(t))

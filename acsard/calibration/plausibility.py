@@ -46,10 +46,10 @@ DRIVE = (
 )
 
 UNLIKE = 0.5
-"""Largest fraction of a sensor's motion (sum of squares) that may be unexplained by the wheels."""
+"""Largest fraction of a sensor's motion (sum of squares) that the wheels may leave unexplained."""
 
 UNITS = 8.0
-"""Largest credible ratio of a measured to a configured value. Above it, a unit must be wrong."""
+"""Largest credible ratio of a measured to a configured value. If it is larger, a unit is wrong."""
 
 LEAST_TURN = 0.2
 """Smallest credible ratio of the measured turn to the turn that the configured wheels predict.
@@ -64,7 +64,7 @@ If the ratio is between `FAR_SIZE` and 1 / `UNITS`, the wheel speeds have a wron
 """
 
 FASTEST_TURN = 12.0
-"""Fastest credible turn rate, rad/s: two turns in a second. A higher rate is in fact in deg/s."""
+"""Largest credible turn rate, rad/s (two turns in a second). A larger one is probably in deg/s."""
 
 LEAST_CHI = 0.4
 """Smallest credible ratio of effective track to wheel separation. Skidding only makes it larger."""
@@ -75,14 +75,15 @@ LEAST_FACTOR, MOST_FACTOR = 0.1, 10.0
 NOTABLE_S, FAR_S = 0.005, 0.5
 """Limits for the delay of a sensor, s.
 
-From `NOTABLE_S` on, a remark states the delay. Above `FAR_S`, it also advises to set the clocks.
+From `NOTABLE_S` on, a remark states the delay. Above `FAR_S`, the remark also advises to
+synchronize the clocks.
 """
 
 LARGE_BIAS = 0.05
 """Gyro bias, rad/s, above which the bias is reported."""
 
 ONE_SIDED = 0.1
-"""If the turns to one side are less than this fraction of those to the other, a remark says so."""
+"""A remark is made if the turns to one side are less than this fraction of those to the other."""
 
 ODD_SIZE = 1.25
 """Smallest factor between the measured and the configured radius that is reported."""
@@ -95,7 +96,7 @@ LEAST_TRACK, MOST_TRACK = 0.85, 3.0
 
 
 def drives_enough(parts: Sequence[Block]) -> None:
-    """Raise `RefusedError` if the blocks (a few seconds of driving each) of the log are too few."""
+    """Raise `RefusedError` if the log has too few blocks (of a few seconds of driving each)."""
     if len(parts) < LEAST_BLOCKS:
         seconds = sum(part.end - part.begin for part in parts)
         raise RefusedError(f"the wheels turn for only {seconds:.0f} s, which is too short: {DRIVE}")
@@ -105,8 +106,8 @@ def rolls_enough(rows: Rows, *, spins: bool = False) -> None:
     """Raise `RefusedError` if the log lacks a movement of the wheels that the fit needs.
 
     The mean of the left and the right angle, and half their difference, must each add up to
-    `LEAST_ROLL`, and must not be proportional to each other (`ALIKE`). With `spins`, the difference
-    (turns on the spot) is enough.
+    `LEAST_ROLL`, and must not be proportional to each other (`ALIKE`). If `spins` is true, a log
+    with only turns in place, in which the mean is nearly 0, is accepted too.
     """
     together, against = (rows.right + rows.left) / 2, (rows.right - rows.left) / 2
     for rolled, what in ((together, "ahead or back"), (against, "in opposite directions")):
@@ -130,7 +131,7 @@ def turns_enough(turned: Floats) -> None:
     """Raise `RefusedError` if the robot hardly turns. `turned` contains its turns in rad."""
     if (angle := float(np.abs(turned).sum())) < LEAST_ANGLE:
         raise RefusedError(
-            f"the robot turned by {np.degrees(angle):.0f} deg in all, which is too little to "
+            f"the robot turned by {np.degrees(angle):.0f} deg in total, which is too little to "
             f"measure the effective track: {DRIVE}"
         )
 
@@ -142,10 +143,10 @@ TRACK, RATIO = "the effective track", "the ratio of the left to the right wheel 
 def unsure(
     found: Multipliers, track_std: float, worst: tuple[float, float] = WORST
 ) -> dict[str, float]:
-    """Return the relative standard deviations, by quantity, that exceed their limit in `worst`.
+    """Map each quantity that is too uncertain to its relative standard deviation.
 
-    `track_std` is the relative standard deviation of the mean track. The track of a single turn
-    varies more.
+    `worst` contains the limits for `TRACK` and `RATIO`. `track_std` is the relative standard
+    deviation of the mean track. The track of a single turn varies more.
     """
     deviations = {TRACK: track_std, RATIO: found.ratio_std}
     return {
@@ -188,10 +189,9 @@ def positions_follow(begun: StartingPoint) -> None:
 def turns_the_right_way(source: str, sides: Floats | None, begun: StartingPoint | None) -> None:
     """Raise `RefusedError` if wheels and sensors show turns in different directions.
 
-    The error names the wrong sign.
-
-    `sides` is the result of `heading.first`, or None without the heading sensor `source`. `begun`
-    is the result of `positions.search`, or None without positions.
+    The error names the sign that is wrong. `source` is the name of the heading sensor, and `sides`
+    is the result of `heading.first`, or None without such a sensor. `begun` is the result of
+    `positions.search`, or None without positions.
     """
     by_places = by_heading = ""
     if begun is not None:
@@ -216,7 +216,7 @@ def turns_the_right_way(source: str, sides: Floats | None, begun: StartingPoint 
         )
     if by_heading:
         sensor = source or "the positions"
-        # If both sensors agree, the wheels are wrong. Otherwise the only sensor may be wrong.
+        # If two sensors agree, the wheels are wrong. If there is only one sensor, it may be wrong.
         or_sensor = (
             ""
             if begun is not None and sides is not None
@@ -231,9 +231,10 @@ def turns_the_right_way(source: str, sides: Floats | None, begun: StartingPoint 
 
 
 def _wrong_sign(sides: Floats) -> str:
-    """Return which sign is wrong: "left", "right", "turn" for both sides, or "" for none.
+    """Return the side with a wrong sign: "left" or "right", "turn" for both, or "" for none.
 
-    A negative factor in `sides` (left, right) means a wrong sign.
+    `sides` contains the factors of the left and of the right side. A negative factor means a wrong
+    sign.
     """
     left, right = (sides > 0.0).tolist()
     if left:
@@ -247,7 +248,7 @@ def turns_like_the_wheels(source: str, rows: Rows, base: Base) -> None:
     by_wheels = float(np.abs(heading.by_sides(rows, base, np.ones(2))).sum())
     if shown < LEAST_TURN * by_wheels:
         raise RefusedError(
-            f"{source} shows turns of {np.degrees(shown):.0f} deg in all, but the wheels would "
+            f"{source} shows turns of {np.degrees(shown):.0f} deg in total, but the wheels would "
             f"turn the robot by up to {np.degrees(by_wheels):.0f} deg: is {source} the rate about "
             "the upright axis? If the IMU lies on its side, fill the column with the rate about "
             "the axis that points up, positive to the left. Are the wheel speeds in rad/s, not "
@@ -256,7 +257,7 @@ def turns_like_the_wheels(source: str, rows: Rows, base: Base) -> None:
 
 
 def turn_rates(source: str, rows: Rows) -> None:
-    """Raise `RefusedError` if the heading sensor shows turns so fast that it must be in degrees.
+    """Raise `RefusedError` if the sensor shows turns so fast that its unit must be degrees.
 
     The sensor is not compared with the wheels, because the wheel speeds may be in degrees as well.
     """
@@ -270,7 +271,7 @@ def turn_rates(source: str, rows: Rows) -> None:
 
 
 def turn_units(source: str, turn: float, bare: float, base: Base) -> None:
-    """Raise `RefusedError` if sensor and wheels turn so differently that a unit must be wrong.
+    """Raise `RefusedError` if sensor and wheels differ so much in a turn that a unit must be wrong.
 
     Args:
         source: the name of the heading sensor, or "" if positions show the turns.
@@ -294,7 +295,7 @@ def turn_units(source: str, turn: float, bare: float, base: Base) -> None:
 
 
 def distance_units(size: float, base: Base) -> None:
-    """Raise `RefusedError` if the ratio of measured to configured radius shows a wrong unit."""
+    """Raise `RefusedError` if `size`, the measured / the configured radius, shows a wrong unit."""
     if 1 / UNITS < size < UNITS:
         return
     may = (
@@ -346,7 +347,7 @@ def remarks(
     for source, seconds in delays.items():
         if abs(seconds) >= NOTABLE_S:
             word = "later" if seconds > 0 else "earlier"
-            far = "; set the clocks" if abs(seconds) > FAR_S else ""
+            far = "; synchronize the clocks" if abs(seconds) > FAR_S else ""
             yield (
                 f"the times of {source} are {abs(seconds) * 1000:.0f} ms {word} than those of the "
                 f"wheels; the calibration has corrected this{far}"

@@ -1,15 +1,15 @@
 """Compares the path of the wheels with positions from any source.
 
 The path of each block (a few seconds) is first shifted and rotated so that it fits the positions
-best. The remaining differences are the evidence for the fit, so no start pose, frame or yaw is
-needed. Places are complex numbers x + iy in m.
+best. The remaining differences are the evidence for the fit. The start pose, the frame and the yaw
+are therefore not needed. Places are complex numbers x + iy in m.
 
 `search` finds parameters from which the fit to positions can start, because the fit needs a track
 that is nearly right. The search tries tracks from a tenth to thirty times the configured one. It
-also tries reversed turns, and wheels of one side that roll backwards. Each time, the size of the
-path gives the wheel radius.
+also tries reversed turns, and wheels of one side that roll backwards. For each of these trials, the
+size of the path gives the wheel radius.
 
-Positions often determine a turn on the spot only up to whole turns: the robot faces the same way
+Positions often determine a turn in place only up to whole turns: the robot faces the same way
 after 90 deg to the left as after 270 deg to the right. If several starting points explain the
 positions about equally well, the search chooses the one that describes the more usual robot.
 """
@@ -36,8 +36,8 @@ FINE_S = 0.02
 JUMP, JUMP_M = 6.0, 0.05
 """Limits for the distance between two successive positions.
 
-This distance may exceed the rolled distance by `JUMP` standard deviations plus `JUMP_M` m. If it is
-larger, it is a jump: the source of positions erred or has relocalized.
+This distance may exceed the rolled distance by `JUMP` standard deviations plus `JUMP_M` m. A larger
+distance is a jump, which means that the source of positions erred or has relocalized.
 """
 
 SPEED_S = 0.05
@@ -64,7 +64,7 @@ class WheelSteps(Struct, frozen=True):
     """The motion of the wheels of a run, divided into the steps from which its path is computed."""
 
     t: Floats
-    """Times at which the steps begin and end, s: one more than there are steps."""
+    """Times at which the steps begin and end, s. There is one more time than there are steps."""
     left: Floats
     """Angle that the left wheels roll in each step, rad."""
     right: Floats
@@ -88,9 +88,10 @@ class Path(Struct, frozen=True):
     """Derivatives of `heading` by the radii, the inverse track and the track growth."""
 
     def at(self, t: Floats, parameters: Floats) -> tuple[Complexes, Complexes]:
-        """Return the places of the position sensor, m, and their derivatives by the parameters.
+        """Return a pair: the places of the position sensor, m, and their derivatives.
 
-        `t` are recorded times, s, late by `P.DELAY`. The derivatives have the shape (times, COUNT).
+        `t` contains recorded times, s, which are late by `P.DELAY`. The derivatives are those by
+        the parameters, shape (times, COUNT).
         """
         t = t - parameters[P.DELAY]
         derivatives = np.zeros((len(t), COUNT), dtype=np.complex128)
@@ -105,7 +106,10 @@ class Path(Struct, frozen=True):
         return here, derivatives
 
     def _sensor(self, t: Floats, parameters: Floats) -> tuple[Complexes, Complexes]:
-        """Return the sensor's place, and the robot's heading as a complex number of length 1."""
+        """Return a pair for each time: the sensor's place, and the robot's heading.
+
+        The place is x + iy in m. The heading is a complex number of length 1.
+        """
         ahead = np.exp(1j * np.interp(t, self.t, self.heading))
         lever = complex(parameters[P.SENSOR_X], parameters[P.SENSOR_Y])
         return np.interp(t, self.t, self.place) + lever * ahead, ahead
@@ -129,7 +133,7 @@ def segments(driven: Sequence[Run], parts: Sequence[Block]) -> list[Segment]:
 
 
 def jumps(run: Run) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
-    """Return the index of the first position after each jump of the source of positions."""
+    """Return the index of the first position after each jump (`JUMP`) of the positions."""
     steps = np.abs(np.diff(run.place))
     if len(steps) < LEAST_POINTS:
         return np.zeros(0, dtype=np.int64)
@@ -143,7 +147,7 @@ def jumps(run: Run) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
 
 
 def wheel_steps(run: Run, fine_s: float = FINE_S) -> WheelSteps:
-    """Return the wheels' motion in steps of about `fine_s` s, but of at least one sample each."""
+    """Return the wheels' motion in steps of about `fine_s` s. A step has at least one sample."""
     usual = float(np.median(np.diff(run.t)))
     every = max(1, int(fine_s / usual))
     kept = np.unique(np.append(np.arange(0, len(run.t), every), len(run.t) - 1))
@@ -176,14 +180,14 @@ def path(steps: WheelSteps, base: Base, parameters: Floats) -> Path:
 
 
 def place(steps: WheelSteps, base: Base, parameters: Floats) -> Complexes:
-    """Return the same places as `path()`, in less time. The parameter TRACK_GROWTH must be 0."""
+    """Return only the places of `path()`, which takes less time. TRACK_GROWTH must be 0."""
     left, right = parameters[P.LEFT] * steps.left, parameters[P.RIGHT] * steps.right
     _, ahead = _directions(base.gain * parameters[P.INVERSE_TRACK] * (right - left))
     return _sums(ahead * base.radius * (left + right) / 2)
 
 
 def _directions(turns: Floats) -> tuple[Floats, Complexes]:
-    """Return the headings at the ends of the steps, rad, and the chords of the steps.
+    """Return a pair: the heading before the first and after each step, rad, and each step's chord.
 
     A chord is a complex number, computed for an arc of length 1.
     """
@@ -266,7 +270,7 @@ DELAYS = np.arange(-1.5, 1.55, 0.1)
 """Delays of the positions that the search tries, s."""
 
 MOST_SEGMENTS, REFINED_SEGMENTS = 60, 20
-"""Maximum numbers of segments: for trying starting points, and for refining them.
+"""Maximum numbers of segments that are used to try starting points, and to refine them.
 
 The segments with the largest extent are used.
 """
@@ -284,7 +288,7 @@ best one are never refined.
 USUAL_TURN = 0.31, 1.25
 """Usual range of the robot's turn, divided by the turn that wheel radius and separation predict.
 
-The lower end is that of a robot that skids much, the upper end that of a robot that does not skid.
+A robot that skids much is at the lower end. A robot that does not skid is near the upper end.
 """
 
 NEAR_HEADING = 0.8, 1.25
@@ -294,9 +298,9 @@ WRONG_WAY = 4.0
 """Penalty factor if the wheels of one side, or the turns of the robot, seem to be reversed."""
 
 NOTHING = 1e-3
-"""Fraction that is added to `StartingPoint.unexplained` for comparisons.
+"""Number that is added to each `StartingPoint.unexplained` before these values are compared.
 
-Smaller differences, which are only noise of the positions, then hardly matter.
+Differences below this number, which are only noise of the positions, then hardly matter.
 """
 
 STRAYED = 1.3
@@ -357,13 +361,16 @@ def _furthest(segments: Sequence[Segment], most: int) -> list[Segment]:
 
 
 def _local_minima(tried: Sequence[StartingPoint]) -> list[StartingPoint]:
-    """Return the points of `tried` at which `unexplained` is not above that of either neighbour."""
+    """Return the points of `tried` whose `unexplained` is not above that of either neighbor."""
     left = [np.inf, *(point.unexplained for point in tried), np.inf]
     return [p for at, p in enumerate(tried) if p.unexplained <= min(left[at], left[at + 2])]
 
 
 def _penalty(point: StartingPoint, sides: Floats | None) -> float:
-    """Return a factor of at least 1, larger for an unusual robot. `sides` is as in `search`."""
+    """Return the penalty factor of a starting point: 1, or more if its robot is unusual.
+
+    `sides` is the result of `heading.first()`, or None without a heading sensor.
+    """
     signed = point.parameters[[P.LEFT, P.RIGHT]] * point.parameters[P.INVERSE_TRACK]
     turn, (least, most) = float(np.abs(signed).mean()), USUAL_TURN
     like = np.ones(2)
@@ -375,14 +382,14 @@ def _penalty(point: StartingPoint, sides: Floats | None) -> float:
 
 
 def _turn(parameters: Floats) -> float:
-    """Return the robot's turn if only the right wheels roll by 1 rad, in units of `Base.gain`."""
+    """Return the turn if only the right wheels roll, by 1 rad. Its unit is `Base.gain` rad."""
     return float(parameters[P.INVERSE_TRACK] * parameters[P.RIGHT])
 
 
 def _timed(
     point: StartingPoint, kept: Sequence[Segment], steps: dict[int, WheelSteps], base: Base
 ) -> StartingPoint:
-    """Return the starting point with the delay of the positions that fits best, from `DELAYS`."""
+    """Return `point` with the delay of the positions, from `DELAYS`, that fits best."""
     parameters = point.parameters
     shape = float(np.sign(parameters[P.LEFT])), _turn(parameters)
     tried = [_tried(kept, steps, base, (*shape, late)) for late in DELAYS]
@@ -395,10 +402,10 @@ def _tried(
     base: Base,
     shape: tuple[float, float, float],
 ) -> StartingPoint:
-    """Return the starting point for a shape of the path, with the size that fits best.
+    """Return the starting point for a shape of the path, with the wheel size that fits best.
 
-    `shape` contains the sign of the left side, the ratio of configured to true track (negative if
-    the robot turns opposite to its wheels), and the delay of the positions, s.
+    `shape` contains three numbers: the sign of the left side, the ratio of configured to true track
+    (negative if the robot turns opposite to its wheels), and the delay of the positions, s.
     """
     parameters = base.start()
     parameters[[P.LEFT, P.RIGHT, P.INVERSE_TRACK, P.DELAY]] = shape[0], 1.0, shape[1], shape[2]
@@ -422,7 +429,7 @@ def _tried(
 def _refined(
     point: StartingPoint, few: Sequence[Segment], steps: dict[int, WheelSteps], base: Base
 ) -> StartingPoint:
-    """Return the point that a fit to a few segments refines, or `point` if that is not better."""
+    """Refine `point` by a fit to a few segments. Return `point` if the result is not better."""
     segments = [replace(segment, block=number) for number, segment in enumerate(few)]
 
     def source(parameters: Floats) -> Evidence:

@@ -40,8 +40,8 @@ OTHER_BAGS = {
     ".bag": (b"#ROSBAG V", "of ROS 1: convert it to a ROS 2 bag in MCAP with `rosbags-convert`"),
     ".zstd": (b"\x28\xb5\x2f\xfd", "that is compressed as a whole file: unpack it with `zstd -d`"),
 }
-"""Maps the file suffix of each kind of bag that this module cannot read to the first bytes of such
-a file, and to words for the error message."""
+"""The kinds of bags that this module cannot read, by file suffix. A value contains the first bytes
+of such a file, and words for the error message."""
 
 
 def calibrated(log: Path, config: Config, tape: Tape | None, choice: Choice) -> Calibration:
@@ -109,7 +109,7 @@ def _is_ours(log: Path) -> bool:
         try:
             return _reader(stream).get_header().profile == "acsard"
         except (*DAMAGE, StopIteration):
-            return True  # the reader of recordings then reports the damage
+            return True  # the reader of acsard's recordings then reports the damage
 
 
 def _reader(stream: IO[bytes]) -> NonSeekingReader:

@@ -2,12 +2,12 @@
 
 The wheel speeds come from a `JointState`, the turn rates from an `Imu`, and the positions from a
 `PoseStamped` or an `Odometry`. This module chooses the topics by their types. If several topics
-fit, or if a topic should not be used, the user names the topics with `--topic`.
+fit, or if one of them should not be used, the user names the topics to use with `--topic`.
 
 An `Odometry` is usually computed from the wheels, and such a pose cannot calibrate them. An
 `Odometry` is therefore used only if the user names its topic, or if the bag has neither turn rates
-nor other positions. An `Odometry` that the user did not name is refused if its turns are
-exactly those that follow from the wheels.
+nor other positions. An `Odometry` that the user did not name is refused if its turns are exactly
+the turns that the wheels show.
 """
 
 from __future__ import annotations
@@ -56,13 +56,13 @@ STEP_S = 1.0
 """Length of the intervals in which a sensor's turns are compared with those of the wheels, s."""
 
 UPRIGHT, LYING = 0.5, 0.8
-"""Limits for the absolute correlation between the robot's turns that an IMU axis measures and those
-that the wheels show. If the correlation is below `UPRIGHT` for the chosen axis and above `LYING`
-for another axis, the IMU lies on its side, and the log is refused."""
+"""Limits for the absolute correlation between the turns about an IMU axis and the turns that the
+wheels show. If the correlation is below `UPRIGHT` for the chosen axis and above `LYING` for another
+axis, the IMU lies on its side, and the log is refused."""
 
 OWN = 3e-3
-"""Smallest credible RMS difference between the turns of an `Odometry` and of the wheels, divided by
-the RMS turn. If it is not larger, the `Odometry` was computed from the wheels."""
+"""RMS difference between the turns of an `Odometry` and of the wheels, divided by the RMS turn. If
+the quotient is at most `OWN`, the `Odometry` was computed from the wheels."""
 
 DELAYS_S = np.arange(-0.1, 0.101, 0.01)
 """Delays of an `Odometry` relative to the wheels, s. `_computed_from` tries each of them."""
@@ -188,7 +188,7 @@ _NO_WHEEL = ("caster", "castor", "steer")
 
 
 def wheel_of(joint: str) -> str:
-    """Return the log column, such as "fl" or "left", that a joint's name means; "" if unclear."""
+    """Return the log column, such as "fl" or "left", that a joint's name means; "" if none."""
     name = re.sub(r"([a-z])([A-Z])", r"\1_\2", joint).lower()
     if any(word in name for word in _NO_WHEEL):
         return ""
@@ -304,8 +304,8 @@ class _Log:
                 name = printable(odometry[0].name)
                 self._notes.append(
                     f"{', '.join(map(str, odometry))} not used: most odometry is computed from "
-                    "the wheels. If it comes from a sensor of its own, such as SLAM or motion "
-                    f"capture, name the topics to compare: --topic {printable(gyro.name)} "
+                    "the wheels. If this odometry comes from another sensor, such as SLAM or "
+                    f"motion capture, name the topics to use: --topic {printable(gyro.name)} "
                     f"--topic {name}"
                 )
         if gyro is None and places is None:
@@ -422,8 +422,8 @@ class _Log:
         if abs(follow[used]) < UPRIGHT and abs(follow[best]) > LYING:
             up = "-" * bool(follow[best] < 0.0) + "xyz"[best]
             raise LogError(
-                f"the {axis[-1]} axis of {topic} does not match the robot's turns that the wheels "
-                f"show, but its {'xyz'[best]} axis does: the IMU lies on its side. Give "
+                f"the turn rate about the {axis[-1]} axis of {topic} does not match the wheels, "
+                f"but the rate about its {'xyz'[best]} axis does: the IMU lies on its side. Give "
                 f"--yaw-axis={up}"
             )
         return {"t": t, "yaw_rate": sign * rates[:, used]}
@@ -435,9 +435,9 @@ class _Log:
         named = topic.name in self._choice.topics
         if topic.kind is Odometry and not named and _computed_from(t, yaw, sides):
             raise LogError(
-                f"{topic} turns exactly as the wheels do, so it was computed from them and cannot "
-                f"show their errors: record {REFERENCES}. If it comes from a sensor, give --topic "
-                f"{printable(topic.name)}"
+                f"{topic} shows exactly the same turns as the wheels, so it was computed from "
+                f"the wheels and cannot show their errors: record {REFERENCES}. If it comes from a "
+                f"sensor, give --topic {printable(topic.name)}"
             )
         turns = np.isfinite(yaw)
         # A source that does not measure an orientation sends a constant one.
@@ -456,13 +456,12 @@ def _too_few(topic: _Topic) -> str:
 
 
 def speeds_of(t: Floats, angles: Floats) -> tuple[Floats, Floats]:
-    """Compute wheel speeds from recorded angles. Return their times, s, and the speeds, rad/s.
+    """Return wheel speeds, rad/s, from recorded angles: a pair of their times, s, and the speeds.
 
-    Each speed is the mean over one sample period. The integral of the speeds is therefore exactly
-    the angle that the wheel rolled, even if the sample times are uneven. No speed is computed
-    across a gap in the samples, or across a jump of an angle. (After a restart of the motor driver,
-    the angles begin at 0.) `angles` has one column for each wheel, rad, and `t` contains their
-    times, s.
+    `angles`, rad, has a column for each wheel, and a row for each of the times `t`, s. A speed is
+    the mean over one sample period, so the integral of the speeds is exactly the angle that the
+    wheel rolled, even if the sample times are uneven. No speed is computed across a gap in the
+    samples, or across a jump of an angle, for example to 0 after a restart of the motor driver.
     """
     whole = np.isfinite(angles).all(axis=1)
     times, first = np.unique(t[whole], return_index=True)
@@ -497,7 +496,10 @@ def _unwrapped(angles: Floats) -> Floats:
 
 
 def _sides(wheels: dict[str, Floats]) -> tuple[Floats, Floats, Floats]:
-    """Return the sample times, s, and the mean angles of the left and the right wheels, rad."""
+    """Return three arrays: sample times, s, and the mean rolled angle of each side's wheels, rad.
+
+    The left side comes before the right side.
+    """
     t = wheels["t"]
     left, right = (
         np.mean([wheels[name] for name in wheels if name in names], axis=0)

@@ -30,7 +30,8 @@ RESTART_S = 1.0
 """Smallest backward step of the times in a log, s, that may be a restart of the recording."""
 
 FEW_RESTARTS = 100
-"""Largest number of restarts. If the times step back more often, the rows are assumed unsorted."""
+"""Maximum number of restarts in a log. If the times jump back more often, the rows are taken as
+unsorted rows of one recording."""
 
 SLOWEST_S = 0.7
 """Longest period of wheel samples, s. If it is longer, the times are probably not in seconds."""
@@ -47,8 +48,9 @@ ROUNDED_S, REPEATED = 0.2, 4.0
 
 ROLLING, AGAIN = 0.2, 0.4
 """The wheels roll if the absolute speeds of the left and the right side add up to more than
-`ROLLING` rad/s. If more than the fraction `AGAIN` of the positions (or yaws) of rolling wheels
-equal those of the row before, the logger has repeated old values. Such rows are removed."""
+`ROLLING` rad/s. The logger has repeated old positions (or yaws) if, while the wheels roll, more
+than the fraction `AGAIN` of the rows have the same value as the row before. Such rows are
+removed."""
 
 WHEELS = "left right"
 COMMANDS = " ".join(APPLIED)
@@ -59,7 +61,7 @@ Streams = dict[str, tuple[Floats, ...]]
 """The times and the values of each sensor, by the sensor's name in `STREAMS`."""
 
 MOST_RUNS = 1000
-"""Largest number of different values in the column `run`. A column with more does not name runs."""
+"""Maximum number of different values in the column `run`. A log with more values is refused."""
 
 TOGETHER = 50
 """Number of rows whose speeds are summed before the two wheels of a side are compared."""
@@ -79,14 +81,14 @@ BLOCKS = 16
 long."""
 
 LONGEST_S = 12.0
-"""Greatest length of a block, s, unless the caller of `blocks()` asks for longer blocks."""
+"""Maximum length of a block, s, unless the caller of `blocks()` asks for longer blocks."""
 
 SMOOTH_S = 0.3
 """Time over which a wheel speed is averaged before it is squared, s. Otherwise the speeds of a
 coarse encoder would be 0 in some samples and far too large in others."""
 
 LEAST_TURN = 0.2
-"""Blocks in which the wheels of each side roll by less than this angle, rad, are left out."""
+"""A block is left out if the wheels of each side roll by less than this angle in it, rad."""
 
 MOST_JITTER_S = 5.0
 """Largest variation of the delay from stamp to arrival, s. If the delay varies by more, the stamps
@@ -112,7 +114,7 @@ class Run(Struct, frozen=True, dict=True):
     """Yaw as recorded, rad. It may be wrapped."""
     place_t: Floats
     place: Complexes
-    """Positions x + iy in m, relative to the first one."""
+    """Positions x + iy, m, relative to the first position."""
     commands_t: Floats
     linear: Floats
     """Commanded speed, m/s."""
@@ -126,9 +128,10 @@ class Run(Struct, frozen=True, dict=True):
 
     @cached_property
     def rolled(self) -> tuple[Floats, Floats]:
-        """The angles that the left and the right wheels have rolled since the start, rad.
+        """A pair: the angles that the left and the right wheels have rolled since the start, rad.
 
-        They are given at the times `t`, and stay constant across a gap in the samples.
+        Both arrays have a value for each of the times `t`. They stay constant across a gap in the
+        samples.
         """
         steps = np.diff(self.t)
         steps[np.isin(self.t[:-1], self.gaps[:, 0])] = 0.0
@@ -141,7 +144,10 @@ class Run(Struct, frozen=True, dict=True):
         return np.asarray((np.abs(self.left) > STILL) | (np.abs(self.right) > STILL))
 
     def angles(self, t: Floats) -> tuple[Floats, Floats]:
-        """Return the angles, rad, that the left and the right wheels have rolled up to `t`, s."""
+        """Return a pair: the angles that the left and the right wheels have rolled up to `t`, rad.
+
+        `t` contains times, s.
+        """
         left, right = self.rolled
         return np.interp(t, self.t, left), np.interp(t, self.t, right)
 
@@ -156,7 +162,7 @@ class Run(Struct, frozen=True, dict=True):
 class Notes:
     """Sentences about a log. A sentence that applies to several runs is listed once.
 
-    A "{}" in a sentence stands for a count, which is the sum over all runs.
+    A "{}" in a sentence is replaced by a count, which is the sum over all runs.
     """
 
     def __init__(self, sentences: Iterable[str]) -> None:
@@ -180,7 +186,7 @@ class Notes:
 
 
 class Log(Struct, frozen=True):
-    """The runs of a log, and sentences about data that was left out or changed."""
+    """The runs of a log, and sentences about the data that were left out or changed."""
 
     runs: tuple[Run, ...]
     notes: tuple[str, ...]
@@ -254,7 +260,7 @@ def _sides(columns: dict[str, Floats], notes: Notes) -> tuple[Floats, Floats]:
 def _apart(columns: dict[str, Floats], front: str, rear: str) -> float:
     """Return the difference between two wheels of a side, as a fraction of the rolled distance.
 
-    Both wheels roll over the same floor, so a difference above `APART` raises `LogError`.
+    Both wheels roll over the same floor. Raises `LogError` if the difference is above `APART`.
     """
     seen = np.isfinite(columns[front]) & np.isfinite(columns[rear])
     starts = np.arange(0, int(seen.sum()), TOGETHER)
@@ -288,7 +294,7 @@ def _restarts(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
     blocks = [part for part in np.split(wheels, back) if len(part) >= LEAST_ROWS]
     spans = sorted((float(np.min(t[part])), float(np.max(t[part]))) for part in blocks)
     if not any(a[1] > b[0] for a, b in pairwise(spans)):
-        return [rows]  # the blocks do not overlap: they are parts of one drive, in another order
+        return [rows]  # the blocks do not overlap in time: they are unsorted parts of one drive
     return list(np.split(rows, np.searchsorted(rows, wheels[back])))
 
 
@@ -338,7 +344,7 @@ def _streams(columns: dict[str, Floats], rows: Rows, notes: Notes) -> Streams | 
     if len(streams[WHEELS][0]) >= LEAST_ROWS:
         return streams
     notes.add(
-        f"runs with fewer than {LEAST_ROWS} rows of wheel speeds are left out: {{}} of them",
+        f"runs left out because they have fewer than {LEAST_ROWS} rows of wheel speeds: {{}}",
         int(len(rows) > 0),
     )
     return None
@@ -366,18 +372,22 @@ def _remove_repeats(drives: Iterable[tuple[str, Streams]], notes: Notes) -> None
         if rolling <= AGAIN * sum(int(rolls.sum()) for *_, rolls in found):
             continue
         notes.add(
-            f"{what} repeat their last value between samples: such rows are left out, {{}} of "
-            "them while the wheels turn",
+            f"the columns {what} repeat their last value between samples: such rows are left out "
+            "({} of them while the wheels turn)",
             rolling,
         )
         for streams, again, _ in found:
-            # Remove the repetitions at rest as well: a repeated value may be older than the time
-            # of its row.
+            # Remove the repetitions at rest as well, because a repeated value may be older than the
+            # time of its row.
             streams[what] = tuple(column[~again] for column in streams[what])
 
 
 def _repeats(streams: Streams, what: str) -> tuple[Mask, Mask]:
-    """Return a mask of the values that repeat the one before, and a mask of rolling wheels."""
+    """Return a pair of masks of a sensor's samples, in the order of time.
+
+    The first is true if a sample repeats the sample before it. The second is true if the wheels
+    roll at the time of the sample.
+    """
     t, *values = streams[what]
     if not len(t):
         return np.zeros(0, dtype=bool), np.zeros(0, dtype=bool)
@@ -402,7 +412,10 @@ def _stream(
 
 
 def _ordered(stream: list[Floats], what: str, notes: Notes) -> Iterator[Floats]:
-    """Yield the columns, sorted by time (the first column). Of equal times, keep the first row."""
+    """Yield the columns, sorted by time (the first column).
+
+    Of several rows with the same time, only the first is kept.
+    """
     t = stream[0]
     notes.add(f"{{}} rows of {what} are out of order and were sorted", int((np.diff(t) < 0).sum()))
     order = np.argsort(t, kind="stable")
@@ -436,14 +449,18 @@ def gaps(t: Floats) -> Floats:
 
 
 def inside(begin: Floats, end: Floats, holes: Floats) -> Mask:
-    """Return a mask of the intervals from `begin` to `end` that do not touch the gaps `holes`."""
+    """Return a mask of the intervals that do not touch any gap.
+
+    `begin` and `end` contain the limits of the intervals. `holes` has a row (begin, end) for each
+    gap, as `gaps()` returns them.
+    """
     after = np.searchsorted(holes[:, 1], begin, side="right")
     before = np.searchsorted(holes[:, 0], end, side="left")
     return np.asarray(after == before)
 
 
 def cumulative(steps: Floats) -> Floats:
-    """Return 0 and the cumulative sums of `steps`: one element more than `steps` has."""
+    """Return 0, followed by the cumulative sums of `steps`. The result is one element longer."""
     return np.concatenate((np.zeros(1), np.cumsum(steps)))
 
 
@@ -484,7 +501,10 @@ def blocks(driven: Sequence[Run], shortest_s: float) -> list[Block]:
 
 
 def _turned(run: Run, begin: float, end: float, left: Floats, right: Floats) -> bool:
-    """Return whether a side rolled by `LEAST_TURN`, back or ahead, from `begin` to `end`, s."""
+    """Return whether the wheels of a side rolled by `LEAST_TURN` from `begin` to `end`, s.
+
+    `left` and `right` contain the rolled angles at both times, rad. Angles back and ahead add up.
+    """
     if max(abs(left[1] - left[0]), abs(right[1] - right[0])) >= LEAST_TURN:
         return True
     a, b = np.searchsorted(run.t, (begin, end))

@@ -43,16 +43,17 @@ from acsard.core.config.settings import DriveConfig, FeedbackConfig, OdometryCon
 from acsard.core.values import AcsardError
 
 LENGTHS_S = (4.0, 8.0, 16.0, 32.0, 64.0)
-"""Block lengths that are tried, s. The tool uses the one that improves the odometry most. Short
-blocks suit accurate positions. Long blocks suit coarse positions, and wheels whose errors hide
-small turns. Without positions, only the shortest length is tried. With positions but no heading
-sensor, the shortest length is not tried."""
+"""Block lengths to try, s. The tool uses the length that improves the odometry most. Short blocks
+suit accurate positions. Long blocks suit coarse positions, and wheels whose errors hide small
+turns. Without positions, the tool tries only the shortest length. With positions but no heading
+sensor, it does not try the shortest length."""
 
 ENOUGH_BLOCKS = 8
-"""Minimum number of blocks for a block length, if a shorter length has already given a fit. With
-six blocks, the standard deviation of the ratio of the radii was up to three times too small."""
+"""Minimum number of blocks. A block length that gives fewer is not tried if a shorter length has
+already given a fit. With six blocks, the standard deviation of the ratio of the radii was up to
+three times too small."""
 
-# For comparison: motion capture on a good floor differs by less than 1e-3.
+# For comparison: on a good floor, motion capture differs from the wheels by less than 1e-3.
 PERFECT = 1e-4
 """Smallest credible difference between a sensor and the wheels, as a fraction of the motion. A
 sensor with a smaller difference was probably computed from the wheels."""
@@ -66,7 +67,7 @@ class Drives(Struct, frozen=True):
     """Sum of all left and right turns of the robot according to the calibrated wheels, in units of
     360 deg."""
     fastest: float
-    """Turn rate, rad/s, below which the robot made 95 % of its turns, weighted by angle."""
+    """Turn rate below which the robot turned 95 % of its total turned angle, rad/s."""
 
     @classmethod
     def of(
@@ -96,8 +97,8 @@ class Calibration(Struct, frozen=True):
     multipliers: Multipliers
     """New multipliers of the wheel separation and of the two wheel radii."""
     scale: str
-    """Source of the wheels' size: "positions", "distance" (by tape), "positions and distance", or
-    "" if nothing measured it."""
+    """Measurement that shows the size of the wheels: "positions", "distance" (by tape), "positions
+    and distance", or "" if nothing was measured that shows it."""
     growth: float
     """Fraction by which the effective track grows with each rad/s of turn rate."""
     growth_std: float
@@ -108,13 +109,14 @@ class Calibration(Struct, frozen=True):
     """Gyro bias, rad/s; 0 without a gyro."""
     notes: tuple[str, ...]
     odometry: dict[str, float]
-    """New settings of `[odometry]`: the geometry's uncertainty, and the noise if `Noise.better`."""
+    """New settings of `[odometry]`: the uncertainty of the geometry. They also contain the noise if
+    `Noise.better` is true."""
     kept: tuple[str, ...] = ()
     """Names of the quantities that stay as configured: `plausibility.TRACK`, `RATIO` or both."""
     feedback: dict[str, float] = {}
     """New settings of `[feedback]`; empty unless the present ones cause false wheel faults."""
     noise: Noise | None = None
-    """None if the log does not show the noise of the odometry."""
+    """Noise of the odometry in this log; None if the log does not show it."""
 
 
 def calibrate(
@@ -145,7 +147,7 @@ def calibrate(
 
 
 class Prepared(Struct, frozen=True):
-    """A log that was cut into blocks of one length, and all that the fit needs from it."""
+    """A log that was cut into blocks of one length, and all other inputs of the fit."""
 
     runs: Sequence[Run]
     headings: Headings | None
@@ -153,8 +155,8 @@ class Prepared(Struct, frozen=True):
     base: Base
     parts: list[Block]
     rows: Rows
-    """Motion in intervals of about 1 s. The gyro's bias has been subtracted from it, unless the
-    bias is unknown because the robot never rested."""
+    """Motion in intervals of about 1 s. The gyro's bias has been subtracted from the turns, unless
+    the bias is unknown (`Headings.bias_unknown`)."""
     segments: list[Segment]
     """The measured positions; empty if the log has none."""
     steps: list[WheelSteps]
@@ -180,7 +182,7 @@ def prepared(
     if headings is not None and not len(rows.turned):
         raise RefusedError(
             f"{headings.source} has no samples while the wheels turn: record it at the same time "
-            "as the wheels, with times of one clock"
+            "as the wheels, with times from the same clock"
         )
     segments = positions.segments(driven, parts)
     plausibility.rolls_enough(rows, spins=headings is not None and not segments)
@@ -205,7 +207,7 @@ def prepared(
     if not sources:
         raise RefusedError(
             "there are no positions or turn rates while the robot drives: record one of them at "
-            "the same time as the wheels, with times of one clock"
+            "the same time as the wheels, with times from the same clock"
         )
     plausibility.turns_the_right_way(headings.source if headings else "", sides, by_positions)
     if sides is not None:
@@ -228,7 +230,7 @@ def _check_units(headings: Headings | None, start: Floats, base: Base, sized: bo
 
 
 class Candidate(Struct, frozen=True):
-    """A fit to blocks of one length, and how much it improves the odometry (cross-validated)."""
+    """A fit to blocks of one length, and the improvement of the odometry (cross-validated)."""
 
     made: Prepared
     fitted: Fit
@@ -292,9 +294,9 @@ def _known(best: Candidate, odometry: OdometryConfig) -> Deviations:
 def _noise(
     best: Candidate, known: Deviations, odometry: OdometryConfig, *, present: bool
 ) -> Noise | None:
-    """Return the noise of the odometry in this log, or None if the log does not show it.
+    """Return the noise of the odometry in this log, or None if the log does not show the noise.
 
-    If `present`, compute the odometry with the configured geometry.
+    If `present` is true, the odometry is computed with the configured geometry, not the fitted one.
     """
     made, fitted = best.made, best.fitted
     held = folds(fitted, made.parts, drives(made.runs), best.rate)
@@ -313,8 +315,8 @@ def _noise(
 def _candidates(made: Prepared) -> list[Candidate]:
     """Return the fit of all parameters if it determines both the track and the ratio of the radii.
 
-    Otherwise return up to two fits: one keeps the ratio as configured, the other one the track.
-    Raises `RefusedError` if these fits are too inaccurate as well, or if no fit converges.
+    Otherwise return up to two fits: the first keeps the ratio as configured, the second keeps the
+    track. Raises `RefusedError` if these fits are too inaccurate as well, or if no fit converges.
     """
     found: list[Candidate] = []
     deviations: dict[str, float] = {}
@@ -351,7 +353,10 @@ def _candidates(made: Prepared) -> list[Candidate]:
 
 
 def _held(base: Base) -> dict[str, list[Held]]:
-    """Map each quantity that can stay as configured to its constraints; "" means a free fit."""
+    """Map each quantity that can stay as configured to the constraints that keep it so.
+
+    The name "" stands for a fit without constraints.
+    """
     ratio, track, growth = np.zeros((3, COUNT))
     ratio[[P.LEFT, P.RIGHT]] = base.right, -base.left
     track[P.INVERSE_TRACK] = growth[P.TRACK_GROWTH] = 1.0
@@ -391,7 +396,7 @@ def _calibration(
     delays = {headings.source: headings.delay} if headings is not None else {}
     if made.segments:
         delays["positions"] = float(fitted.parameters[P.DELAY])
-    # Without an improvement, the configured multipliers stay, and no sensor has measured the scale.
+    # Without an improvement, `kept` has both quantities, and no sensor has measured the scale.
     measured = bool(made.segments) and len(best.kept) < 2
     scale, notes = ["positions"] if measured else [], list(log.notes)
     if tape is not None:
@@ -399,7 +404,7 @@ def _calibration(
         names = [run.name for run in log.runs]
         result, name = scaled(result, tape, names, follow, known=measured)
         scale.append("distance")
-        notes.append(f"the distance of {tape.metres:g} m, measured by tape, is that of run {name}")
+        notes.append(f"the distance of {tape.metres:g} m by tape was compared with run {name}")
     plausibility.in_range(result.values)
     known = _known(best, odometry)
     if tape is not None:
@@ -472,8 +477,8 @@ def _too_good(made: Prepared, fitted: Fit, log: Log) -> Iterator[str]:
 def _own(what: str) -> str:
     return (
         f"{what}: these values agree better with the wheels than a sensor can. If they were "
-        "computed from the same wheels, like the odometry of a driver, the result describes the "
-        "settings of that driver and not the robot; use a gyro, SLAM, GPS or motion capture"
+        "computed from the same wheels, like the odometry of a motor driver, the result describes "
+        "the settings of that driver and not the robot; use a gyro, SLAM, GPS or motion capture"
     )
 
 

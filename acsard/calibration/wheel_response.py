@@ -9,8 +9,8 @@ If a wheel contradicts this for `feedback.fault_time`, the daemon reports a faul
 
 This module tries several response times, and takes the one that fits best. It assumes that the
 wheels of the log are healthy. With the configured response time, it runs the daemon's own fault
-detection, `core/motion/wheel_witness.py`, on the log. It measures for how long a wheel nevertheless
-looks faulty.
+detection (`core/motion/wheel_witness.py`) on the log. It measures the longest time for which this
+detection takes a wheel for faulty.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ class WheelResponse(Struct, frozen=True):
     seconds: float
     """Response time that fits best, s."""
     proposed: float | None
-    """Response time to configure if `false_fault` is true, s. It is the smallest of the times
-    `TRIED`, beginning with `seconds`, that satisfies `SPARE`. None if there is no such time."""
+    """Response time to configure, s. It is the smallest of the times `TRIED` from `seconds` up that
+    satisfies `SPARE`. None if `false_fault` is false, or if there is no such time."""
     present: float
     """Configured response time, s."""
     false_fault: bool
@@ -66,18 +66,18 @@ class WheelResponse(Struct, frozen=True):
     """Highest speed that the wheels reach, rad/s, or infinity if the log shows no such limit."""
 
     def settings(self) -> dict[str, float]:
-        """Return the settings of `[feedback]` that must change, by name."""
+        """Return the settings of `[feedback]` that must change, by name; empty if none must."""
         if not self.false_fault or self.proposed is None:
             return {}
         return {"response_time": self.proposed}
 
     def sentences(self) -> list[str]:
-        """Return a sentence about the response time, and one about `fastest` if that is finite."""
+        """Return a sentence about the response time. If `fastest` is finite, add one about it."""
         follow = f"the wheels follow their commands with a response time of {self.seconds:.2g} s"
         if self.false_fault:
             then = (
-                f", but with feedback.response_time = {self.present:g} the daemon would take the "
-                "wheels for faulty: "
+                f", but with feedback.response_time = {self.present:g} the daemon would report a "
+                "wheel fault: "
             )
             if self.proposed is not None:
                 then += f"the new feedback.response_time is {self.proposed:g}"
@@ -85,11 +85,14 @@ class WheelResponse(Struct, frozen=True):
                 then += "first lower limits.wheel_speed as the next note says"
             else:
                 then += (
-                    "no longer response time leaves enough reserve; if the wheels are healthy, "
-                    "raise feedback.fault_time"
+                    "even longer response times leave too little reserve; if the wheels are "
+                    "healthy, raise feedback.fault_time"
                 )
         elif max(self.seconds / self.present, self.present / self.seconds) > SAME:
-            then = f". feedback.response_time is {self.present:g}, and causes no fault in this log"
+            then = (
+                f"; the configured feedback.response_time = {self.present:g} s differs, but causes "
+                "no fault in this log"
+            )
         else:
             then = f", which agrees with the configured feedback.response_time = {self.present:g} s"
         found = [follow + then]
@@ -135,10 +138,10 @@ def response(
 
 
 def _commanded(run: Run, drive: DriveConfig) -> tuple[Floats, Floats, Floats]:
-    """Return the time steps, s, the commanded speeds and the measured speeds, rad/s.
+    """Return three arrays: the time steps, s, the commanded speeds and the measured speeds, rad/s.
 
     The speeds have the shape (samples, 2), with the left side first. The time step of a sample is
-    NaN if no command applies to the sample, or if a gap precedes it.
+    NaN if no command applies to the sample, or if a gap in the samples precedes it.
     """
     kinematics = Kinematics(drive)
     ahead = kinematics.wheel_speeds(Twist(1.0, 0.0))
@@ -154,7 +157,7 @@ def _commanded(run: Run, drive: DriveConfig) -> tuple[Floats, Floats, Floats]:
 
 
 def _expected(steps: Floats, wanted: Floats, seen: Floats) -> Floats:
-    """Return the speeds, rad/s, that the model expects; shape (samples, 2, response times)."""
+    """Return the expected speeds, rad/s, for each time in `TRIED`; shape (samples, 2, times)."""
     expected = np.empty((*wanted.shape, len(TRIED)))
     last = np.zeros((2, len(TRIED)))
     for number, step in enumerate(steps):
@@ -169,7 +172,7 @@ def _expected(steps: Floats, wanted: Floats, seen: Floats) -> Floats:
 def _evidence(
     parts: Sequence[tuple[Floats, Floats, Floats]], response_time: float, fault_time: float
 ) -> float:
-    """Return the longest time, s, for which a wheel looks faulty to the daemon's detection."""
+    """Return the longest time, s, for which the daemon's detection takes a wheel for faulty."""
     longest, most = 0.0, fault_time / LINES_OF_EVIDENCE
     for steps, wanted, seen in parts:
         sides = [(Expected(), Witness()) for _ in range(2)]

@@ -1,4 +1,4 @@
-"""Shows over time which command source drove, and why the others waited or were refused."""
+"""Finds which command source drove at each time, and why the others waited or were refused."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from acsard.recording.recorded_steps import Step
 STATES = ("refused", "waits", "sends", "drives")
 """States of a command source that is not silent.
 
-In the state `sends` the robot accepts the source's commands, but the source does not drive. If
-short spans of time are merged, the result has the state that comes first in this tuple.
+In the state `sends`, the robot accepts the source's commands, but the source does not drive. If
+short spans of time are merged, the merged span has the first of their states in this order.
 """
 
 MOVES = ("ready", "driving")
@@ -27,13 +27,13 @@ OTHERS = "others"
 """Common name of all command sources that are not in the configuration."""
 
 SAMPLE_S = 0.1
-"""Time between two samples of the sources' states, s. A new mode or source is sampled at once."""
+"""Time between two samples of the sources' states, s. A new mode or source is sampled earlier."""
 
 MAX_TEXT = 300
-"""Largest number of characters that are kept of a sentence or a name in a recording."""
+"""Maximum number of characters that are kept of a sentence or a name in a recording."""
 
 MAX_SENDERS = 256
-"""Largest number of senders whose last command is kept."""
+"""Maximum number of senders whose last command is kept."""
 
 
 class CommandSources:
@@ -59,7 +59,7 @@ class CommandSources:
     def take_commands(self, step: Step, t: float, robot: Robot) -> bool:
         """Process the commands of a step at time `t`, s. `robot` is the robot after the step.
 
-        Returns whether a refusal was added or extended.
+        Return True if a source was refused, so that the states need a new sample.
         """
         commands, before = step.inputs.commands, dict(self._refused)
         for command in commands:
@@ -75,7 +75,7 @@ class CommandSources:
         return before != self._refused
 
     def _find_refused(self, step: Step, t: float, robot: Robot) -> None:
-        """Find the commands of this step that the robot refused, and note their sources.
+        """Find the commands of this step that the robot refused, and mark their sources as refused.
 
         The robot's counters give the reasons, but not the sources. A source was refused if its last
         accepted command is older than its command of this step.
@@ -111,7 +111,7 @@ class CommandSources:
             self.bands[name].add(t, state, words)
 
     def _states(self, step: Step, t: float, robot: Robot) -> Iterator[tuple[str, str, str]]:
-        """Yield the name of each source, its state and the reason in words."""
+        """Yield for each source: its name, its state ("" if silent), and the reason in words."""
         mode, reason, _, driver = step.recorded.status
         for source in robot.snapshot(step.inputs.now.mono_ns).sources:
             refusal, wait = self._refusal(source.name, t), source.waits_for

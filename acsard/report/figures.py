@@ -34,7 +34,7 @@ from acsard.report.plot_elements import (
 from acsard.report.report_data import Mark, Marks, ReportData
 
 ROW_PX, AXIS_PX = 54, 68
-"""Height of each row in the picture of the sources, and extra height for its time axis, px."""
+"""Height of each row in the picture of the sources, and additional height for its time axis, px."""
 
 
 class Line(NamedTuple):
@@ -56,16 +56,16 @@ GAP_PX = 30
 """Height of the gap above each diagram of a picture, px. The gap holds the diagram's title."""
 
 LEAST_LINEAR, LEAST_ANGULAR = 0.1, 0.2
-"""Smallest span of the scale of the forward speed, m/s, and of the turn rate, rad/s. Otherwise a
-robot that never moves would have an empty scale."""
+"""Smallest span of the scale of the forward speed, m/s, and of that of the turn rate, rad/s.
+Otherwise the scale of a robot that never moves would be empty."""
 
 BENEATH = 3.4
 """Width of a curve that another curve nearly covers, px. The wide curve stays visible on both sides
-of the other one."""
+of the other curve."""
 
 
 class Clip(NamedTuple):
-    """An excursion of a curve beyond the scale of its diagram, drawn at the diagram's edge."""
+    """An excursion: a time in which a curve exceeds the scale, and is drawn at the edge."""
 
     t: float
     """Time at which the curve leaves the diagram, s."""
@@ -80,23 +80,23 @@ MARKS_APART = 0.02
 width."""
 
 HEADROOM = 0.5
-"""Room for commanded speeds above and below the other speeds, as a fraction of their span.
+"""Space in a diagram above and below the limited and measured speeds, as a fraction of their span.
 
-A command that the robot reaches after a ramp stays visible, but a command of 99 m/s does not
-flatten the other curves.
+A commanded speed that the robot reaches after a ramp stays visible in this space, but a command of
+99 m/s does not flatten the other curves.
 """
 
 
 def clipped(
     points: Sequence[Point], others: Sequence[Sequence[Point]], least: float, gap: float
 ) -> tuple[list[Point], list[Clip]]:
-    """Limit a curve to the scale of a diagram. Return the limited curve and its excursions.
+    """Limit a curve to the scale of a diagram. Return a pair: this curve, and its excursions.
 
     Args:
         points: the curve; NaN interrupts it.
         others: the curves that determine the scale; `HEADROOM` is added to their span.
         least: smallest span of the scale.
-        gap: longest time between excursions beyond the same edge that count as one, s.
+        gap: excursions beyond the same edge that are at most this time apart count as one, s.
     """
     values = [0.0, *(p.value for curve in others for p in curve if math.isfinite(p.value))]
     room = HEADROOM * max(max(values) - min(values), least)
@@ -125,13 +125,13 @@ class Part(NamedTuple):
 
 
 Row = tuple[str, list[Span]]
-"""The name of a row, and the spans of time that are drawn as its bands."""
+"""A row of the picture of the sources: its name, and the spans of time that are drawn as bands."""
 
 DRIVES = "drives"
 
 
 class BandStyle(NamedTuple):
-    """Appearance of the bands that show one state. Each source that drives has its own style."""
+    """Appearance of the bands that show one state. The state "drives" has a style per source."""
 
     kind: str
     """State that the bands show, such as "drives"."""
@@ -162,7 +162,7 @@ def _styles(rows: list[Row]) -> Iterator[BandStyle]:
 
 
 def _keys(styles: list[BandStyle]) -> list[Key]:
-    """Return one legend entry for each colour and pattern, with all its meanings."""
+    """Return one legend entry for each pair of color and pattern, with all its meanings."""
     meanings: dict[tuple[str, str], list[str]] = {}
     for style in styles:
         meanings.setdefault((style.colour, style.pattern), []).append(style.meaning)
@@ -185,8 +185,8 @@ NOTED = {
     "link_stale": ("▲", "triangle-up", "#e0b400"),
     "link_late": ("⬟", "pentagon", "#8f4f22"),
 }
-"""Events that are drawn on the path, each with its symbol, plotly's name for this symbol, and its
-colour."""
+"""Events that are drawn on the path, by name. A value contains the symbol, plotly's name for this
+symbol, and the color."""
 
 
 def path_figure(data: ReportData) -> Figure:
@@ -238,7 +238,7 @@ def _places(name: str, places: list[Place], mode: str, **look: object) -> Trace:
 
 
 def _with_gaps(places: list[Place]) -> list[Place]:
-    """Insert a gap before each place whose `Place.new` is true."""
+    """Insert a gap before each place whose `Place.new` is true, except before the first place."""
     gap = Place(0.0, math.nan, math.nan, 0.0)
     found = [item for place in places for item in ((gap, place) if place.new else (place,))]
     return found[1:] if found and found[0] is gap else found
@@ -453,7 +453,7 @@ class TimeFigures:
         axis = {
             "type": "date",
             "range": [self._ms(-0.01 * seconds), self._ms(1.01 * seconds)],
-            # Plotly would turn the labels of a narrow picture, and cut them at its lower edge.
+            # Otherwise plotly turns the labels of a narrow picture and cuts them at its lower edge.
             "tickangle": 0,
             # Invisible ticks keep the time labels away from the lowest label of the y axis.
             "ticks": "outside", "ticklen": 8, "tickcolor": "rgba(0,0,0,0)",
@@ -508,7 +508,10 @@ class TimeFigures:
 
 
 def _hover(name: str, values: Sequence[float]) -> dict[str, Any]:
-    """Return plotly's hover text: the curve's name, the time, and one of `values` (if empty: y)."""
+    """Return plotly's hover text: the curve's name, the time, and the value at the pointer.
+
+    The value is one of `values`, or y if `values` is empty.
+    """
     shown = "customdata" if values else "y"
     text = f"{name} %{{{shown}:.3~f}}<br>%{{x|%H:%M:%S.%L}}<extra></extra>"
     return {"hovertemplate": text} | ({"customdata": numbers(values)} if values else {})

@@ -1,9 +1,9 @@
 """Makes the report: one HTML file that needs no other file.
 
-No text of unknown origin can become code in the file. Each text passes `escaped`. The pictures are
-JSON without any `<`, in a block that browsers do not execute. As a second barrier, the file's
-content security policy allows only the two scripts of the file, identified by their hashes, and
-forbids the page to load anything.
+No text of unknown origin can become code in the file, because each text passes through `escaped`.
+The pictures are JSON without any `<`, in a block that browsers do not execute. As a second barrier,
+the file's content security policy allows only the two scripts of the file, identified by their
+hashes, and forbids the page to load anything.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ PROGRAM = """
 const boxes = [], timed = [];
 const look = { responsive: true, displaylogo: false, plotlyServerURL: "",
   modeBarButtons: [["zoom2d", "pan2d", "zoomIn2d", "zoomOut2d", "resetScale2d"]] };
-const MAX_LABEL_PX = 90;  // with the gap to the next one
+const MAX_LABEL_PX = 90;  // includes the gap to the next label
 const labels = box => ({ "xaxis.nticks": Math.max(2, Math.floor(box.clientWidth / MAX_LABEL_PX)) });
 for (const one of JSON.parse(document.getElementById("pictures").textContent)) {
   const box = document.getElementById(one.name);
@@ -114,7 +114,7 @@ for (const box of timed) box.on("plotly_relayout", async change => {
 const paper = on => {
   document.body.classList.toggle("paper", on);
   if (on) for (const one of document.querySelectorAll("details")) one.open = true;
-  for (const box of boxes)  // at once: the browser does not wait
+  for (const box of boxes)  // all in one task, because the browser prints without waiting
     Plotly.relayout(box, on ? { width: box.clientWidth } : { width: null, autosize: true });
   fit();
 };
@@ -124,11 +124,11 @@ addEventListener("afterprint", () => paper(false));
 
 
 MAX_OPEN = 40
-"""Largest number of events for which the list of events is unfolded when the page loads."""
+"""The list of events is unfolded when the page loads if it has at most this number of events."""
 
 
 def escaped(text: str) -> str:
-    """Return any text as HTML that shows the text and nothing else."""
+    """Return `text` as HTML that shows exactly this text, and does nothing else."""
     return html.escape(printable(text))
 
 
@@ -177,7 +177,7 @@ def page(
 def drawn(
     recording: Recording, library: str, span: Span = WHOLE, progress: Progress = no_progress
 ) -> tuple[str, list[str]]:
-    """Replay a part of a recording. Return the text of its report, and the notes in the report.
+    """Replay a part of a recording. Return a pair: the report as HTML, and the notes in it.
 
     `library` is the code of plotly. `progress` is called with the wall-clock time that the replay
     has reached, ns since 1970. Raises `RecordingError` if the part has no step.
@@ -190,7 +190,7 @@ def drawn(
             progress(step.inputs.now.wall_ns)
         data.step(step, outputs, robot)
         if data.over:
-            # Read the rest of the recording, so that the notes count every damaged place.
+            # Read the rest of the recording too, so that the notes count every damaged place in it.
             deque(recording.messages(), maxlen=0)
             break
     if data.began is None:

@@ -1,8 +1,8 @@
 """Makes the elements of a report's pictures, in the format of the library plotly.
 
 The pictures are plain lists and dicts. Columns of numbers are doubles in base64, because plotly
-reads this form and JSON cannot represent NaN. `page.py` sets the colours of background, grid and
-text. The colours in this module suit a light and a dark background.
+reads this form and JSON cannot represent NaN. `page.py` sets the colors of background, grid and
+text. The colors in this module suit a light and a dark background.
 """
 
 from __future__ import annotations
@@ -34,28 +34,31 @@ UNKNOWN = "#9a9a9a"
 SOURCE_COLOURS = (
     "#159a6b", "#2f6fd8", "#b04fc4", "#8f4f22", "#1ab2d2", "#8a8f00", "#e0588c", "#4a2f8f",
 )  # fmt: skip
-"""Colours of the command sources that drive. Neighbours in this list are easy to distinguish."""
+"""Colors of the command sources that drive. Neighbors in this list are easy to distinguish."""
 
 PATTERNS = ("", "/", "x", ".", "-")
-"""Fill patterns of the bands of sources. When all colours are used, the colours repeat with a new
+"""Fill patterns of the bands of sources. When all colors are used, they repeat with the next
 pattern."""
 
 
 def source_style(number: int) -> tuple[str, str]:
-    """Return the colour and the pattern of a source that drives; `number` counts from 0."""
+    """Return a pair: the color and the pattern of the source that was the `number`th to drive.
+
+    `number` counts from 0.
+    """
     beyond, place = divmod(number, len(SOURCE_COLOURS))
     return SOURCE_COLOURS[place], PATTERNS[beyond % len(PATTERNS)]
 
 
 WRAP = 42
-"""Length of a line of hover text that fits on a phone, characters."""
+"""Maximum length of a line of hover text, characters. Such a line fits on a phone."""
 
 Trace = dict[str, Any]
 """Plotly's description of one curve, or of one set of marks or bars."""
 
 
 class Key(NamedTuple):
-    """An entry of a legend: symbol, colour and meaning."""
+    """An entry of a legend: symbol, color and meaning."""
 
     sign: str
     colour: str
@@ -81,7 +84,7 @@ class Figure(NamedTuple):
 
 
 def label(text: str) -> str:
-    """Return any text escaped for plotly, wrapped to lines of `WRAP` characters."""
+    """Return `text`, escaped for plotly and wrapped to lines of at most `WRAP` characters."""
     lines = textwrap.wrap(printable(text), WRAP) or [""]
     return "<br>".join(html.escape(line) for line in lines)
 
@@ -93,7 +96,7 @@ def numbers(values: Iterable[float]) -> dict[str, str]:
 
 
 def scatter(name: str, x: Iterable[float], y: Iterable[float], **look: object) -> Trace:
-    """Return a curve, or marks, at these points. `look` contains further attributes for plotly."""
+    """Return a curve or marks at these points. `look` contains more of plotly's attributes."""
     return {"type": "scatter", "name": name, "x": numbers(x), "y": numbers(y), **look}
 
 
@@ -119,7 +122,7 @@ def layout() -> dict[str, Any]:
 
 
 def note(text: str, x: float, y: float) -> dict[str, Any]:
-    """Return a title at `x`, a fraction of the picture's width, and at `y` on the y axis."""
+    """Return a title. `x` is a fraction of the picture's width, and `y` a value on the y axis."""
     return {
         "text": label(text), "x": x, "y": y, "xref": "paper", "yref": "y", "xanchor": "left",
         "yanchor": "middle", "showarrow": False, "font": {"size": 13},

@@ -1,8 +1,8 @@
 """Collects the data of a report from a recording, step by step.
 
 The mode, the reasons, the path, the events and the driving source come from the recording. The
-commanded, limited and measured speeds come from a robot that replays the recorded inputs. The data
-are thinned as they arrive, so a day takes no more memory than a minute.
+commanded, limited and measured speeds come from a replay of the recorded inputs. The data are
+thinned as they arrive, so a day takes no more memory than a minute.
 """
 
 from __future__ import annotations
@@ -26,13 +26,16 @@ from acsard.report.command_sources import MAX_TEXT, SAMPLE_S, CommandSources
 NS_PER_MS = 1_000_000
 
 MODES = ("fault", "stopped", "shutdown", "waiting", "inactive", "driving", "ready")
-"""Modes of the robot. If short spans are merged, the mode that comes first here is kept."""
+"""Modes of the robot. If short spans are merged, the merged span has the first of their modes in
+this order."""
 
 LINKS = ("down", "stale", "booting", "up")
-"""States of the serial link. If short spans are merged, the state that comes first here is kept."""
+"""States of the serial link. If short spans are merged, the merged span has the first of their
+states in this order."""
 
 MAX_EVENT_TEXT = 1000
-"""Largest number of characters that are kept of an event's text. The daemon's longest has 308."""
+"""Maximum number of characters that are kept of an event's text. The daemon's longest text has
+308."""
 
 FIRST, LAST = 30, 30
 """Numbers of events of each name that are kept: `FIRST` from the beginning, `LAST` from the end."""
@@ -51,9 +54,9 @@ class Mark(Struct, frozen=True):
     count: int
     """Number of equal events that this mark stands for."""
     place: Place | None
-    """Place according to odometry; None before the first pose."""
+    """Place of the robot according to odometry; None before the first pose."""
     seconds: float
-    """Wall-clock time of the event according to the robot's clock at that moment, s since 1970."""
+    """Time of the event on the robot's clock at that moment, s since 1970."""
 
     @property
     def words(self) -> str:
@@ -61,15 +64,15 @@ class Mark(Struct, frozen=True):
 
 
 class Marks:
-    """The events of a recording. Only the first and the last events of each name are kept."""
+    """The events of a recording. Only the first and the last events with each name are kept."""
 
     def __init__(self) -> None:
         self._first: dict[str, list[tuple[int, Mark]]] = {}
         self._last: dict[str, deque[tuple[int, Mark]]] = {}
-        """The last events of each name, each with its number in the order of all events."""
+        """The last events with each name. Each event has its number in the order of all events."""
         self._count = 0
         self.counts: Counter[str] = Counter()
-        """Number of events of each name. A mark for several equal events counts as all of them."""
+        """Number of events with each name. A mark for several equal events counts several times."""
         self.left_out = 0
 
     def add(self, mark: Mark) -> None:
@@ -91,7 +94,7 @@ class Marks:
 
 
 class Driven(Struct):
-    """The time and the distance for which one source drove the robot."""
+    """The total time for which one source drove the robot, and the total distance."""
 
     seconds: float = 0.0
     metres: float = 0.0
@@ -100,9 +103,9 @@ class Driven(Struct):
 class Lateness:
     """Measures how late the daemon ran the step of each control period.
 
-    The recording gives the number of missed periods, and so the number of each period. The times at
-    which periods were due follow from these numbers, except for a constant offset. The offset is
-    chosen so that the smallest delay is 0.
+    The recording states how many periods were missed, which gives the number of each period. The
+    times at which the periods were due follow from these numbers, except for a constant offset. The
+    offset is chosen so that the smallest delay is 0.
     """
 
     def __init__(self, rate_hz: float) -> None:
@@ -118,15 +121,18 @@ class Lateness:
         """Number of periods without a step."""
 
     def at_once(self) -> None:
-        """Count a line that was sent at once for a fresh command, instead of in the next period."""
+        """Count a line that the daemon sent for a fresh command instead of in the next period."""
         self._ahead += 1
 
     def tick(self, t: float, now_ns: int, missed: int, known: bool) -> None:
-        """Process the step of a control period; `t` is its time in the report, s.
+        """Process the step of a control period.
 
-        `now_ns` is its monotonic time, ns. `missed` is the number of periods without a step since
-        the last tick. `known` is False if the recording lacks steps before this one. Then the
-        number of the period is computed from `now_ns`.
+        Args:
+            t: the time of the step in the report, s.
+            now_ns: the monotonic time of the step, ns.
+            missed: the number of periods without a step since the last tick.
+            known: False if the recording lacks the steps just before this step. The number of the
+                period is then computed from `now_ns`.
         """
         period_ns, began_ns = self._period_ns, self._began_ns
         if began_ns is None:
@@ -138,7 +144,7 @@ class Lateness:
             self._number, missed = round((now_ns - began_ns) / period_ns), 0
         behind_ns = now_ns - began_ns - self._number * period_ns
         if missed and self._ahead and behind_ns < self._earliest - period_ns / 2:
-            # The line that was sent at once was that of the missed period.
+            # The line that was sent for a fresh command replaced that of the missed period.
             self._number -= 1
             behind_ns += period_ns
         self._ahead = 0
@@ -157,7 +163,7 @@ class Lateness:
 
 
 class LineCount:
-    """Number of serial lines of one kind: a curve of the number in each second, and the total."""
+    """Number of serial lines of one kind, in each second (`curve`) and in total (`total`)."""
 
     def __init__(self) -> None:
         self.curve, self.total = Curve(), 0
@@ -187,7 +193,7 @@ class SerialCounts:
         self._outstanding: int | None = None
         """Smallest number of unanswered lines at any step of this second.
 
-        At other steps the answer to the newest line may still be under way.
+        At the other steps, the answer to the newest line may not have arrived yet.
         """
         self._lost: int | None = None
         """Number of answers that were lost before this second, that is, the largest `_outstanding`
@@ -225,7 +231,7 @@ class SerialCounts:
 
 
 def _received(counters: Mapping[str, int]) -> tuple[int, int]:
-    """Return the number of accepted and of dropped lines. Implausible lines count as dropped."""
+    """Return a pair: the numbers of accepted and of dropped lines. Implausible ones are dropped."""
     bad = sum(count for name, count in counters.items() if name.startswith("line_"))
     return counters.get("lines", 0) - counters.get("line_implausible", 0), bad
 
@@ -257,16 +263,17 @@ class ReportData:
         self.lateness = Lateness(config.rate_hz)
         self.marks = Marks()
         self.began: float | None = None
-        """Wall-clock time of the first collected step, s since 1970. All times `t` count from
-        it."""
+        """Wall-clock time of the first collected step, s since 1970; None before this step. All
+        times `t` count from it."""
         self.ended = 0.0
         """Wall-clock time of the last collected step, s since 1970."""
         self.seconds = self.metres = 0.0
         """Duration of the collected steps, s, and distance that the robot drove in them, m."""
         self.driven: dict[str, Driven] = {}
-        """Maps each source to the time and the distance for which it drove the robot."""
+        """Maps each source to the time and the distance that it drove the robot."""
         self.fastest = Twist()
-        """Largest absolute value of the measured speed of each axis, m/s and rad/s."""
+        """Largest absolute values of the measured speed, m/s, and of the measured turn rate,
+        rad/s."""
         self.steps = self.missing = 0
         """Number of collected steps, and number of steps that are missing between them."""
         self._timeline = TimelineWriter(config)
@@ -278,9 +285,10 @@ class ReportData:
         self._number: int | None = None
         self._place: Place | None = None
         self._jumps = True
-        """True if the next pose does not continue the path, because a request set the pose."""
+        """True if the next pose does not continue the path: it is the first pose, or a request set
+        the pose."""
         self._sampled = self._sent = -math.inf
-        """Time of the last sample of the status, and of the last line that was sent, s."""
+        """Time of the last sample of the status, and time of the last sent line, s."""
         self._status: tuple[str, ...] = ()
 
     @property
@@ -315,7 +323,7 @@ class ReportData:
         self._number = step.number
 
     def end(self, ending: str = "") -> None:
-        """Finish the data. `ending` tells how the recording ends, as in `TimelineWriter.end`."""
+        """Finish the data. `ending` says how the recording ends, as in `TimelineWriter.end`."""
         t = self.seconds
         for entry in self._timeline.end(ending) if self.began is not None else ():
             self.marks.add(self._mark(entry, t))
@@ -330,7 +338,7 @@ class ReportData:
     # Distance and speeds.
 
     def _drive(self, step: Step, t: float, inside: bool) -> None:
-        """Process the poses of a step; if `inside` is true, add them to path and distance."""
+        """Process the poses of a step. If `inside` is true, add them to the path and distance."""
         mode, _, _, source = step.recorded.status
         driven = self._driven(source) if mode == "driving" and inside else None
         if driven is not None and t > self.seconds:
@@ -377,7 +385,8 @@ class ReportData:
     def _add_sent(self, curve: Curve, step: Step, t: float, speed: float) -> None:
         """Add a speed to a curve if the step sent a line.
 
-        Without a line the curve has a gap once the watchdog of the microcontroller has expired.
+        If no line was sent for longer than the timeout of the microcontroller's watchdog, add a
+        gap to the curve.
         """
         if step.recorded.sent is not None:
             curve.add(t, speed)
@@ -398,7 +407,7 @@ class ReportData:
             self.lateness.at_once()
 
     def _sample(self, step: Step, t: float, robot: Robot, refused: bool) -> None:
-        """Sample mode, link and sources if the last sample is `SAMPLE_S` old, or after a change."""
+        """Sample mode, link and sources every `SAMPLE_S`, and also after a change or a refusal."""
         mode, reason, link, _ = status = step.recorded.status
         if status == self._status and t - self._sampled < SAMPLE_S and not refused:
             return

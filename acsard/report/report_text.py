@@ -23,16 +23,16 @@ Clock = Callable[[float, bool], str]
 """Formats a time in s since 1970 as local time, with the date if the second argument is true."""
 
 MAX_REASONS = 8
-"""Largest number of rows in the table of reasons."""
+"""Maximum number of rows in the table of reasons."""
 
 NUMBER = re.compile(r"\d+(\.\d+)?")
 
 FINE_S = 0.05
-"""Time for which a point of a picture may stand, s. If a point stands for more time, the report has
-a note."""
+"""Longest time that one point of a picture may cover, s. If points cover a longer time, a note in
+the report says so."""
 
 MAX_NAMES = 5
-"""Largest number of names or texts that are listed in one sentence."""
+"""Maximum number of names or texts that are listed in one sentence."""
 
 
 class Origin(Struct, frozen=True):
@@ -61,7 +61,7 @@ OF_THE_BOARD = {
     "bumper_pressed": "bumper hit",
     "battery_stop": "battery stop",
 }
-"""Words for the events in which the board caused a stop, by the name of the event."""
+"""Words for the events in which the board caused a stop. The keys are the names of the events."""
 
 
 def differences(config: Config) -> list[Setting]:
@@ -93,7 +93,7 @@ def summary(data: ReportData) -> str:
         f"The robot drove {data.metres:.2f} m in {lasting(driving_s)} of {lasting(data.seconds)}, "
         f"at most {fast.linear:.2f} m/s and {fast.angular:.2f} rad/s."
         if driving_s
-        else f"The robot did not drive in these {lasting(data.seconds)}."
+        else f"The robot did not drive in the recorded {lasting(data.seconds)}."
     )
     stops = many(counts["stop"], "stop")
     by = _names([mark for mark in data.marks.all() if mark.name == "stop"])
@@ -119,9 +119,10 @@ def _names(marks: list[Mark]) -> str:
 
 
 def reasons(data: ReportData) -> list[tuple[str, str, str, float]]:
-    """Return why command sources did not drive: rows of source, state, reason, and duration in s.
+    """Return the reasons why command sources did not drive, with the longest duration first.
 
-    The longest duration comes first. Reasons that differ only in numbers share a row.
+    Each row contains the source, its state, the reason, and the total duration, s. Reasons that
+    differ only in numbers share a row.
     """
     durations: dict[tuple[str, str, str], dict[str, float]] = {}
     for name, band in data.sources.bands.items():
@@ -138,7 +139,7 @@ def reasons(data: ReportData) -> list[tuple[str, str, str, float]]:
 
 
 def _first_of_each(marks: list[Mark], clock: Clock) -> str:
-    """Return each distinct text of the marks with the time of its first occurrence."""
+    """Return a list, in words, of the different texts of the marks, each with its first time."""
     first: dict[str, Mark] = {}
     for mark in marks:
         first.setdefault(mark.text, mark)
@@ -147,7 +148,7 @@ def _first_of_each(marks: list[Mark], clock: Clock) -> str:
 
 
 def _late(marks: Iterable[Mark], clock: Clock) -> str:
-    """Return the causes of late control periods with their times; "" if no event names a cause."""
+    """Return the causes of late control periods and their times, or "" if no event names one."""
     late = [
         replace(mark, text=cause)
         for mark in marks
@@ -162,7 +163,7 @@ def notes(data: ReportData, origin: Origin) -> list[str]:
     if data.missing:
         found.append(
             f"{many(data.missing, 'step is', 'steps are')} missing: after the missing steps, the "
-            "commanded and limited speeds and the reasons of waiting sources may be wrong."
+            "commanded and limited speeds, and the reasons why sources wait, may be wrong."
         )
     if data.marks.counts["clock"]:
         found.append(
@@ -175,7 +176,7 @@ def notes(data: ReportData, origin: Origin) -> list[str]:
     if width > FINE_S:
         found.append(
             f"Each point of a picture covers up to {width:.2g} s, and shows the lowest and the "
-            "highest value in that time. To see more detail, draw a shorter time with --from and "
+            "highest value in that time. To see more detail, choose a shorter time with --from and "
             "--to."
         )
     return found

@@ -1,13 +1,13 @@
 """Computes the error budget of a drive: the odometry error that each single cause makes.
 
 The errors of one cause are propagated alone through the error model of the odometry
-(`core/motion/uncertainty.py`). For the position error, the computation repeats the recorded drive
-until the robot has driven 100 m. For the heading error, it repeats the drive, with all turns to the
-left, until the robot has turned by 360 deg.
+(`core/motion/uncertainty.py`). For the position error, the computation repeats the measured drive
+until the robot has driven 100 m. For the heading error, it makes all turns left turns, and repeats
+the drive until the robot has turned by 360 deg.
 
 Feedback lines show the errors of stamps, quantization, gaps and contradicting wheels. A gyro shows
-the error of the track. The noise of the gyro is taken from the variance that the odometry
-publishes. All other errors are those that `[odometry]` declares.
+the error of the track. The variance that the odometry publishes shows the noise of the gyro. All
+other errors are those that `[odometry]` declares.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from acsard.core.values import REST, PoseCovariance
 Cause = Literal["time", "quantization", "gaps", "slip", "parameters", "gyro"]
 
 Basis = Literal["measured", "settings", "unknown"]
-"""The source of an error's size: measurements, the settings of `[odometry]`, or none."""
+"""The source from which the size of an error is known; "unknown" if there is none."""
 
 METRES = 100.0
 """Distance after which the position error is given, m."""
@@ -41,19 +41,19 @@ LEAST_M, LEAST_RAD = 0.2, 0.2
 """Minimum distance (m) and minimum turn (rad) of a drive from which errors can be extrapolated."""
 
 LEAST_LINES = 20
-"""Minimum number of feedback lines. With fewer, the robot is treated as standing still."""
+"""Minimum number of feedback lines. With fewer, the robot is assumed to stand still."""
 
 STEP_S = 0.1
 """Minimum duration of the steps into which a drive is divided, s."""
 
 MOST_STEPS = 20_000
-"""Maximum number of steps in 100 m of driving. A slow drive has steps longer than `STEP_S`."""
+"""Maximum number of steps in 100 m of driving. A slow drive has longer steps than `STEP_S`."""
 
 STRAIGHT = Steps(np.array([[0.05, 0.0] + [0.0] * 7]))
 SPIN = Steps(np.array([[0.0, 0.05] + [0.0] * 7]))
-"""Steps of 0.05 m ahead (`STRAIGHT`) and of 0.05 rad on the spot (`SPIN`), without errors.
+"""A step of 0.05 m ahead (`STRAIGHT`) and a step of 0.05 rad in place (`SPIN`), without errors.
 
-If the robot stood still, its budget is computed for these steps.
+If the robot stood still, its budget is computed for repetitions of these steps.
 """
 
 
@@ -90,7 +90,7 @@ class Budget(Struct, frozen=True):
     lines: int
     missing: int
     unseen: float
-    """Driving time without feedback lines, s."""
+    """Total duration of the gaps in the feedback, s."""
     lateness: float
     """RMS error of the stamps of feedback lines, s."""
     quantum: float
@@ -100,9 +100,9 @@ class Budget(Struct, frozen=True):
     gyro: bool
     """True if the heading comes from a gyro."""
     still: bool
-    """True if the robot hardly moved. `shares` then contains only errors that settings state."""
+    """True if the robot hardly moved. `shares` then contains only errors known from settings."""
     at_rest: tuple[float, float]
-    """Standard deviations of linear (m/s) and angular (rad/s) speed at rest, due to rounding."""
+    """Standard deviations of linear (m/s) and angular (rad/s) speed due to rounding, at rest."""
     shares: tuple[Share, ...]
     multiplier: float = 1.0
     """Configured ratio of effective track to wheel separation."""
@@ -117,7 +117,8 @@ class Budget(Struct, frozen=True):
     def largest(self, *bases: Basis) -> Share | None:
         """Return the share with the largest position error, among the shares with one of `bases`.
 
-        If all position errors are 0, the heading errors decide. If they are 0 too, return None.
+        If all position errors are 0, return the share with the largest heading error. If the
+        heading errors are 0 as well, return None.
         """
         known = [share for share in self.shares if share.basis in bases]
         for size in (_millimetres, _degrees):
@@ -127,10 +128,10 @@ class Budget(Struct, frozen=True):
         return None
 
     def total(self) -> tuple[float | None, float | None]:
-        """Return the errors of all causes together, in mm after 100 m and deg after a full turn.
+        """Return a pair: the total error in mm after 100 m, and that in deg after a full turn.
 
-        The causes are independent, so the squares of their errors are added. A total is None if the
-        errors of all causes are None.
+        The causes are independent, so each total is the root of the sum of the squared errors. It
+        is None if this error is unknown for all causes.
         """
         return _squares([share.mm_per_100_m for share in self.shares]), _squares(
             [share.deg_per_turn for share in self.shares]
@@ -182,7 +183,7 @@ def budget(received: Received, config: Config, metres: float = METRES) -> Budget
 
 
 def _standing(received: Received, config: Config, model: _Model) -> Budget:
-    """Return the budget of a robot that stands still. Its errors follow from the settings."""
+    """Return the budget of a robot that stands still, with the errors that settings declare."""
     lines, odometry, known = received.lines, config.odometry, model.declares_parameters
     shares = (
         model.share("slip", "settings", STRAIGHT, SPIN, _only(odometry, *NOISE)),
@@ -204,7 +205,10 @@ def _standing(received: Received, config: Config, model: _Model) -> Budget:
 
 
 def _causes(received: Received, model: _Model, driving: Driving, counts: int) -> Iterator[Share]:
-    """Yield each cause's errors. `counts` are the encoder counts per wheel turn, 0 if unknown."""
+    """Yield the errors of each cause. `counts` is the number of encoder counts per wheel turn.
+
+    It is 0 if the number is unknown.
+    """
     odometry, plain = model.odometry, driving.plain()
 
     def share(
@@ -245,8 +249,8 @@ class _Model:
     def __init__(self, config: Config, metres: float) -> None:
         self.odometry, self.kinematics = config.odometry, Kinematics(config.drive)
         self.rolls = self.turns = True
-        """Whether the drive suffices to extrapolate position errors (`rolls`) and heading errors
-        (`turns`)."""
+        """`rolls` is true if the drive is long enough to extrapolate position errors from it.
+        `turns` is true if it has enough turns to extrapolate heading errors."""
         self._metres = metres
 
     @property
@@ -282,7 +286,7 @@ class _Model:
         self, steps: Steps, only: OdometryConfig, counts: int, scale: float, metres: float,
         angle: float,
     ) -> PoseCovariance:  # fmt: skip
-        """Return the pose's covariance when the repeated steps reach `metres` m or `angle` rad."""
+        """Repeat the steps up to `metres` m or `angle` rad, and return the pose's covariance."""
         pose, path = PoseUncertainty(ErrorModel(only, self.kinematics), counts), Path()
         rolled = turned = 0.0
         for distance, turn, along, yaw, *missed, by_gyro in cycle(steps.rows.tolist()):
@@ -300,7 +304,7 @@ class _Model:
 
 
 def _only(odometry: OdometryConfig, *kept: str) -> OdometryConfig:
-    """Return the settings with every declared error set to 0, except those named in `kept`."""
+    """Return the settings with every declared error set to 0, except the settings in `kept`."""
     zeros = {name: 0.0 for name in (*NOISE, *PARAMETERS) if name not in kept}
     return replace(odometry, pose_covariance_diagonal=(0.0,) * 6, **zeros)
 

@@ -32,8 +32,8 @@ ADVICE: dict[Cause, str] = {
     "slip": "drive on other ground, turn less on the spot, or use a gyro ([odometry] gyro), which "
     "measures turns that skidding wheels do not show",
     "parameters": "run `acsard calibrate`: it measures wheel radii and effective track",
-    "gyro": "let the robot stand for a second now and then, so that the daemon learns the bias of "
-    "the gyro",
+    "gyro": "let the robot stand still for a second now and then, so that the daemon learns the "
+    "bias of the gyro",
 }
 
 BASIS: dict[Basis, str] = {
@@ -97,7 +97,7 @@ def _driven(budget: Budget) -> str:
     return (
         f"{budget.seconds:.1f} s, {budget.metres:.2f} m, {budget.turned:.0f} deg turned, "
         f"{budget.lines} feedback lines{missing}; heading from the "
-        f"{'gyro' if budget.gyro else 'wheels'}. If the drive goes on like this, each cause "
+        f"{'gyro' if budget.gyro else 'wheels'}. If the drive continues like this, each cause "
         "alone makes this error:"
     )
 
@@ -110,22 +110,22 @@ def _table(budget: Budget) -> Table:
         (name, _number(mm, 0), _number(deg, 2), *words)
         for name, mm, deg, *words in [*causes, total]
     ]
-    return table(rows, ("", "mm in 100 m", "deg a turn", "", "based on"), right={1, 2})
+    return table(rows, ("", "mm in 100 m", "deg per turn", "", "based on"), right={1, 2})
 
 
 def _track(budget: Budget, learned: float) -> str:
     implied = f"{learned:.3f} (standard deviation {budget.learned_std:.3f})"
     if budget.learned_used:
         return (
-            f"According to the gyro, drive.wheel_separation_multiplier is {implied}. Odometry "
-            "uses this value while only the wheels measure the turn; the configured value is "
-            f"{budget.multiplier:.3f}."
+            f"According to the gyro, drive.wheel_separation_multiplier should be {implied}. "
+            "Odometry uses this value while only the wheels measure the turn; the configured value "
+            f"is {budget.multiplier:.3f}."
         )
     return (
-        f"According to the gyro, drive.wheel_separation_multiplier would be {implied}. Odometry "
+        f"According to the gyro, drive.wheel_separation_multiplier should be {implied}. Odometry "
         f"uses the configured value, {budget.multiplier:.3f}. If the two values differ on the "
         "ground where the robot works, either run `acsard calibrate`, or set [odometry] "
-        "learned_track, which uses the gyro's value while the gyro is silent."
+        "learned_track: odometry then uses the gyro's value while the gyro is silent."
     )
 
 

@@ -33,24 +33,24 @@ MOST = 60_000
 """Maximum number of feedback lines that are kept: ten minutes at 100 Hz."""
 
 SHARE_COARSE = 0.1
-"""Fraction of feedback lines with signs of coarse encoders above which the report mentions them."""
+"""If more than this fraction of the feedback lines show coarse encoders, the report says so."""
 
 LEAST_LOST, SHARE_LOST = 3, 0.01
 """Number and fraction of feedback lines that this program may miss. The larger limit applies.
 
-A few are always missing, because the daemon's counters and its messages are not read at the same
-moment.
+This program always seems to miss a few lines, because it reads the daemon's counters and messages
+at different moments.
 """
 
 SAMPLED = "checked with samples"
-"""Value of `check` in the message `diagnostics` if the feedback lines carry encoder counts."""
+"""Value of `check` in the message `diagnostics` if feedback lines carry encoder counts."""
 
 LOOK_S = 0.05
 """Interval at which the message queues are polled, s."""
 
 
 def budgets(robot: Client, config: Config, seconds: float) -> Iterator[Budget]:
-    """Yield the error budget of the drive so far, every `seconds` s.
+    """Every `seconds` s, yield the error budget of the whole drive so far.
 
     Raises `ReplyError` if no feedback lines arrive, or if a message cannot be decoded.
     """
@@ -63,7 +63,7 @@ def budgets(robot: Client, config: Config, seconds: float) -> Iterator[Budget]:
 
 
 def _await_line(robot: Client, lines: Subscription) -> None:
-    """Wait for the first feedback line. From then on, the daemon publishes all of `KEYS`."""
+    """Wait for the first feedback line. After it, messages on all of `KEYS` arrive."""
     end = time.monotonic() + FIRST_S
     while lines.try_recv() is None:
         if time.monotonic() > end:
@@ -91,7 +91,7 @@ class Feed:
     """Collects the messages of a daemon. Call `add()` for each message, and then `received()`."""
 
     def __init__(self, config: Config, first: RobotState) -> None:
-        """Start the collection. `first` is the daemon's state just before the first message."""
+        """Start an empty collection. `first` is the daemon's state before the first message."""
         self._config, self._first = config, first
         self._start_ns = first.stamp.to_ns()
         self._odom: dict[int, Odometry] = {}
@@ -168,7 +168,7 @@ def _value(diagnostics: DiagnosticArray, key: str) -> str:
 
 
 def _learned(diagnostics: DiagnosticArray) -> tuple[float | None, float, bool]:
-    """Return `learned`, `deviation` and `used` of `Received`, from the diagnostics."""
+    """Return three values for `Received`, from the diagnostics: `learned`, `deviation`, `used`."""
     names = ("learned_multiplier", "wheel_separation_multiplier", "learned_multiplier_std")
     learned, configured, std = (_value(diagnostics, name) for name in names)
     used = _value(diagnostics, "multiplier_in_use") == learned != configured

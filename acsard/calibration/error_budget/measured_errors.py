@@ -1,19 +1,20 @@
-"""Measures the motion of a drive and the errors of each of its steps from feedback lines.
+"""Measures the motion of a drive, and the errors of each step of this motion, from feedback lines.
 
 Late stamps and lost lines: the board makes its lines at a fixed period, or as answers to the lines
-of the daemon, so their times form a grid. A line cannot arrive before the board made it. The line
-with the smallest delay among its neighbours therefore shows where the grid is. If even this line
-arrives a whole period later than expected, a line was lost.
+of the daemon, so the times of its lines form a grid. A line cannot arrive before the board made it.
+The line with the smallest delay among its neighbors therefore shows where the grid is. If even this
+line arrives a whole period later than expected, a line was lost.
 
 Rounding: a feedback line carries wheel speeds with two decimals. Independent rounding errors have a
 standard deviation of q / sqrt(12), where q is the quantization step. A wheel at a constant speed
-repeats the same error, so n equal values in a row are one error of n times this size. If a wheel
+repeats the same error, so n equal values in a row make one error of n times this size. If a wheel
 passes through a value while it becomes faster or slower, the errors before and after the middle of
 the equal values cancel.
 
-Encoder counts: some firmware reports multiples of the speed of one count per period. An edge that
-comes too late for one period is counted in the next one, so errors of the count do not accumulate.
-The rounding of the multiples to two decimals does accumulate, but its errors can be computed.
+Encoder counts: some firmware counts encoder edges in each period, and reports multiples of the
+speed of one count per period. An edge that comes too late for one period is counted in the next
+period, so errors of the count do not accumulate. The errors from rounding the multiples to two
+decimals do accumulate, but they can be computed.
 
 Errors that are independent from step to step are given as variances. Errors that have the same sign
 in each step add up, so they are given as motion that the pose missed.
@@ -45,7 +46,7 @@ At 100 Hz they take 0.3 s, the longest time for which a busy host does not run t
 """
 
 MISSING = 0.6
-"""If the smallest delay among `AHEAD` lines grows by this many periods, a line was lost."""
+"""If the smallest delay among `AHEAD` lines grows by this number of periods, a line was lost."""
 
 FOLLOWED = 0.05
 """Gain of the low-pass filter that follows the smallest delay among `AHEAD` lines.
@@ -56,9 +57,9 @@ This delay drifts because the period is at first known only to about 1 %.
 CLUSTERED, ALIKE_TIMES = 0.4, 0.25
 """Limits that decide whether the period of lines is their median or their mean interval.
 
-The median is taken if more than the fraction `CLUSTERED` of the intervals differ from the median by
-less than the fraction `ALIKE_TIMES` of the median. Otherwise the lines arrive in bursts, and the
-mean is taken.
+The period is the median if more than the fraction `CLUSTERED` of the intervals differ from the
+median by less than the fraction `ALIKE_TIMES` of the median. Otherwise the lines arrive in bursts,
+and the period is the mean.
 """
 
 
@@ -72,11 +73,11 @@ class LineTimes(Struct, frozen=True):
 
 
 def line_times(t: Floats, sent: Floats) -> LineTimes:
-    """Estimate the delay of each feedback line, and the number of lines lost before it.
+    """Estimate the delay of each feedback line, and the number of lines that were lost before it.
 
     `t` contains the stamps of at least 3 feedback lines, s, and `sent` the times of the daemon's
-    lines, s. One estimate assumes a fixed period, the other a board that answers each line of the
-    daemon. The estimate with the smaller delays is returned.
+    lines, s. The function makes two estimates: one for a board that sends at a fixed period, one
+    for a board that answers each line of the daemon. It returns the estimate with smaller delays.
     """
     even = _even(t)
     asked = _asked(t, sent)
@@ -93,7 +94,7 @@ def _even(t: Floats) -> LineTimes:
     period = usual if np.mean(alike) > CLUSTERED else mean
     missing = _missing((t - t[0]) / period if period > 0.0 else np.arange(len(t), dtype=float))
     number = np.arange(len(t)) + np.cumsum(missing)
-    # Fit a straight line twice. The second fit leaves out the stalls, which distort the first one.
+    # Fit a straight line twice. The second fit leaves out stalls, which distort the first fit.
     among = np.ones(len(t), dtype=bool)
     for _ in range(2):
         slope, start = np.polyfit(number[among], t[among], 1)
@@ -142,7 +143,7 @@ def _missing(at: Floats) -> Counts:
 
 
 BLOCK_S = 0.5
-"""Time, s, within which the errors of time stamps are correlated: one stall causes them all."""
+"""Time, s, within which the errors of stamps are correlated, because one stall delays all lines."""
 
 LEAST_LINES, ALIKE = 20, 0.99
 """Limits for the fit that separates the noise of the gyro from its scale error.
@@ -154,8 +155,8 @@ proportional to time (cosine above `ALIKE`), the fit cannot separate noise and s
 LATEST_S = 0.1
 """Largest delay of a feedback line, s, that counts as an error of its stamp.
 
-Two successive lines that are at least this far apart enclose a gap if the pose did not move between
-them.
+If two successive lines are at least `LATEST_S` apart and the pose did not move between them, there
+is a gap in the feedback between them.
 """
 
 Wheels = tuple[float, float, float, float]
@@ -178,7 +179,10 @@ class Line(Struct, frozen=True):
 
 
 class Motion(Struct, frozen=True):
-    """The motion from line to line, and its errors. Arrays have no row for the first line."""
+    """The motion from each feedback line to the next, and its errors.
+
+    The arrays have one row less than there are lines.
+    """
 
     seconds: float
     period: float
@@ -190,7 +194,7 @@ class Motion(Struct, frozen=True):
     yaw_variance: Floats | None
     """Variance that the noise of the gyro adds to each turn, rad2; None if it is unknown."""
     late: Floats
-    """Errors of distance and turn due to wrong stamps, rows of (m, rad)."""
+    """Errors of distance and turn due to wrong stamps of lines, rows of (m, rad)."""
     lateness: float
     """RMS error of the time stamps of feedback lines, s."""
     filled: Floats
@@ -206,8 +210,8 @@ def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool)
     """Compute the motion between at least 3 feedback lines, and the errors of this motion.
 
     `sent` contains the times of the daemon's lines, s. `whole` is true if this program received
-    every line that the daemon received. If `whole` is false, a missing line may have been lost on
-    the way to this program, so it does not count as an error of the odometry.
+    every line that the daemon received. If `whole` is false, a missing line may have been lost
+    between the daemon and this program, so it does not count as an error of the odometry.
     """
     t = np.array([line.at for line in lines])
     found = line_times(t, sent)
@@ -258,9 +262,9 @@ def _noise(t: Floats, speeds: Floats, turns: Floats, variances: Floats) -> Float
 def _late(t: Floats, twists: list[Twist], found: LineTimes) -> Floats:
     """Return the errors of the motion due to wrong stamps, rows of (m, rad).
 
-    A wrong stamp changes the interval dt of a line, and thus the distance, which is speed times dt.
-    Summation by parts gives each line its own term: the delay of the line, multiplied by the
-    difference (speed of the line - speed of the next line).
+    A wrong stamp changes the interval dt before a line, and thus the distance, which is speed times
+    dt. It changes the next interval by the opposite amount. Summation by parts gives each line one
+    error: the delay of the line times (speed in this line - speed in the next line).
     """
     speeds = np.array([(one.linear, one.angular) for one in twists])
     near = np.abs(found.late) <= LATEST_S
@@ -274,9 +278,10 @@ def _late(t: Floats, twists: list[Twist], found: LineTimes) -> Floats:
 def _gaps(
     t: Floats, twists: list[Twist], rolled: list[Twist], found: LineTimes, whole: bool
 ) -> tuple[Floats, Floats, int, float]:
-    """Return `filled`, `unfilled`, `missing` and `unseen` of `Motion`.
+    """Return four values: `filled`, `unfilled`, `missing` and `unseen` of `Motion`.
 
-    `twists` come from the reported speeds, and the motion `rolled` from the reported positions.
+    `twists` come from the speeds in the lines, and `rolled`, the motion from each line to the next,
+    comes from the wheel positions.
     """
     filled, unfilled = np.zeros((len(rolled), 2)), np.zeros((len(rolled), 4))
     lost, unseen = 0, 0.0
@@ -296,8 +301,8 @@ def _gaps(
             seconds = missing * found.period
             unseen += seconds
             lost += missing
-            # The odometry may have filled the gap with a motion that differs from the one at the
-            # mean of the speeds before and after the gap.
+            # The odometry may have filled the gap with another motion than the motion at the mean
+            # of the speeds before and after the gap.
             off = moved.linear - after.linear * found.period - mean.linear * seconds
             turned = moved.angular - after.angular * found.period - mean.angular * seconds
             along, yaw = gaps.unseen(seconds, before, after)
@@ -309,7 +314,8 @@ def _gaps(
 
 
 TOGETHER = 0.8
-"""Two wheels with equal speeds in at least this fraction of lines have equal rounding errors."""
+"""Two wheels are assumed to have equal rounding errors if their speeds are equal in at least this
+fraction of lines."""
 
 LEAST_VALUES = 3
 """Minimum number of different speeds that are needed to find a quantization step."""
@@ -326,7 +332,7 @@ class Rounding(Struct, frozen=True):
     offset: Floats
     """Known error of the angle that a wheel rolled from line to line, rad."""
     alike: Floats
-    """1 for a pair of wheels with equal rounding errors, 0 for another pair; shape (4, 4)."""
+    """Matrix that is 1 for each pair of wheels with equal rounding errors, else 0; shape (4, 4)."""
     quantum: float
     """Quantization step, rad/s."""
     count: float
@@ -354,8 +360,9 @@ def rounding(speeds: Floats, period: float) -> Rounding:
 def _runs(values: Floats) -> Floats:
     """Return the variances of a wheel's rounding errors, divided by (quantization step)^2 / 12.
 
-    A run of n equal speeds has the variance n^2 at its last speed, and 0 at the others. If the
-    wheel passed through this speed while it became faster or slower, the last variance is 1.
+    `values` contains the wheel's speed in each line. The last of n equal speeds in a row has the
+    variance n^2, and the others have 0. If the wheel passed through this speed while it became
+    faster or slower, the last one has the variance 1.
     """
     found = np.zeros(len(values))
     ends = np.append(np.flatnonzero(np.diff(values)), len(values) - 1)
@@ -373,7 +380,7 @@ def _runs(values: Floats) -> Floats:
 
 def _quantum(speeds: Floats) -> float:
     """Return the step, rad/s, of which all speeds are multiples, or 0 if there is none."""
-    # A value that is repeated for a whole drive is no more evidence than a single one.
+    # A value that is repeated for a whole drive is no more evidence than a single value.
     seen = np.unique(np.abs(speeds[speeds != 0.0]))
     return quantization_step(seen) if len(seen) >= LEAST_VALUES else 0.0
 
@@ -394,7 +401,7 @@ class Steps(Struct, frozen=True):
     """Whether a gyro measured the turns. Otherwise the wheels did."""
 
     def to_the_left(self) -> Steps:
-        """Return the steps with right turns mirrored, so that all turns are to the left."""
+        """Return the steps with each right turn mirrored, so that all turns are to the left."""
         rows = self.rows.copy()
         rows[rows[:, 1] < 0.0] *= (1, -1, 1, 1, 1, -1, 1, 1, 1)
         return Steps(rows, self.by_gyro)
@@ -473,9 +480,10 @@ class Driving:
         self, variances: Floats | None = None, missed: Floats | None = None,
         gyro: Floats | None = None,
     ) -> Steps:  # fmt: skip
-        """Return the steps with these errors, given for all lines but the first; None means 0.
+        """Return the steps with these errors; None means no errors of this kind.
 
-        In `Steps.rows`, `variances` fill columns 2 and 3, `missed` 4 to 7, and `gyro` 8.
+        Each array has a row for every line but the first. In `Steps.rows`, `variances` fills the
+        columns 2 and 3, `missed` the columns 4 to 7, and `gyro` the column 8.
         """
         moved, count = self._motion, len(self._motion.distance)
         errors = [

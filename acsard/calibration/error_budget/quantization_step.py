@@ -3,11 +3,11 @@
 A firmware may compute speeds from the encoder counts in each period T, s. It then reports only
 multiples of the step q = 2 pi / (N T), rounded to two decimals, where N is the number of counts per
 wheel turn. The search finds the largest q of which nearly all speeds are multiples. It rejects a q
-that fits only by chance. Speeds that a filter has smoothed are not multiples of any step. A mean
-over M periods has a step that is M times as fine.
+that fits only by chance. If the firmware smooths the speeds with a filter, they are not multiples
+of any step. If it reports means over M periods, the step is M times as fine.
 
-One of the largest speeds is V = j q for a whole number j. The candidates for q are therefore V / j
-for j = 1, 2 and so on.
+A speed V among the largest speeds is V = j q for a whole number j. The candidates for q are
+therefore V / j for j = 1, 2 and so on.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from acsard.calibration.log_table import Floats
 from acsard.core.link.whole_counts import ROUNDING
 
 FINEST = 4 * ROUNDING
-"""Finest step that is tried, rad/s. A finer step would fit over half of all speeds by chance."""
+"""Finest step to try, rad/s. A finer step would fit more than half of all speeds by chance."""
 
 DEVIATION = 0.01 / math.sqrt(12)
 """Standard deviation of the error of rounding to two decimals, rad/s."""
@@ -34,17 +34,17 @@ BY_CHANCE = 1e-5
 STEEP = 1.0
 """Smallest step, rad/s, that is accepted without a check against `BY_CHANCE`.
 
-Only the speeds of coarse encoders jump this much.
+Only speeds from coarse encoders have steps of this size.
 """
 
 
 def quantization_step(speeds: Floats) -> float:
-    """Return the quantization step of these speeds, or 0 if they have none; all in rad/s.
+    """Return the quantization step of these speeds, rad/s, or 0 if they have none.
 
-    `speeds` contains at least three different speeds above 0 in rising order, shape (n,).
+    `speeds` contains at least three different speeds above 0, rad/s, in rising order.
     """
     spare = max(1, int(STRAYS * len(speeds)))
-    # The largest speed, apart from the few that need not be multiples of the step.
+    # The largest speed, without the few that need not be multiples of the step.
     anchor = float(speeds[-1 - spare])
     for part in range(1, int(anchor / FINEST) + 1):
         # The anchor is rounded as well, so each multiple is wrong in proportion to its size.
@@ -56,13 +56,13 @@ def quantization_step(speeds: Floats) -> float:
 
 
 def _strays(speeds: Floats, step: float, doubt: float) -> int:
-    """Count the speeds that are not multiples of `step`. Its relative error is up to `doubt`."""
+    """Count the speeds that are not multiples of `step`, whose relative error is up to `doubt`."""
     off = np.abs(speeds - step * np.round(speeds / step))
     return int(np.count_nonzero(off > ROUNDING + doubt * speeds))
 
 
 def _fitted(speeds: Floats, rough: float, spare: int, tries: int) -> float:
-    """Return the step near `rough`, rad/s, by least squares; 0 if a closer test rejects it.
+    """Fit the step near `rough` by least squares, rad/s. Return 0 if a closer test rejects it.
 
     `spare` is the number of speeds that need not be multiples of the step. `tries` is the number of
     candidates tried so far, each of which could fit by chance.

@@ -1,11 +1,12 @@
 """The types of a guided drive: `Method`, `Leg`, `Move` and measurements, and the robot's `Setup`.
 
-`acsard calibrate` and the web page import this module for the names of the methods. It does not
-import numpy, so that they start quickly.
+`acsard calibrate` and the web page import this module for the names of the methods. This module
+does not import numpy, so that both start quickly.
 
-The robot stays within its limits and on a floor of 3 m x 3 m. Before the calibration it is unknown
-how far the robot turns for a command. The plan must therefore work for an effective track of 1 to
-2.5 times the wheel separation. Each drive stays on the floor because it has one of these forms:
+A guided drive keeps the robot within its limits and on a floor of 3 m x 3 m. Before the calibration
+it is unknown how far the robot turns for a command. The plan must therefore work for an effective
+track of 1 to 2.5 times the wheel separation. Each drive has one of these forms, so that the robot
+stays on the floor:
 
 - It goes there and back.
 - It follows a line that a person set the robot on.
@@ -59,7 +60,7 @@ class DisturbedError(GuideError):
 
 
 class Move(Struct, frozen=True):
-    """A command, and the time for which the tool keeps sending it. Zero speeds make a pause."""
+    """A twist, and the time for which the tool commands it. A zero twist makes a pause."""
 
     seconds: float
     linear: float = 0.0
@@ -73,21 +74,22 @@ UNITS = {"m": 1.0, "mm": 1e-3, "deg": math.pi / 180}
 
 
 Quantity = Literal["turned", "angle", "distance", "ahead", "aside"]
-"""The quantity that a tape reading gives about the robot's motion since its last known pose.
+"""The quantity that a tape reading gives about the motion since the last known pose of the robot.
 
 - `turned`: the turn in rad, positive to the left, including whole turns.
 - `angle`: the turn in rad, positive to the left, with an unknown number of whole turns.
 - `distance`: the straight-line distance in m.
-- `ahead`, `aside`: the displacement in m, along the heading of that pose and to the left of it.
+- `ahead`: the displacement in m along the heading of that pose.
+- `aside`: the displacement in m to the left of that heading.
 """
 
 
 class Mean(Struct, frozen=True):
-    """A measurement that is the mean of several answers, plus a known constant."""
+    """A measurement that is the mean of the person's answers, plus a known constant."""
 
     quantity: Quantity
     answers: tuple[str, ...]
-    """Names of the person's answers."""
+    """Names of the answers of which the mean is computed."""
     deviation: float
     """Standard deviation of the measurement, m or rad."""
     plus: float = 0.0
@@ -97,7 +99,7 @@ class Mean(Struct, frozen=True):
 
 
 class Slant(Struct, frozen=True):
-    """A measurement of the robot's turn, computed from two points' distances from a line."""
+    """A measurement of the robot's turn, computed from the distances of two points from a line."""
 
     quantity: Quantity
     near: str
@@ -116,7 +118,10 @@ class Slant(Struct, frozen=True):
     The tool asks for this distance once, before the first leg.
     """
     since: str = ""
-    """Name of the leg after which the start angle to the line was measured; "" for 0."""
+    """Name of the leg after which the start angle to the line was measured.
+
+    "" means that the robot started parallel to the line.
+    """
     plus: float = 0.0
     """Whole and half turns to add, rad, because the angle to the line does not show them."""
     over: tuple[str, ...] = ()
@@ -174,7 +179,7 @@ STOPS_IN = 0.1
 """Distance that the robot may still roll after a leg has ended, m."""
 
 WIDEST = 2.5
-"""Largest ratio of effective track to wheel separation that the plan allows for. The least is 1."""
+"""Largest ratio of effective track to wheel separation that the plan covers. The smallest is 1."""
 
 
 class Setup(Struct, frozen=True):
@@ -209,7 +214,7 @@ class Setup(Struct, frozen=True):
         return Move(abs(metres) / self.speed, math.copysign(self.speed, metres))
 
     def spin(self, rate: float, seconds: float) -> Move:
-        """Return a turn on the spot at `rate`, rad/s, positive to the left, for `seconds`.
+        """Return a turn in place at `rate`, rad/s, positive to the left, for `seconds`.
 
         A robot that skids turns more slowly than `rate`.
         """
@@ -224,7 +229,7 @@ class Setup(Struct, frozen=True):
         return Move(straight.seconds, straight.linear, self.command(rate))
 
     def turn(self, angle: float, rate: float, track: float) -> Move:
-        """Return a turn on the spot by a true angle. The command makes up for skidding.
+        """Return a turn in place by a true angle. Its command compensates for skidding.
 
         `angle` is in rad, positive to the left. `rate` is the true turn rate, rad/s, which the
         limits may reduce. `track` is the ratio of effective track to wheel separation.
@@ -246,7 +251,7 @@ class Setup(Struct, frozen=True):
     def rate_per_command(self) -> float:
         """Turn rate without skidding, rad/s, for an angular command of 1 rad/s.
 
-        It differs from 1 because the configured multipliers make up for skidding.
+        It differs from 1 because the configured multipliers compensate for skidding.
         """
         bare = replace(
             self.drive, wheel_separation_multiplier=1.0, left_wheel_radius_multiplier=1.0,
@@ -266,7 +271,8 @@ the ratio.
 TRACKS = [1.0 + 0.05 * step for step in range(round((WIDEST - 1.0) / 0.05) + 1)]
 """Ratios of effective track to wheel separation for which the driving time is computed.
 
-The largest ratio need not take longest: with a smaller one, a leg may have one more full turn.
+The largest ratio does not always need the longest time. With a smaller ratio, a leg may have one
+more full turn.
 """
 
 
@@ -278,7 +284,7 @@ class Method(Struct, frozen=True):
     """Measuring tool that the person uses, in words; "" if a sensor measures instead."""
 
     def longest_s(self, setup: Setup) -> float:
-        """Return the longest driving time, s, over all effective tracks in `TRACKS`."""
+        """Return the total driving time of all legs, s, for the worst of the ratios in `TRACKS`."""
         return max(sum(leg.seconds for leg in self.legs(setup, track)) for track in TRACKS)
 
 

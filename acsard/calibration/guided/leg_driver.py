@@ -29,10 +29,10 @@ DEVIATES_S = 1.0
 """Time for which the robot may deviate from the command before the leg is halted, s."""
 
 LINEAR_OFF, ANGULAR_OFF, OFF_SHARE = 0.05, 0.15, 0.3
-"""Limits for the twist at the wheels minus the commanded twist.
+"""Limits for the difference between the measured twist of the wheels and the commanded twist.
 
-The difference may be `LINEAR_OFF` m/s and `ANGULAR_OFF` rad/s, each plus the fraction `OFF_SHARE`
-of the command.
+The linear difference may be `LINEAR_OFF` m/s plus the fraction `OFF_SHARE` of the linear command.
+The angular difference may be `ANGULAR_OFF` rad/s plus `OFF_SHARE` of the angular command.
 """
 
 STILL = 0.02
@@ -71,21 +71,21 @@ class LegDriver:
         self._kinematics = Kinematics(drive)
         self.phase = Phase.OPENING
         self.halted = ""
-        """The reason why the leg was cut short, or ""."""
+        """The reason why the leg was cut short; "" if it was not."""
         self.disturbed = False
-        """Whether the reason in `halted` is temporary, so that the leg can be repeated."""
+        """True if the reason in `halted` is temporary, so that the leg can be repeated."""
         self.silent = False
-        """Whether the leg was halted because nothing was received from the daemon.
+        """True if the leg was halted because no messages from the daemon arrived.
 
-        If the daemon returns, the leg can be repeated.
+        If messages arrive again, the leg can be repeated.
         """
         self._begun = self._received = self._stepped = self._changed = now
         self._number, self._ends = -1, now
         self._command = REST
         self._waits = "no message with the daemon's state has arrived"
-        """The reason why the daemon does not accept the commands yet, or ""."""
+        """The reason why the daemon does not accept the commands yet; "" if it accepts them."""
         self._starved = f"the daemon has received no command of source {source} for {OPENING_S:g} s"
-        """Reason to halt the leg if this computer is too busy to send commands."""
+        """The reason to give if this computer was too busy to send commands."""
         self._still_since: float | None = None
         self._deviates_since: float | None = None
 
@@ -106,12 +106,14 @@ class LegDriver:
         """Handle a key press, which halts the leg except in two cases.
 
         In a leg with `Leg.by_key`, a key ends the last move, and further keys are ignored. In phase
-        OPENING, Enter is ignored: the person may still hold the key that started the leg.
+        OPENING, Enter is ignored, because the person may still hold the Enter key that started the
+        leg.
         """
         if self.phase is Phase.OPENING and pressed in ENTER:
             return
         if self.phase is Phase.MOVING and now - self._stepped > QUIET_S / 2:
-            # The robot had stopped during the pause, and that may be why the person pressed a key.
+            # This process was paused, and the robot stopped meanwhile. The person may have pressed
+            # a key only because the robot stopped.
             self._halt(HELD_UP)
         last = self._number == len(self._leg.moves) - 1
         if self.phase is Phase.MOVING and self._leg.by_key and last:
@@ -126,7 +128,10 @@ class LegDriver:
             late = state.mode == "waiting" and is_ours(state.reason)
             self._halt(f"the robot is {state.mode}: {state.reason}", disturbed=late)
         elif state.source not in ("", self._source):
-            self._halt(f"{state.source} commands the robot now: end that program, and start again")
+            self._halt(
+                f"the source {state.source} commands the robot now: end the program that uses "
+                "this source, and start again"
+            )
         elif self.phase is Phase.OPENING:
             self._waits = why
         elif state.sender not in ("", self._sender):
@@ -147,10 +152,10 @@ class LegDriver:
     def step(self, now: float) -> Twist:
         """Return the command to send now."""
         held_up, self._stepped = now - self._stepped, now
-        # During a pause of this process the robot has braked, and the time of the move may have run
+        # While this process was paused, the robot has braked, and the time of the move may have run
         # out. The next move would then begin at the wrong place. The pause also hides whether the
-        # daemon was silent. After a pause before the first move, the person who started the leg may
-        # have left.
+        # daemon was silent. If the pause came before the first move, the person who started the leg
+        # may have left meanwhile.
         if held_up > QUIET_S / 2 and self.phase in (Phase.OPENING, Phase.MOVING):
             self._halt(HELD_UP, disturbed=True)
         elif now - self._received > QUIET_S:
@@ -186,8 +191,8 @@ class LegDriver:
             return
         move = self._leg.moves[self._number]
         self._command = Twist(move.linear, move.angular)
-        # Count from the planned end of the last move, so that a late step does not lengthen the
-        # drive.
+        # Add the duration to the planned end of the last move, not to `now`. A late step then does
+        # not lengthen the drive.
         self._ends, self._changed = self._ends + move.seconds, now
 
     def _settle(self, now: float) -> None:
@@ -204,10 +209,10 @@ class LegDriver:
             )
 
     def _tolerate_briefly(self, why: str, now: float, *, disturbed: bool) -> None:
-        """Halt the leg if the reason `why` has lasted for `DEVIATES_S`; "" means no reason.
+        """Halt the leg if there has been a reason for `DEVIATES_S`; `why` is "" for no reason.
 
         A shorter deviation is harmless: if this computer is busy for a moment, it sends commands
-        late, and the robot only slows down. `disturbed` tells whether the leg can be repeated.
+        late, and the robot only slows down. `disturbed` is true if the leg can be repeated.
         """
         if not why:
             self._deviates_since = None
@@ -217,7 +222,7 @@ class LegDriver:
             self._halt(why, disturbed=disturbed)
 
     def _objection(self, state: RobotState) -> str:
-        """Return why the daemon does not follow the commands of this leg, or "" if it does."""
+        """Return why the daemon does not obey the commands of this leg, or "" if it obeys them."""
         if why := objection(state, self._source, self._sender):
             return why
         # A source with a long timeout still drives the robot after its commands stop arriving.
@@ -229,13 +234,13 @@ class LegDriver:
     def _deviation(self, state: RobotState, now: float) -> str:
         """Return a sentence about how the wheels deviate from the command, or "" if they do not.
 
-        Only wheel speeds are compared with the command. The turn rate of a gyro is not, because a
+        The command is compared with wheel speeds, and not with the turn rate of a gyro, because a
         robot that skids turns less than commanded.
         """
         if now - self._changed < OBEYED_S:
             return ""
         if not state.wheels:
-            return "the microcontroller sends no feedback: look at its cable and its power supply"
+            return "the microcontroller sends no feedback: check its cable and its power supply"
         twist = self._kinematics.twist(WheelSpeeds(*state.wheels))
         for commanded, actual, off, unit in (
             (self._command.linear, twist.linear, LINEAR_OFF, "m/s"),

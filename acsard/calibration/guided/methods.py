@@ -1,9 +1,10 @@
 """The table of the methods of calibration by a guided drive, and the legs of each.
 
 UMBmark is by Borenstein & Feng, UMBmark: A Benchmark Test for Measuring Odometry Errors in Mobile
-Robots (1995). The paper evaluates the distance between start and end of squares with two formulas
-for small errors. Here the same measurements go into the fit of `tape_readings.py` instead, because
-the track of a robot that skids is far from the configured one.
+Robots (1995). The robot drives squares, and a person measures the displacement between the start
+and the end of each square. The paper evaluates these measurements with two formulas for small
+errors. Here they go into the fit of `tape_readings.py` instead, because the track of a robot that
+skids is far from the configured track.
 """
 
 from __future__ import annotations
@@ -26,31 +27,31 @@ from acsard.calibration.multipliers import LEAST_M
 from acsard.terminal.prompt import Ask
 
 TAPE_M = 0.005
-"""Standard deviation of a straight drive's length by tape, m, with the errors at both ends."""
+"""Standard deviation of a straight drive's length by tape, m. It covers the errors at both ends."""
 
 BY_EYE = 0.07
 """Standard deviation of a heading that a person judges by eye, rad."""
 
 END_M = 0.003
-"""Standard deviation of the measured distance of the robot from its marks after a square, m.
+"""Standard deviation of the measured distance between robot and marks after a square, m.
 
 It includes the error with which the person made the marks beside the robot.
 """
 
 FIRST_TURN = 1.2
-"""Turn rate that the first turn on the spot would have without skidding, rad/s."""
+"""Turn rate that the first turn in place would have without skidding, rad/s."""
 
 MISSED = 1.1
-"""Timeout of the first turn, as a multiple of the time for a full turn with the track `WIDEST`."""
+"""Timeout of the first turn, as a multiple of the time for a full turn with the ratio `WIDEST`."""
 
 MOST_SPIN_S = 24.0
-"""Longest time of a leg with several full turns on the spot, s."""
+"""Longest total time of several full turns in place in one leg, s."""
 
 STOP, SETTLE = Move(0.6), Move(1.0)
 """Pauses between moves. In `STOP` the robot comes to rest; in `SETTLE` it also stops shaking."""
 
 ROUND = "once round"
-"""Name of the leg that turns once on the spot. A person ends this leg with a key."""
+"""Name of the leg in which the robot turns once in place. A person ends this leg with a key."""
 
 FROM_MARK = Ask(
     "How far is the marked wheel from its mark now, in a straight line?", "m", LEAST_M, 2 * ROOM,
@@ -67,19 +68,19 @@ def _at_the_edge(setup: Setup) -> str:
 
 
 def once_round(setup: Setup, until: str, asks: tuple[Ask, ...] = (), *measures: Measure) -> Leg:
-    """Return the leg of one turn to the left on the spot, which the person ends with a key.
+    """Return the leg of one left turn in place, which the person ends with a key.
 
     `until` completes the instruction "Press SPACE ...".
     """
     longest = MISSED * 2 * math.pi * WIDEST
     rate = abs(setup.command(FIRST_TURN)) * setup.rate_per_command
-    words = f"The robot turns to the left on the spot. Press SPACE {until}"
+    words = f"The robot turns left in place. Press SPACE {until}"
     turn = setup.spin(FIRST_TURN, longest / rate)
     return Leg(ROUND, words, (turn,), asks, measures, by_key=True)
 
 
 def turns(setup: Setup, rate: float, track: float, most: int) -> int:
-    """Return how many full turns on the spot fit into `MOST_SPIN_S`, from 1 to `most`.
+    """Return the number of full turns in place that fit into `MOST_SPIN_S`: 1 to `most`.
 
     `rate` is the true turn rate, rad/s. `track` is the ratio of effective track to separation.
     """
@@ -115,8 +116,8 @@ def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
 
     around = once_round(
         setup,
-        "when it has turned one full circle and faces along the line as before; 20 deg too far or "
-        "too short do not matter.",
+        "when it has turned one full circle and faces along the line as before; an error of 20 deg "
+        "does not matter.",
         TO_LINE,
         Slant("turned", *LINE, since="ahead", plus=2 * math.pi, over=("back", ROUND)),
     )
@@ -152,10 +153,10 @@ GAP_M = 0.2
 """Distance from the wall at which the robot stops when it returns, m."""
 
 OUT_M = 0.9
-"""Distance that the robot drives away from the wall before several turns on the spot, m."""
+"""Distance that the robot drives away from the wall before several turns in place, m."""
 
 HALF_RATE, ROUND_RATE = 0.8, 1.2
-"""True turn rates of half turns and of whole turns in the method "wall", rad/s."""
+"""True turn rates in the method "wall", rad/s: of half turns, and of several full turns."""
 
 SQUARE = (
     "Push the robot's back flat against the wall by hand, so that both its rear corners touch it"
@@ -212,7 +213,7 @@ def _wall(setup: Setup, track: float) -> tuple[Leg, ...]:
         once_round(
             setup,
             "when it has turned one full circle and faces straight away from the wall as before; "
-            "10 deg too far or too short do not matter.",
+            "an error of 10 deg does not matter.",
         ),
         Leg(
             "home",
@@ -315,19 +316,19 @@ FAST, SLOW, CURVE = 1.5, 0.75, 0.8
 SPIN_S, CURVE_M, TURN_RAD = 7.5, 1.2, 5.0
 """Sizes of moves in the methods "gyro" and "positions".
 
-- `SPIN_S`: the duration of a turn on the spot in "gyro", s.
+- `SPIN_S`: the duration of a turn in place in "gyro", s.
 - `CURVE_M`: the length of a curve, m.
-- `TURN_RAD`: the angle of a turn on the spot in "positions", rad, as it is without skidding.
+- `TURN_RAD`: the angle of a turn in place in "positions", rad, that a robot without skidding turns.
 """
 
 PETALS = ((FAST, CURVE), (-FAST, -CURVE), (SLOW, 0.0), (-SLOW, CURVE), (FAST, -CURVE))
-"""Moves of the method "positions": each pair is a turn on the spot and a curve after it.
+"""Moves of the method "positions": each pair is a turn in place and the curve after it.
 
-A number is the turn rate of the move without skidding, rad/s.
+The numbers are the turn rates that these moves have without skidding, rad/s.
 """
 
 STANDING, PAUSE, SHORT = Move(2.5), Move(1.4), Move(0.7)
-"""Pauses before the first drive, between drives, and where the robot only has to stop.
+"""Pauses: before the first drive, between drives, and where the robot only has to stop.
 
 `STANDING` and `PAUSE` are long enough to measure the bias of a gyro.
 """
@@ -354,23 +355,23 @@ def _gyro(setup: Setup, track: float) -> tuple[Leg, ...]:
     for rate in (CURVE, -CURVE, 0.0):
         moves += _there_and_back(setup, rate)
     far = Ask(
-        "How far is the marked wheel from its mark now, in a straight line? Press Enter alone if "
-        "you did not measure it",
+        "How far is the marked wheel from its mark now, in a straight line? If you did not measure "
+        "it, press only Enter",
         "m", 0.0, 2 * setup.length, 0.0, "metres",
     )  # fmt: skip
     return (
         _straight(setup, (far,)),
         Leg(
             "turns",
-            "The robot drives back to the middle of the floor, turns on the spot to both sides, "
-            "fast and slowly, and drives three curves there and back.",
+            "The robot drives back to the middle of the floor, turns in place to both sides, fast "
+            "and slowly, and drives three curves there and back.",
             (*moves, PAUSE),
         ),
     )
 
 
 def _positions(setup: Setup, track: float) -> tuple[Leg, ...]:
-    # Positions show a turn on the spot only through the direction of the curve that follows it.
+    # Positions show a turn in place only by the direction of the curve that follows it.
     moves = [SHORT, setup.ahead(-setup.to_middle), SHORT]
     for turn_rate, curve_rate in PETALS:
         moves += [setup.spin(turn_rate, TURN_RAD / abs(turn_rate)), SHORT]
@@ -379,8 +380,8 @@ def _positions(setup: Setup, track: float) -> tuple[Leg, ...]:
         _straight(setup),
         Leg(
             "turns",
-            "The robot drives back to the middle of the floor. Then it repeatedly turns a part of "
-            "a circle on the spot and drives a curve there and back.",
+            "The robot drives back to the middle of the floor. Then it repeatedly turns in place "
+            "by a part of a circle, and drives a curve there and back.",
             tuple(moves),
         ),
     )

@@ -35,13 +35,13 @@ from acsard.terminal.prompt import Prompt
 SOURCE = "app"
 
 LOOK_S = 0.005
-"""Period of polling keyboard and message queues, s. A key press takes effect within this period."""
+"""Period of polling the keyboard and the message queues, s. A key takes effect within this time."""
 
 SHOWN_S = 0.2
 """Interval between updates of the progress display of a leg, s."""
 
 RETURNS_S = 3.0
-"""Time, s, in which a silent daemon must send its state again for the leg to be repeated."""
+"""If a silent daemon sends its state again within this time, s, the leg is repeated."""
 
 POSITIONS = (Odometry, PoseStamped)
 """Types of a position message, in the order in which they are tried.
@@ -105,7 +105,7 @@ class Sensor:
 STREAMS = {
     "wheels": FOUR, "gyro": ("yaw_rate",), "places": ("x", "y"), "commands": APPLIED,
 }  # fmt: skip
-"""Columns of a log that the messages of each kind fill."""
+"""The kinds of recorded messages, each with the columns of a log that its values fill."""
 
 
 class Sample(Struct, frozen=True):
@@ -169,7 +169,8 @@ class Recorder:
 def times(samples: Sequence[Sample]) -> Floats:
     """Return the times of samples on this computer's clock, s.
 
-    They come from the stamps (`on_arrival_clock`), or from the arrivals if any stamp is missing.
+    The times come from the stamps (`on_arrival_clock`). If any stamp is missing, they are the times
+    of arrival.
     """
     came = np.array([sample.came for sample in samples])
     made = np.array([math.nan if s.made is None else s.made for s in samples])
@@ -177,7 +178,7 @@ def times(samples: Sequence[Sample]) -> Floats:
 
 
 class RobotOnBus:
-    """Drives the robot one leg at a time, and records its sensors meanwhile."""
+    """Drives the robot one leg at a time, and records its sensors during each leg."""
 
     def __init__(self, client: Client, config: Config, prompt: Prompt) -> None:
         self._client, self._prompt = client, prompt
@@ -188,13 +189,13 @@ class RobotOnBus:
         self._watch = Watch(client, clock.steady_s())
 
     def gyro(self, key: str) -> None:
-        """Record the turn rates on `key` in each leg. Raises `GuideError` if none arrive."""
+        """Record the turn rates on `key` in each later leg. Raises `GuideError` if none arrive."""
         sensor = Sensor(self._client.session, self._full(key), (Imu,))
         sensor.await_first("a gyro's turn rate")
         self._sensors.append((sensor, "gyro"))
 
     def positions(self, key: str, session: zenoh.Session | None) -> None:
-        """Record the positions on `key` in each leg. Raises `GuideError` if none arrive.
+        """Record the positions on `key` in each later leg. Raises `GuideError` if none arrive.
 
         `session` is the Zenoh session that receives the positions. None means the session that also
         commands the robot.
@@ -227,7 +228,7 @@ class RobotOnBus:
             )
         if driver.halted:
             end = "" if driver.halted.endswith("?") else "."
-            text = f"{driver.halted}{end} The tool commanded zero, and writes no file"
+            text = f"{driver.halted}{end} The tool commanded zero speed, and writes no file"
             if driver.disturbed or (driver.silent and self._returns()):
                 raise DisturbedError(driver.halted, text)
             raise GuideError(text)

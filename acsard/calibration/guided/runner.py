@@ -38,10 +38,11 @@ MOST_SIMULATED_REPEATS = 20
 def begins_again(legs: Sequence[Leg], number: int, *, sensor: bool) -> int:
     """Return the index of the leg to drive next after the disturbed leg `number`.
 
-    If a sensor measures, this is the disturbed leg. Measurements by tape are relative to the place
-    where the person put the robot, so the drive then goes back to the last leg before which the
-    person placed the robot. The exception is a leg that needs only the robot's angle at its start
-    (`angle_before`): the person measures this angle again, and the drive repeats only that leg.
+    If `sensor` is true, a sensor measures the motion, and only the disturbed leg is repeated.
+    Otherwise a person measures by tape, relative to the place where the person put the robot. The
+    drive then returns to the last leg before which the person placed the robot. The exception is a
+    leg that needs only the robot's angle at its start (`angle_before`). The person measures this
+    angle again, and only that leg is repeated.
     """
     if sensor or angle_before(legs[number]):
         return number
@@ -51,7 +52,7 @@ def begins_again(legs: Sequence[Leg], number: int, *, sensor: bool) -> int:
 def angle_before(leg: Leg) -> str:
     """Return the name of the earlier leg after which a person measured the start angle of `leg`.
 
-    It is "" if `leg` needs no start angle, or if its measurements cover several legs.
+    Return "" if `leg` needs no start angle, or if its measurements cover several legs.
     """
     slants = [measure for measure in leg.measures if isinstance(measure, Slant)]
     return next((slant.since for slant in slants if slant.since and not slant.over), "")
@@ -65,7 +66,7 @@ def guide(
 
     Args:
         name: the name of the method, as in `METHODS`.
-        ride: the function that drives one leg and returns its recording.
+        ride: the function that drives one leg and returns the recording of this leg.
         simulated: whether the robot is the built-in simulator, which allows more repeats.
         true_positions: whether the recorded positions are the simulator's true ones.
 
@@ -78,15 +79,15 @@ def guide(
     method = METHODS[name]
     longest = method.longest_s(setup)
     prompt.say(
-        f"Calibration with {NEEDS[name]}. The robot drives for at most {longest:.0f} "
-        "s in all, in several legs. The robot repeats a leg that is disturbed. Stay near the "
-        "robot: any key stops the robot at once."
+        f"Calibration with {NEEDS[name]}. The robot drives for at most {longest:.0f} s in total, "
+        "in several legs. The robot repeats a leg that is disturbed. Stay near the robot: any key "
+        "stops the robot immediately."
     )
     rides: dict[str, Run] = {}
     answers: Answers = {}
     readings: dict[str, list[Reading]] = {}
-    # The legs are computed again after each leg: those that depend on the effective track come
-    # after the measurement that shows it.
+    # The legs are computed again after each leg, because a measurement may have changed `track`.
+    # The legs that depend on the effective track come after the measurement that shows it.
     track, number = 1.0, 0
     repeats: dict[str, int] = {}
     most = MOST_SIMULATED_REPEATS if simulated else MOST_REPEATS
@@ -104,7 +105,7 @@ def guide(
         again = begins_again(legs, number, sensor=not method.tool)
         back = "" if simulated else ": put the robot back where it stood when that leg began"
         prompt.say(
-            f"Leg {number + 1} was disturbed: {disturbed.why}. The drive goes on with leg "
+            f"Leg {number + 1} was disturbed: {disturbed.why}. The drive continues with leg "
             f"{again + 1}{back}."
         )
         if method.tool and again == number and (since := angle_before(leg)):

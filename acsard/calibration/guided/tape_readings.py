@@ -48,14 +48,14 @@ UNKNOWN = 1.0
 """Prior standard deviation of the mean wheel radius, as a fraction."""
 
 PRIOR_FREE = 4.0
-"""Degrees of freedom of the assumed noise.
+"""Degrees of freedom of the assumed noise of the readings.
 
-They are the weight of the assumed noise in a mean with the noise that the readings show.
+The fit averages the assumed noise with the noise that the readings show. This is its weight.
 """
 
 MOST_STEPS = 50
 SMALL = 1e-9
-"""If a step changes no parameter by more than this, the fit has converged."""
+"""If a step changes every parameter by less than this, the fit has converged."""
 
 WORST_CONDITION = 1e8
 """Largest condition number of normal equations from which the parameters can be computed."""
@@ -63,8 +63,7 @@ WORST_CONDITION = 1e8
 ACTIVE = [P.LEFT, P.RIGHT, P.INVERSE_TRACK, P.TRACK_GROWTH]
 
 PRECISE = 0.2
-"""Relative standard deviation below which a reading of a turn can give the parameters from which
-the fit starts."""
+"""Largest relative standard deviation of a reading of a turn from which the fit may start."""
 
 
 class Reading(Struct, frozen=True, dict=True):
@@ -82,7 +81,7 @@ class Reading(Struct, frozen=True, dict=True):
         return joined(self.rides)
 
     def residual(self, prediction: float) -> float:
-        """Return measured minus predicted value. For an `angle`, whole turns are removed."""
+        """Return the measured value minus `prediction`. For an `angle`, whole turns are removed."""
         off = self.value - prediction
         return math.remainder(off, 2 * math.pi) if self.quantity == "angle" else off
 
@@ -117,7 +116,7 @@ def joined(rides: Sequence[Run]) -> WheelSteps:
 
 
 def predicted(steps: WheelSteps, quantity: Quantity, base: Base, parameters: Floats) -> Predicted:
-    """Return the value of a reading of `quantity` that the wheels and these parameters predict."""
+    """Return the prediction of a reading of `quantity` from the wheels and these parameters."""
     driven = path(steps, base, parameters)
     rolled = base.radius * float(np.abs(steps.left).sum() + np.abs(steps.right).sum()) / 2
     derivatives = np.zeros(COUNT)
@@ -189,7 +188,7 @@ def _compared(
 
 
 def _solved(readings: Sequence[Reading], base: Base, start: Floats) -> tuple[Floats, Floats]:
-    """Return the parameters that fit the readings best, and the normal equations of this fit.
+    """Return a pair: the parameters that fit the readings best, and the matrix J^T W J of this fit.
 
     Raises `RefusedError` if the readings do not determine the parameters.
     """
@@ -296,7 +295,7 @@ def slant(near: float, far: float, apart: float) -> float:
         raise RefusedError(
             f"two points of the robot that are {apart * 1000:.0f} mm apart cannot be "
             f"{near * 1000:.0f} mm and {far * 1000:.0f} mm from the line or wall: start the "
-            "calibration again, and measure anew"
+            "calibration again, and measure again"
         )
     return math.asin(sine)
 
@@ -326,8 +325,8 @@ def calibrated(
     base = Base.of(drive)
     rides = list({id(ride): ride for reading in readings for ride in reading.rides}.values())
     fit = fit_readings(readings, base)
-    # The rows are not compared with a gyro, so the blocks only have to be short enough to show the
-    # turn rates.
+    # No gyro is compared with the rows, so the blocks only have to be short enough to show the turn
+    # rates.
     rows = heading.rows(None, rides, blocks(rides, 4.0))
     by_wheels = heading.turned(rows, base, fit.parameters)
     rate = rates(rows, by_wheels)
@@ -355,8 +354,8 @@ def calibrated(
 def _improvement(readings: Sequence[Reading], base: Base, fit: TapeFit, rate: Rates) -> Improvement:
     """Return the odometry errors with the configured and with the new parameters.
 
-    Each reading shows one error. The new parameters for this error come from a fit without the
-    reading, unless that fit fails.
+    Each reading shows one error. For the error with the new parameters, these come from a fit
+    without this reading. If that fit fails, they come from the fit to all readings.
     """
     sums = {name: np.zeros(3) for name in ("turn", "straight", "place")}
     present = fit.parameters.copy()
@@ -368,7 +367,7 @@ def _improvement(readings: Sequence[Reading], base: Base, fit: TapeFit, rate: Ra
         truth = fitted + fit.residuals[number]
         before = truth - predicted(steps, reading.quantity, base, present).value
         residual = fit.residuals[number] if np.isnan(fit.held_out[number]) else fit.held_out[number]
-        # The robot uses one track for all turn rates, unlike the fit.
+        # Unlike the fit, the robot uses one track for all turn rates.
         after = residual - (predicted(steps, reading.quantity, base, constant).value - fitted)
         turn = abs(predicted(steps, "turned", base, fit.parameters).value)
         if reading.quantity in ("turned", "angle"):

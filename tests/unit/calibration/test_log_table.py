@@ -183,8 +183,8 @@ def test_what_others_write_is_the_same_table(how: str) -> None:
 @each(
     ("data", "words"),
     [
-        (written(point=",").encode(), "write numbers with a point"),
-        (written(";").replace(".", "'").encode(), "write numbers with a point"),
+        (written(point=",").encode(), "write numbers with a decimal point"),
+        (written(";").replace(".", "'").encode(), "write numbers with a decimal point"),
         (written().replace("0.", "12:00:00.").encode(), "a date, but t must be in seconds"),
         (written(" ").encode(), "no commas between"),
         (written().replace("yaw_rate", "gyro_z").encode(), "the header must name yaw_rate"),

@@ -89,8 +89,8 @@ WRONG = {
         ("degrees, mm/s", True, False, "yaw_rate seems to be in degrees"),
         ("m/s, large", True, False, "wheel speeds are in m/s"),
         ("latitude", False, True, "latitude and longitude"),
-        ("another clock", True, False, "times of one clock"),
-        ("another clock", True, True, "times of one clock"),
+        ("another clock", True, False, "times from the same clock"),
+        ("another clock", True, True, "times from the same clock"),
         ("later", True, False, "does not follow the wheels"),
     ],
 )
@@ -196,7 +196,7 @@ def test_it_begins_near_the_truth(gyro: bool, places: bool) -> None:
 def test_sensors_of_another_time_are_refused() -> None:
     drive = usual()
     other = replace(drive, place_t=drive.place_t + 1000.0, gyro=np.zeros(0), gyro_t=np.zeros(0))
-    with pytest.raises(RefusedError, match="one clock"):
+    with pytest.raises(RefusedError, match="same clock"):
         ready(table(other, gyro=False))
 
 

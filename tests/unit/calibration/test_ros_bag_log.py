@@ -168,7 +168,7 @@ def test_a_few_messages_make_no_candidate() -> None:
 
 
 def test_odometry_that_is_computed_from_the_wheels_is_refused() -> None:
-    with pytest.raises(LogError, match=r"/odom .Odometry. turns exactly as the wheels do"):
+    with pytest.raises(LogError, match=r"/odom .Odometry. shows exactly the same turns as"):
         of(joint_states(SHORT), wheel_odometry(SHORT))
 
 
@@ -226,7 +226,9 @@ def test_a_tilted_pose_gives_the_yaw_of_its_quaternion() -> None:
 def test_an_imu_on_its_side_is_told_with_the_axis_that_follows_the_wheels(
     axis: int, sign: float, option: str
 ) -> None:
-    with pytest.raises(LogError, match=rf"z axis .* but its {'xyz'[axis]} axis .*={option}$"):
+    with pytest.raises(
+        LogError, match=rf"z axis .* but the rate about its {'xyz'[axis]} axis .*={option}$"
+    ):
         of(joint_states(SHORT), imu(SHORT, axis=axis, sign=sign))
     bag = of(joint_states(SHORT), imu(SHORT, axis=axis, sign=sign), axis=option)
     rate = bag.columns["yaw_rate"]

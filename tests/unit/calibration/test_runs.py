@@ -52,7 +52,7 @@ def test_runs_are_told_apart_by_their_column() -> None:
 def test_a_run_with_too_few_rows_is_left_out_and_told() -> None:
     names, _, notes = of(rows(0, run="a") + rows(0, 3, run="b"))
     assert names == ["a"]
-    assert any("fewer than 20 rows of wheel speeds are left out: 1 of" in note for note in notes)
+    assert any("fewer than 20 rows of wheel speeds: 1" in note for note in notes)
 
 
 def test_rows_without_a_time_are_reported() -> None:
@@ -177,7 +177,7 @@ def test_positions_of_half_the_rate_are_recognized_in_one_note_for_all_runs() ->
     assert [len(run.place) for run in log.runs] == [50, 55] * 6
     (note,) = log.notes
     assert note.startswith(
-        "x y repeat their last value between samples: such rows are left out, 570 of"
+        "the columns x y repeat their last value between samples: such rows are left out (570 of"
     )
 
 

@@ -80,7 +80,7 @@ def test_a_slow_robot_that_reverses_would_be_faulty_and_its_response_time_is_pro
     assert made.proposed is not None
     assert 1.0 < made.proposed < 3.0
     assert made.settings() == {"response_time": made.proposed}
-    assert "would take the wheels for faulty" in made.sentences()[0]
+    assert "would report a wheel fault" in made.sentences()[0]
     assert not found(REVERSING, 2.0, response_time=made.proposed).false_fault
 
 
@@ -103,7 +103,7 @@ def test_a_response_time_that_causes_no_fault_is_one_sentence() -> None:
     made = found(GUIDED, 0.05)
     assert made.settings() == {}
     (sentence,) = made.sentences()
-    assert "feedback.response_time is 0.2, and causes no fault in this log" in sentence
+    assert "feedback.response_time = 0.2 s differs, but causes no fault in this log" in sentence
     assert found(REVERSING, 2.0, fault_time=0.0).settings() == {}
 
 
@@ -125,6 +125,6 @@ def test_commands_of_another_drive_show_nothing() -> None:
 def test_the_calibration_writes_a_response_time_that_is_needed() -> None:
     made = calibrate(log([*GUIDED, *REVERSING], 2.0), DriveConfig())
     assert keys(made)["feedback.response_time"] > 1.0  # type: ignore[operator]
-    assert any("would take the wheels for faulty" in note for note in made.notes)
+    assert any("would report a wheel fault" in note for note in made.notes)
     sound = calibrate(log(GUIDED, 0.2), DriveConfig())
     assert "feedback.response_time" not in keys(sound)

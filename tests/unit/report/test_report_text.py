@@ -23,7 +23,7 @@ def test_the_summary_has_distance_speed_and_the_client_that_stopped_the_robot() 
 
 def test_the_summary_of_a_standing_robot_says_that_it_did_not_drive() -> None:
     report, _ = report_of(lambda world: world.run(0.5))
-    assert summary(report).startswith("The robot did not drive in these 0.5 s.")
+    assert summary(report).startswith("The robot did not drive in the recorded 0.5 s.")
 
 
 def test_a_fault_is_listed_with_its_time_and_its_text() -> None:

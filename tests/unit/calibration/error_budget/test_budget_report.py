@@ -97,13 +97,13 @@ def test_the_track_that_a_gyro_implies_stands_beside_the_configured_one(still: b
     found = of(KNOWN, learned=1.7, learned_std=0.05, multiplier=1.5, still=still)
     told = " ".join(text(found).split())
     assert (
-        "multiplier would be 1.700 (standard deviation 0.050). Odometry uses the configured value,"
+        "multiplier should be 1.700 (standard deviation 0.050). Odometry uses the configured value,"
         in told
     )
     assert "value, 1.500. If the two values differ" in told
-    assert "would be" not in text(of(KNOWN, still=still))
+    assert "should be" not in text(of(KNOWN, still=still))
     told = " ".join(text(replace(found, learned_used=True)).split())
-    assert "multiplier is 1.700 (standard deviation 0.050). Odometry uses this value" in told
+    assert "multiplier should be 1.700 (standard deviation 0.050). Odometry uses this value" in told
     assert "the configured value is 1.500." in told
 
 

@@ -144,7 +144,7 @@ def talk(way: str) -> Talk:
 def test_a_person_reads_what_is_needed_and_how_long_each_leg_takes(way: str) -> None:
     first, *legs = talk(way).shown
     assert first.startswith(f"Calibration with {NEEDS[way]}. The robot drives for at most ")
-    assert f" {METHODS[way].longest_s(usual_setup()):.0f} s in all, in several legs." in first
+    assert f" {METHODS[way].longest_s(usual_setup()):.0f} s in total, in several legs." in first
     assert [text.split(".")[0] for text in legs] == [str(n + 1) for n in range(len(legs))]
     assert all(text.endswith(" s)") for text in legs)
 

@@ -137,7 +137,7 @@ def test_two_distances_from_a_line_are_an_angle(angle: float, apart: float) -> N
 
 
 def test_distances_that_no_robot_can_have_are_refused() -> None:
-    with pytest.raises(RefusedError, match="measure anew"):
+    with pytest.raises(RefusedError, match="measure again"):
         slant(0.1, 0.5, 0.25)
 
 
