@@ -1,8 +1,8 @@
 """Decides whether an HTTP request reaches its handler.
 
-The checks, in this order: whether the client is on the robot (`callers.py`), the origin of the web
-page that sent the request, the token, the request rate, the role. A path that does not exist
-requires a token too, so a client without one does not learn which paths exist.
+It checks, in this order, whether the client is on the robot (`callers.py`), the origin of the web
+page that sent the request, the token, the request rate, and the role. A path that does not exist
+requires a token too, so a client without a token does not learn which paths exist.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class Lookups:
         self._read_s = -READ_EVERY_S
 
     async def read(self) -> Sequence[Token]:
-        """Return the robot's tokens, read from the file after this call.
+        """Return the robot's tokens from a read of the token file that starts after this call.
 
         Raises `TimeoutError` if the disk does not answer.
         """
@@ -103,7 +103,10 @@ class Admission:
         counts: Counts,
         rules: WebConfig,
     ) -> None:
-        """Store the arguments. `names` are the robot's host names and addresses, in lower case."""
+        """Create the checks for the page of the robot with the id `robot`.
+
+        `names` are the robot's host names and addresses, in lower case.
+        """
         self._local, self._origins = Who(rules.local, HERE), frozenset(rules.origins)
         self._robot, self._names, self._vault = robot, names, vault
         self._acceptor, self._counts = acceptor, counts
@@ -208,9 +211,9 @@ class Admission:
         if request.method not in ("GET", "HEAD") if is_open else not listed:
             require_own_origin(said)
         if is_open:
-            # A browser loads the files of the page over several connections. If these show a valid
-            # token, they must not be closed to make room for others before the browser requests a
-            # row that needs the token.
+            # A browser loads the files of the page over several connections before it requests a
+            # path that needs a token. If such a connection shows a valid token already, this is
+            # recorded, so that the connection is not closed to make room for another one.
             shown = [] if here else tokens_shown(request, self._robot)
             if who := next(filter(None, map(self._vault.known, shown)), None):
                 self._acceptor.admitted(request.transport, who)

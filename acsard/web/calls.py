@@ -64,9 +64,10 @@ class Calls:
         ends: Callable[[], Awaitable[Ending]],
         sees: Callable[[str], bool],
     ) -> None:
-        """Store the arguments.
+        """Create the limits, with no call running.
 
-        `ends` interrupts a running check or calibration, and `sees(id)` tells if a robot is known.
+        `ends` interrupts a running check or calibration. `sees(id)` returns whether the robot with
+        this id is known to the server.
         """
         self._robots, self._ends, self._sees = robots, ends, sees
         self._stops, self._merged = Stops(), Merged()
@@ -126,7 +127,7 @@ class Calls:
         return reply
 
     async def get(self, robot: str, name: str) -> tuple[str, bytes]:
-        """Query the last value of a robot's key as JSON; return its encoding and its payload.
+        """Query the last value of a robot's key as JSON; return the pair (encoding, payload).
 
         Raises `MendableError` if there is no connection, if no answer arrives, or if `AT_ONCE`
         requests are running already.

@@ -64,7 +64,7 @@ class Wanted(Struct, frozen=True):
 
 
 async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], log: Log) -> None:
-    """Serve until a signal arrives or the daemon that started this server ends.
+    """Run the page's server until a signal arrives, or until the daemon that started it ends.
 
     `announce` is called with the bound addresses. Raises `MendableError`.
     """
@@ -213,12 +213,12 @@ def _names(directory: str) -> set[str]:
 async def _renew(
     context: ssl.SSLContext, names: set[str], files: CertificateFiles, directory: str, log: Log
 ) -> None:
-    """Use changed certificate files for later connections, and add their names to `names`."""
+    """Use changed certificate files for later connections, and add the new names to `names`."""
     while True:
         await asyncio.sleep(TIDY_S)
         if not files.renewed():
             continue
-        # If the files change again while they are read, the next round finds the new ones.
+        # If the files change while they are read, the next round reads them again.
         with suppress(OSError, ValueError):
             _load(context, directory)
             names |= _names(directory)
