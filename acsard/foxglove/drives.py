@@ -102,7 +102,7 @@ class Drives:
     def advertised(
         self, client: int, channel: int, topic: str, encoding: str, schema_name: str
     ) -> None:
-        """Register a viewer's channel. If the channel cannot drive, `came` reports the reason."""
+        """Register a viewer's channel. If it cannot drive, `came` reports the reason later."""
         found, problem = "", ""
         if topic != self.topic:
             problem = f"no program listens on {topic}: send commands to {self.topic} instead"
@@ -119,7 +119,8 @@ class Drives:
                 viewer.channels[channel] = found, problem
 
     def came(self, client: int, channel: int, data: bytes) -> None:
-        """Queue the command in a message of a viewer, or tell the viewers why it is refused."""
+        """Queue the command in a viewer's message, or tell the viewers why the command is
+        refused."""
         viewer = self._viewers.get(client)
         encoding, problem = viewer.channels.get(channel, ("", "")) if viewer else ("", "")
         if viewer is None or not encoding:
@@ -150,7 +151,7 @@ class Drives:
             )
 
     def withdrawn(self, client: int, channel: int) -> None:
-        """Remove a channel. Send a zero command if the robot may still follow this viewer."""
+        """Remove a channel. Send a zero command if the viewer may still be driving the robot."""
         with self._lock:
             viewer = self._viewers.get(client)
             if viewer is None:
@@ -176,7 +177,7 @@ class Drives:
             for viewer in self._viewers.values():
                 self.outbox.release(viewer.commander, self.timeout_s)
             self._viewers.clear()
-        self.outbox.end(0.5)  # the final zeros normally take a few ms
+        self.outbox.end(0.5)  # sending the final zeros normally takes a few ms
 
     # The sending thread runs the method below.
 

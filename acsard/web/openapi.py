@@ -190,7 +190,7 @@ def _flat(node: Any, before: str) -> Any:
 
 
 def _components(kinds: Iterable[Any]) -> tuple[Described, Refs]:
-    """Return a pair: the schemas of `kinds` and their nested types, and a reference to each type."""
+    """Return a pair: the schemas of `kinds` and their nested types, and a reference per kind."""
     # In one call, msgspec gives different names to two types that have the same name.
     unique = list(dict.fromkeys(kinds))
     refs, parts = msgspec.json.schema_components(
