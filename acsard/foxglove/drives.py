@@ -27,7 +27,7 @@ from acsard.foxglove.notices import Notices
 from acsard.host import clock
 
 SLOW_NS, SLOW_TIMES = 5 * NS_PER_S // 2, 3
-"""A panel publishes too seldom if `SLOW_TIMES` messages in a row each come after a silence of more
+"""A panel publishes too rarely if `SLOW_TIMES` messages in a row each come after a silence of more
 than `commander.SILENCE_NS` (0.3 s) and at most `SLOW_NS` (2.5 s)."""
 
 _receiver = Receiver(JointsConfig(), Kinematics(DriveConfig()))
@@ -73,7 +73,7 @@ class Viewer:
         self._slow = 0
 
     def is_slow(self, silence_ns: int | None) -> bool:
-        """Return whether the panel publishes so seldom that the robot stops between its messages.
+        """Return whether the panel publishes so rarely that the robot stops between the messages.
 
         Call this for each message. `silence_ns` is the time since the previous message, ns. It is
         None if that time is at most `commander.SILENCE_NS`, and for the first message.

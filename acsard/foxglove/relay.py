@@ -129,7 +129,8 @@ class Commanders:
     def follow(self, topics: Collection[str]) -> None:
         """Subscribe to the commands of `topics` only.
 
-        A client over TLS may not receive the commands of other clients, so it subscribes to none.
+        If this program is connected over TLS, it may not receive the commands of other clients and
+        subscribes to none.
         """
         wanted = set() if self._deaf else self._ways.keys() & set(topics)
         for topic in self._heard.keys() - wanted:
@@ -183,7 +184,7 @@ class _Heard:
         self._box.put((arrival, now.wall_ns))
 
     def take(self) -> list[tuple[Arrival, int]]:
-        """Return (command, wall-clock arrival time in ns) for each command since the last call."""
+        """Return the commands since the last call as pairs (command, wall-clock arrival time, ns)."""
         return self._box.take()
 
     def undeclare(self) -> None:
@@ -251,7 +252,7 @@ class Relay:
             if out.key == EVENTS:
                 self._robot.ask(EVENTS, self._followed[EVENTS].add)
             elif out.key in ("tf_static", "diagnostics", "state") and out.last:
-                # These keys are published seldom, so a new viewer receives the last message.
+                # These keys are published rarely, so a new viewer receives the last message.
                 out.channel.log(out.last)
         for key in keys - self._followed.keys():
             self._followed[key] = self._subscribed(key)

@@ -122,7 +122,7 @@ class Settings:
     def set(self, wishes: dict[str, Any]) -> dict[str, Any]:
         """Queue a change of these settings, and return their present values.
 
-        `refresh` makes the change. A notice tells all viewers whether it succeeded.
+        `refresh` makes the change, and a notice tells all viewers whether the change succeeded.
         """
         with self._lock:
             full = len(self._wishes.waiting) >= WISHES
@@ -135,7 +135,7 @@ class Settings:
             return asked(self._known, wishes.keys()) if wishes else {}
 
     def _change(self, wishes: dict[str, Any]) -> dict[str, Any]:
-        """Change all of these settings or none, and return the settings whose values have changed.
+        """Change all settings in `wishes` or none; return the settings whose values have changed.
 
         The result also contains the settings in `wishes`, because a viewer may show the wished
         values even if the change has failed.

@@ -202,8 +202,8 @@ class JsonPrompt:
     def offer(self, config: str | None, keys: Mapping[str, object], trouble: str = "") -> bool:
         """Offer to write these keys into the configuration file; return whether they were written.
 
-        `config` is the path of the file, or None to search for it. The question is asked only if
-        the file can be changed and `trouble`, a reason not to write, is "".
+        `config` is the path of the file, or None to search for it. `trouble` is a reason not to
+        write, or "". If there is a reason, or if the file cannot be changed, say so and do not ask.
         """
         try:
             if trouble:

@@ -97,7 +97,7 @@ class Prompt(Protocol):
         """
 
     def keys(self, wait_s: float) -> str:
-        """Wait up to `wait_s` s for a key press, and return the pressed keys; "" if none."""
+        """Wait up to `wait_s` s for a key press; return the pressed keys, or "" if none."""
 
 
 SIGNALS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP

@@ -57,7 +57,7 @@ def motion(state: RobotState, width: int) -> list[Text]:
 
 
 def sources(state: RobotState, room: int, width: int) -> list[Text]:
-    """Return lines with each source's priority, the age of its last command, and what it waits for.
+    """Return lines about each source: priority, age of the last command, and what it waits for.
 
     If the sources need more than about `room` lines, the last line names the other sources.
     """

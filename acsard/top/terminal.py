@@ -1,6 +1,7 @@
 """Shows the screens of the commands `acsard top`, `acsard fleet` and `acsard drive`.
 
-A signal or the end of the input ends every screen. The letter `q` ends those of `top` and `fleet`.
+A signal or the end of the input ends each screen. The letter `q` ends the screens of `top` and
+`fleet`.
 If the terminal cannot show a screen, `acsard drive` prints lines instead.
 """
 

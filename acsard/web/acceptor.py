@@ -304,7 +304,7 @@ class _Connection(asyncio.Protocol):
             self._acceptor.wait(self)
 
     def start(self) -> None:
-        """Start the TLS handshake; for plain HTTP, open the connection at once."""
+        """Start the TLS handshake, or for plain HTTP open the connection."""
         self._task = self._loop.create_task(self._open())
 
     async def _open(self) -> None:

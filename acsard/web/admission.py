@@ -159,7 +159,7 @@ class Admission:
                 await self._pace_stranger(request)
                 return self._preflight(request)
             waits = await self._admit(request, self._rows.get(request.match_info.route))
-            # For a POST, only the answer is delayed, so a stop is sent to the robot at once.
+            # For a POST, only the answer is delayed, so the server sends a stop without delay.
             if waits and request.method != "POST":
                 await asyncio.sleep(HOLD_S)
             answer = await handler(request)
@@ -192,17 +192,19 @@ class Admission:
             return problem(error.status, WORDS.get(error.status, error.reason))
 
     async def _pace_stranger(self, request: web.Request) -> None:
-        """Delay a request without a valid token by `HOLD_S` if it exceeds the rate `STRANGERS`.
+        """Delay a request without a valid token by `HOLD_S` if it exceeds the limit `STRANGERS`.
 
-        The rate is for all such requests from the client's network.
+        The limit applies to all requests without a valid token from the client's network.
         """
         if not self._strangers.take(network_of(peer_of(request)), clock.mono_ns()):
             await asyncio.sleep(HOLD_S)
 
     async def _admit(self, request: web.Request, row: Route | None) -> bool:
-        """Store the client's identity in the request; return whether it exceeds its rate limit.
+        """Store the client's identity in the request; return whether the request must be delayed.
 
-        `row` is None for an unknown path. Raises `RefusedError` if the client may not use the path.
+        It must be delayed if the client exceeds the rate limit of a path whose requests wait. `row`
+        is the route of the path, or None for an unknown path. Raises `RefusedError` if the client
+        may not use the path.
         """
         said = asked_of(request)
         here = place(said, self._names | {own_address(request)}) == "here"
@@ -302,12 +304,12 @@ def own_port(request: web.Request) -> int:
 
 
 def tokens_shown(request: web.Request, robot: str) -> list[str]:
-    """Return the tokens from `tokens_sent()`, or else those in the cookies for the robot's id."""
+    """Return the tokens from `tokens_sent()`. If there are none, return those in the cookies."""
     return tokens_sent(request) or tokens_in(request.cookies, robot, own_port(request))
 
 
 def tokens_sent(request: web.Request) -> list[str]:
-    """Return the token in the header `Authorization`, or else those in `Sec-WebSocket-Protocol`."""
+    """Return the token in `Authorization`. If there is none, use `Sec-WebSocket-Protocol`."""
     kind, _, text = request.headers.get("Authorization", "").partition(" ")
     if kind.lower() == "bearer":
         return [text.strip()]

@@ -95,7 +95,7 @@ class Setting(Struct, frozen=True, omit_defaults=True):
 
 
 class Page:
-    """The web application of the robot's page: its request handlers and their common state."""
+    """The web application of the robot's page: the request handlers and the data they share."""
 
     def __init__(
         self,

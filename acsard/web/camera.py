@@ -1,4 +1,4 @@
-"""The newest picture of a camera's MJPEG stream, for the clients of the page.
+"""Fetches the newest picture of a camera's MJPEG stream for the clients of the page.
 
 Another program (ustreamer, go2rtc, mjpg-streamer) serves the stream. One connection reads the
 stream while clients ask for pictures. Only the newest picture is kept, so a client with a slow

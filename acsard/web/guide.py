@@ -172,7 +172,7 @@ class Guide:
     def heard(self, viewer: object) -> None:
         """Send a sign of life to the child that the viewer started.
 
-        While the robot may move, the child ends if such signs stop.
+        While the robot may move, the child ends if no sign of life arrives for some time.
         """
         if (errand := self._of(viewer)) is not None:
             errand.relay()
@@ -341,7 +341,7 @@ class _Errand:
             self._interrupt()
 
     def kill(self) -> None:
-        """Kill the child at once, without letting it send zero speeds."""
+        """Kill the child without letting it send zero speeds."""
         if self._process is not None and self._process.returncode is None:
             self._process.kill()
 

@@ -104,7 +104,7 @@ def sockets_for(files: int) -> int:
 
 
 class Sockets(Generic[C]):
-    """The open TCP connections. When all places are taken, a new connection displaces an old one.
+    """The open TCP connections. When all places are taken, a new connection displaces an older one.
 
     1. The network with the most connections without a valid token loses the oldest of these.
     2. If every connection has shown a valid token, the token with the most connections loses its

@@ -69,7 +69,7 @@ def _path() -> Track:
 
 
 class _Asking:
-    """The bus client of a `Watch`. Queries run in threads and do not block the event loop."""
+    """The bus client that a `Watch` uses. Queries run in threads, so they do not block the loop."""
 
     def __init__(self, client: Client) -> None:
         self.subscribe, self._client = client.subscribe, client

@@ -70,7 +70,7 @@ class Route(Struct, frozen=True):
     summary: str = ""
     """Description for the OpenAPI document; "" leaves the row out of it."""
     takes: type | str | None = None
-    """Type of the request's body, or the name of a bus message in `SCHEMAS`; None without a
+    """Type of the request's body, or the name of a bus message in `SCHEMAS`; None if there is no
     body."""
     forms: tuple[str, ...] = (JSON,)
     """Media types of the request's body."""

@@ -187,9 +187,10 @@ def _about(wanted: Wanted) -> About:
 
 
 def _certified(wanted: Wanted) -> tuple[ssl.SSLContext | None, set[str]]:
-    """Return the TLS context, and the host names by which other machines reach this one.
+    """Return a pair: the TLS context, and the host names by which other machines reach this one.
 
-    Without HTTPS, return None and an empty set. Raises `MendableError` for a bad certificate.
+    If no address uses HTTPS, return None and an empty set. Raises `MendableError` for a bad
+    certificate.
     """
     if not any(one.secure for one in wanted.listen):
         return None, set()
@@ -205,7 +206,7 @@ def _load(context: ssl.SSLContext, directory: str) -> None:
 
 
 def _names(directory: str) -> set[str]:
-    """Return this machine's names and those in its certificate, without loopback names."""
+    """Return the names of this machine and the names in its certificate, without loopback names."""
     names = {socket.gethostname().lower(), own_name(), *map(str.lower, names_in(directory))}
     return {one for one in names if one != "localhost" and not is_loopback(one)}
 

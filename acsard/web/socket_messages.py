@@ -118,7 +118,7 @@ class Call(_Frame, frozen=True):
 
 
 class Ping(_Frame, frozen=True):
-    """Ask the server for a pong with the same number."""
+    """Ask the server to send a pong with the number of this ping."""
 
     ping: float
 
@@ -211,7 +211,7 @@ class Greeting(Struct, frozen=True):
     """The actions that the client's role does not allow, each with the reason in words. An action
     is the name of a service, "drive", "recordings" or "begin" (a check or calibration)."""
     camera: bool
-    """Whether `GET /api/camera` has pictures."""
+    """True if a camera is configured, whose pictures `GET /api/camera` returns."""
 
 
 class Hello(Struct, frozen=True):

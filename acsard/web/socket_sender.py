@@ -122,7 +122,7 @@ class Outgoing:
             await self._socket.send_frame(said, aiohttp.WSMsgType.CLOSE)
 
     def cut(self) -> None:
-        """End the connection at once, without a reason."""
+        """End the connection without telling the client the reason."""
         self._closing = True
         cut(self._transport)
 
@@ -223,7 +223,7 @@ class Keys:
             )
         elif robot != self._robots.id and not self._shares.enter(self._holder, (robot, key)):
             text = (
-                f"one token may follow at most {STREAMS_OF_ONE} keys of other robots at once, "
+                f"one token may follow at most {STREAMS_OF_ONE} keys of other robots, "
                 f"and all tokens together at most {STREAMS}"
             )
             self._out.refuse("subscribe", "too_many", f"{text}: unsubscribe from some")

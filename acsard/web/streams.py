@@ -32,8 +32,8 @@ KEYS = frozenset(topic.key for topic in FOLLOWED)
 DECLARE_S = 3.0
 
 STATE = "state"
-"""Key of a robot's state. For other robots than the page's own, the server does not query this key,
-because a router's storage would answer with an old state even if the robot has been off for a
+"""Key of a robot's state. The server queries this key only of the page's own robot. For another
+robot, a router's storage would answer with an old state even if that robot has been off for a
 week."""
 
 UNREADY = (TimeoutError, zenoh.ZError, UsageError)
