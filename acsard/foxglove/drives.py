@@ -69,7 +69,7 @@ class Viewer:
     def __init__(self, robot: Client) -> None:
         self.robot, self.commander = robot, Commander(leads=True, gathers=True)
         self.channels: dict[int, tuple[str, str]] = {}
-        """Maps a channel's id to (Zenoh encoding, ""), or to ("", reason why it cannot drive)."""
+        """Maps a channel's id to (Zenoh encoding, ""), or to ("", reason) if it cannot drive."""
         self._slow = 0
 
     def is_slow(self, silence_ns: int | None) -> bool:

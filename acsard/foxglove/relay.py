@@ -184,7 +184,7 @@ class _Heard:
         self._box.put((arrival, now.wall_ns))
 
     def take(self) -> list[tuple[Arrival, int]]:
-        """Return the commands since the last call as pairs (command, wall-clock arrival time, ns)."""
+        """Return the commands since the last call as pairs (command, wall-clock arrival in ns)."""
         return self._box.take()
 
     def undeclare(self) -> None:

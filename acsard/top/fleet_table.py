@@ -118,7 +118,7 @@ def _why(state: RobotState) -> str:
 
 
 def _place(state: RobotState) -> str:
-    """Return x and y in m and the heading in degrees."""
+    """Return the pose as text: x and y in m, and the heading in degrees."""
     figures = (state.x, 1), (state.y, 1), (math.degrees(state.yaw), 0)
     return " ".join(signed(value, decimals, 7).strip() for value, decimals in figures) + "°"
 

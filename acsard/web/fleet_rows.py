@@ -54,7 +54,7 @@ class Fleet:
         self._tidy()
 
     def rows(self) -> list[Row]:
-        """Return one row per robot, sorted by id, and start any due query in the background."""
+        """Return one row per robot, sorted by id, and start due queries in the background."""
         self._look()
         rows = [] if self._tracked is None else self._tracked.rows()
         return [_row(one) for one in sorted(rows, key=lambda one: one.robot_id)]

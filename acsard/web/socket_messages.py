@@ -221,7 +221,7 @@ class Hello(Struct, frozen=True):
 
 
 class DrivenPath(Struct, frozen=True):
-    """Path of the robot in the last ten minutes: m in the odom frame, oldest first."""
+    """Points (x, y) of the robot's path in the last ten minutes, m, odom frame, oldest first."""
 
     path: Sequence[Point]
     truth: Sequence[Point]
