@@ -297,7 +297,7 @@ class JsonPrompt:
         try:
             said = self._lines.decode(line)
         except (msgspec.MsgspecError, ValueError, RecursionError):
-            # The question stays open.
+            # The line answers nothing, so the question stays open.
             return
         with self._news:
             if said.key:

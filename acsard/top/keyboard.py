@@ -116,7 +116,7 @@ class Ride:
         # stopped and cleared during the silence.
         self._commander = Commander(leads=True)
         self._watch = Watch(robot, clock.steady_s())
-        # Subscribing may take long. The terminal discards the keys that are typed before the end.
+        # Subscribing may take long. The terminal discards the keys that are typed until it is done.
         self._fine = self._stepped = clock.steady_s()
 
     def step(self, typed: str) -> None:

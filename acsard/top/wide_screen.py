@@ -190,9 +190,9 @@ def certificate(state: RobotState) -> Text:
 
 def rates(seen: ScreenData, state: RobotState, before: RobotState) -> Callable[[str], str]:
     """Return a function that maps a counter's name to a text with the counter's rate and total."""
-    # The stamps of the states give the exact time between the states. If it differs from the time
-    # between the arrivals by more than a network's delay, the robot's clock was set, so use the
-    # latter.
+    # The stamps give the exact time between the two states. If it differs from the time between the
+    # arrivals of the states by more than a network's delay, the robot's clock was set, so use the
+    # time between the arrivals.
     seconds = (state.stamp.to_ns() - before.stamp.to_ns()) / NS_PER_S
     if abs(seconds - seen.passed) > 0.2:
         seconds = seen.passed

@@ -139,7 +139,7 @@ class Acceptor:
             loop.add_reader(opened, self._accept, opened, secure, make)
 
     def _accept(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
-        # After this number of connections, other work of the event loop has its turn.
+        # Accept at most 32 connections in a row, so that other work of the event loop has its turn.
         for _ in range(32):
             try:
                 accepted, place = opened.accept()
@@ -217,7 +217,7 @@ class Acceptor:
             one = next(iter(same))
             del same[one]
             if same:
-                self._waiting[network] = same  # after all other networks
+                self._waiting[network] = same  # behind all other networks
             self._starting[one] = loop.time()
             one.start()
         # A handshake occupies the event loop for 1 to 2 ms. The pause between the handshakes lets

@@ -101,8 +101,8 @@ class BlackBox:
         old = now_ns - self._listed_ns > LISTED_NS
         if self._listing is None or (old and self._listing.done()):
             self._listing = asyncio.ensure_future(in_thread(lambda: rows(place), READ_S))
-            # Read the error, because all clients may be gone by then. asyncio logs an error that
-            # nothing has read.
+            # Read the error here too, because all clients may be gone by then. asyncio would log an
+            # error that nothing has read.
             self._listing.add_done_callback(
                 lambda listing: listing.cancelled() or listing.exception()
             )
