@@ -1,4 +1,4 @@
-"""Adds the commit of the source to a wheel. hatchling runs this file when it builds one."""
+"""Adds the git commit of the source to a wheel. hatchling runs this file when it builds a wheel."""
 
 import sys
 from pathlib import Path
@@ -8,10 +8,13 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 
 class CustomBuildHook(BuildHookInterface):
-    """Writes the commit of the clone beside the package, if the source is a clone of git."""
+    """Writes the commit into a file of the package, if the source is a git clone."""
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Add the file. An editable installation has none: it reads its clone when it starts."""
+        """Add the file with the commit to the wheel.
+
+        An editable installation gets no file, because acsard then reads the commit from the clone.
+        """
         sys.path.insert(0, self.root)
         from acsard.host.version import COMMIT_FILE, commit_of
 

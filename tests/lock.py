@@ -35,7 +35,7 @@ Debian 12 has glibc 2.36, which runs wheels for 2.36 and for all earlier version
 """
 
 HEAD = """\
-# What the service is built with and runs on, for Python 3.11 to 3.13 on x86_64 and aarch64:
+# The packages that build and run the service, for Python 3.11 to 3.13 on x86_64 and aarch64:
 #
 #     pip install -r requirements.lock
 #

@@ -1,4 +1,4 @@
-"""Connects a robot to Foxglove viewers, by a main loop that runs on one thread."""
+"""Connects a robot to Foxglove viewers. The main loop of the bridge runs on one thread."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from acsard.foxglove.server import (
 from acsard.host import clock
 
 GONE = "daemon"
-"""Id of the status message that tells the viewers that the daemon is gone."""
+"""Id of the status message by which viewers learn that the daemon is gone."""
 
 
 class Bridge:
@@ -75,13 +75,14 @@ class Bridge:
         self._token = robot.session.liveliness().declare_subscriber(key, self._alive, history=True)
 
     def run(self) -> None:
-        """Run the main loop until `end` is called. Raises an error of the sending thread."""
+        """Run the main loop until `end` is called. Raises the error that ended the sender
+        thread."""
         dead = self._drives.outbox.dead
         while not self._ended.is_set():
             if dead.done():
                 dead.result()
             self._wake.wait(0.5)
-            # Let messages gather before a round, which makes the rounds a third cheaper. The pause
+            # Collect messages before a round, which saves a third of the processor time. The pause
             # is shorter than one frame at 60 Hz. Commands do not wait for this loop.
             time.sleep(0.015)
             self._wake.clear()
@@ -162,7 +163,7 @@ class Bridge:
                 self._watch.look(now)
 
     def _object(self, driving: dict[int, Client]) -> None:
-        """Tell all viewers why the robot does not follow a viewer that requests a speed."""
+        """Tell all viewers why the robot does not obey a viewer that requests a speed."""
         now_ns = clock.steady_ns()
         for client in driving.keys() - self._objections.keys():
             self._objections[client] = Objections()

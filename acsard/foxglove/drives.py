@@ -27,7 +27,7 @@ from acsard.foxglove.notices import Notices
 from acsard.host import clock
 
 SLOW_NS, SLOW_TIMES = 5 * NS_PER_S // 2, 3
-"""A panel publishes too seldom if `SLOW_TIMES` messages in a row each come after a silence of more
+"""A panel publishes too rarely if `SLOW_TIMES` messages in a row each come after a silence of more
 than `commander.SILENCE_NS` (0.3 s) and at most `SLOW_NS` (2.5 s)."""
 
 _receiver = Receiver(JointsConfig(), Kinematics(DriveConfig()))
@@ -69,11 +69,11 @@ class Viewer:
     def __init__(self, robot: Client) -> None:
         self.robot, self.commander = robot, Commander(leads=True, gathers=True)
         self.channels: dict[int, tuple[str, str]] = {}
-        """Maps a channel's id to (Zenoh encoding, ""), or to ("", reason why it cannot drive)."""
+        """Maps a channel's id to (Zenoh encoding, ""), or to ("", reason) if it cannot drive."""
         self._slow = 0
 
     def is_slow(self, silence_ns: int | None) -> bool:
-        """Return whether the panel publishes so seldom that the robot stops between its messages.
+        """Return whether the panel publishes so rarely that the robot stops between the messages.
 
         Call this for each message. `silence_ns` is the time since the previous message, ns. It is
         None if that time is at most `commander.SILENCE_NS`, and for the first message.
@@ -102,7 +102,7 @@ class Drives:
     def advertised(
         self, client: int, channel: int, topic: str, encoding: str, schema_name: str
     ) -> None:
-        """Register a viewer's channel. If the channel cannot drive, `came` reports the reason."""
+        """Register a viewer's channel. If it cannot drive, `came` reports the reason later."""
         found, problem = "", ""
         if topic != self.topic:
             problem = f"no program listens on {topic}: send commands to {self.topic} instead"
@@ -119,7 +119,8 @@ class Drives:
                 viewer.channels[channel] = found, problem
 
     def came(self, client: int, channel: int, data: bytes) -> None:
-        """Queue the command in a message of a viewer, or tell the viewers why it is refused."""
+        """Queue the command in a viewer's message, or tell the viewers why the command is
+        refused."""
         viewer = self._viewers.get(client)
         encoding, problem = viewer.channels.get(channel, ("", "")) if viewer else ("", "")
         if viewer is None or not encoding:
@@ -150,7 +151,7 @@ class Drives:
             )
 
     def withdrawn(self, client: int, channel: int) -> None:
-        """Remove a channel. Send a zero command if the robot may still follow this viewer."""
+        """Remove a channel. Send a zero command if the viewer may still be driving the robot."""
         with self._lock:
             viewer = self._viewers.get(client)
             if viewer is None:
@@ -176,7 +177,7 @@ class Drives:
             for viewer in self._viewers.values():
                 self.outbox.release(viewer.commander, self.timeout_s)
             self._viewers.clear()
-        self.outbox.end(0.5)  # the final zeros normally take a few ms
+        self.outbox.end(0.5)  # sending the final zeros normally takes a few ms
 
     # The sending thread runs the method below.
 

@@ -24,7 +24,7 @@ STATUS: dict[Level, StatusLevel] = {
 }
 
 AGAIN = Rate(0.5)
-"""Limit on the rate of notices with the same text: one in two seconds."""
+"""Limit on the rate of notices with the same text: one per two seconds."""
 
 WAITING = 100
 """Maximum number of notices that wait to be sent. If there are more, the oldest are dropped."""
@@ -33,7 +33,8 @@ WAITING = 100
 class Notice(Struct, frozen=True):
     """A message to the viewers.
 
-    With an id in `stays`, the viewers show it until a notice has this id and an empty `text`.
+    If `stays` is an id, the viewers show the message until a later notice has the same id and an
+    empty `text`.
     """
 
     level: Level
@@ -55,8 +56,8 @@ class Notices:
     def say(self, level: Level, name: str, text: str, stays: str = "") -> None:
         """Queue a message to all viewers; `name` is its subject on the topic `log`.
 
-        With an id in `stays`, the viewers show the message until `over` is called with this id.
-        Without an id, a text that repeats too soon (`AGAIN`) is dropped.
+        If `stays` is an id, the viewers show the message until `over` is called with this id. If it
+        is "", the message is dropped if its text was queued already within the limit `AGAIN`.
         """
         now_ns = clock.mono_ns()
         with self._lock:
@@ -90,18 +91,18 @@ class Notices:
 
 
 class Objections:
-    """Decides when to report why the robot does not follow a viewer. The class is pure."""
+    """Decides when to report why the robot does not obey a viewer. The class is pure."""
 
     def __init__(self) -> None:
         self._since_ns: int | None = None
         self.told = ""
-        """The reported reason why the robot does not follow, in words; "" if there is none."""
+        """The reported reason why the robot does not obey, in words; "" if none is reported."""
 
     def look(self, objection: str, now_ns: int) -> bool:
-        """Update `told`, and return whether it has changed.
+        """Update the reported reason `told`, and return whether it has changed.
 
-        `objection` is the present reason, "" if the robot follows. It is copied to `told` once the
-        robot has not followed for `GRACE_S`.
+        `objection` is the present reason why the robot does not obey, or "" if it obeys. The reason
+        is reported when the robot has not obeyed for `GRACE_S`.
         """
         if not objection:
             self._since_ns = None

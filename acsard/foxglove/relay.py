@@ -1,7 +1,7 @@
 """Forwards messages from the bus to the Foxglove viewers.
 
-The relay subscribes only to topics that a viewer looks at, so any other topic costs no time here or
-in the daemon. If messages arrive faster than they can be forwarded, the oldest are dropped.
+The relay subscribes only to topics that a viewer shows, so all other topics cost no time here or in
+the daemon. If messages arrive faster than they can be forwarded, the oldest are dropped.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class News:
         self._told: list[LogEvent] = []
 
     def of(self, events: Events) -> list[Log]:
-        """Return the new events as log messages. After the daemon restarts, all events are new."""
+        """Return the new events as log messages. After a restart of the daemon, all are new."""
         known, told, stamp_ns = self._total, self._told, events.stamp.to_ns()
         if events.total < known:
             if stamp_ns <= self._stamp_ns:
@@ -129,7 +129,8 @@ class Commanders:
     def follow(self, topics: Collection[str]) -> None:
         """Subscribe to the commands of `topics` only.
 
-        A client over TLS may not receive the commands of other clients, so it subscribes to none.
+        If this program is connected over TLS, it may not receive the commands of other clients and
+        subscribes to none.
         """
         wanted = set() if self._deaf else self._ways.keys() & set(topics)
         for topic in self._heard.keys() - wanted:
@@ -183,7 +184,7 @@ class _Heard:
         self._box.put((arrival, now.wall_ns))
 
     def take(self) -> list[tuple[Arrival, int]]:
-        """Return the commands since the last call, each with its wall-clock arrival time, ns."""
+        """Return the commands since the last call as pairs (command, wall-clock arrival in ns)."""
         return self._box.take()
 
     def undeclare(self) -> None:
@@ -228,13 +229,13 @@ class Relay:
         return self._commanders.topics
 
     def follow(self, topics: Collection[str], fresh: Collection[str]) -> None:
-        """Subscribe only to the keys of `topics`, the topics that viewers look at.
+        """Subscribe only to the keys of `topics`, the topics that viewers show.
 
-        Each topic in `fresh` has a new viewer. If such a topic is published seldom, its last
+        Each topic in `fresh` has a new viewer. If such a topic is published rarely, its last
         message is sent again for the new viewer.
         """
         if self.log_topic in fresh:
-            self._news = News()  # a viewer that opens the log sees the last events
+            self._news = News()  # a viewer that opens the log receives the last events too
         self._commanders.follow(topics)
         shown = [
             out
@@ -251,7 +252,7 @@ class Relay:
             if out.key == EVENTS:
                 self._robot.ask(EVENTS, self._followed[EVENTS].add)
             elif out.key in ("tf_static", "diagnostics", "state") and out.last:
-                # These keys are published seldom, so a new viewer receives the last message.
+                # These keys are published rarely, so a new viewer receives the last message.
                 out.channel.log(out.last)
         for key in keys - self._followed.keys():
             self._followed[key] = self._subscribed(key)
@@ -284,7 +285,7 @@ class Relay:
             out.log(line)
 
     def _messages(self, key: str, samples: Subscription) -> list[msgspec.Struct]:
-        # A round forwards at most this many messages of a key: those of one second at 100 Hz.
+        # A round forwards at most the newest 100 messages of a key, one second's worth at 100 Hz.
         held: deque[zenoh.Sample] = deque(maxlen=100)
         try:
             while (sample := samples.try_recv()) is not None:

@@ -16,14 +16,17 @@ from acsard.host.errors import ReplyError
 
 
 class Facts(Struct, frozen=True):
-    """Facts about a robot. `config` has the default values if this program may not read it."""
+    """Facts about a robot.
+
+    If this program may not read the robot's configuration, `config` has the default values.
+    """
 
     config: Config
     tables: object
     """The configuration as plain tables; None if this program may not read it."""
     sources: tuple[str, ...]
     forbidden: str
-    """Reason why this program may not drive, in words; "" if it may."""
+    """Reason why this program may not drive, in words; "" if it may drive."""
     deaf: str = ""
     """Reason why this program cannot receive other programs' commands, in words; "" if it can."""
 
@@ -45,7 +48,7 @@ def key_of(row: Channel, source: str) -> str:
 
 
 def learn(robot: Client) -> Facts:
-    """Query the robot for its configuration, command sources and the permissions of this client.
+    """Query the robot for its configuration, its command sources, and this client's permissions.
 
     Raises the errors of `Client.get`, and `ReplyError` if a reply is not readable.
     """

@@ -33,7 +33,7 @@ from acsard.host.errors import InUseError, NotPermittedError
 from acsard.host.mailbox import Mailbox
 
 WISHES = 16
-"""Largest number of changes of settings that wait for the daemon."""
+"""Maximum number of requested changes of settings that wait to be sent to the daemon."""
 
 POLL_NS = 5 * NS_PER_S
 """Time between two queries for the robot's settings, which other clients may change, ns."""
@@ -63,7 +63,7 @@ class Shown:
         self._wake()
 
     def take(self) -> tuple[set[str], set[str]]:
-        """Return all topics with viewers, and the topics with a new viewer since the last call."""
+        """Return a pair: topics with viewers, and topics with a new viewer since the last call."""
         with self._lock:
             fresh, self._fresh = self._fresh, set()
             return set(self._viewers), fresh
@@ -91,7 +91,10 @@ class Settings:
         self.learn(tables)
 
     def learn(self, tables: object) -> dict[str, Any]:
-        """Store the configuration `tables` (None: unreadable), and return the changed settings."""
+        """Store the configuration, and return the settings that have changed.
+
+        `tables` is the configuration as plain tables, or None if this program may not read it.
+        """
         now = {} if tables is None else live_settings(tables)
         with self._lock:
             news = changes(self._known, now)
@@ -100,7 +103,10 @@ class Settings:
         return news
 
     def get(self, names: Collection[str]) -> dict[str, Any]:
-        """Return the known settings with these names (all if `names` is empty) without a query."""
+        """Return the known settings with these names, or all known settings if `names` is empty.
+
+        The daemon is not queried.
+        """
         with self._lock:
             self._asked = True
             return asked(self._known, names)
@@ -116,7 +122,7 @@ class Settings:
     def set(self, wishes: dict[str, Any]) -> dict[str, Any]:
         """Queue a change of these settings, and return their present values.
 
-        `refresh` makes the change. A notice tells all viewers whether it succeeded.
+        `refresh` makes the change, and a notice tells all viewers whether the change succeeded.
         """
         with self._lock:
             full = len(self._wishes.waiting) >= WISHES
@@ -129,9 +135,10 @@ class Settings:
             return asked(self._known, wishes.keys()) if wishes else {}
 
     def _change(self, wishes: dict[str, Any]) -> dict[str, Any]:
-        """Change all of these settings or none. Return those that differ from the last known ones.
+        """Change all settings in `wishes` or none; return the settings whose values have changed.
 
-        The result also has the settings in `wishes`, because a viewer may show them as changed.
+        The result also contains the settings in `wishes`, because a viewer may show the wished
+        values even if the change has failed.
         """
         news = dict[str, Any]()
         try:
@@ -148,7 +155,7 @@ class Settings:
             return news | (asked(self._known, wishes.keys()) if wishes else {})
 
     def refresh(self, here: bool) -> dict[str, Any]:
-        """Make one waiting change, or query the settings again if a viewer needs them.
+        """Make one queued change, or query the settings again if a viewer needs them.
 
         `here` is false if the daemon is gone. Return the settings that changed. This call waits for
         at most two replies of the daemon.
@@ -240,9 +247,10 @@ def start(
     *,
     acts: bool,
 ) -> WebSocketServer:
-    """Start the server at `address`. `acts` lets viewers send commands and change settings.
+    """Start the server at `address`.
 
-    Raises `InUseError` if the port is taken, and `NotPermittedError` if the port needs root.
+    If `acts` is true, viewers may send commands and change settings. Raises `InUseError` if the
+    port is taken, and `NotPermittedError` if the port needs root.
     """
     host, port = address
     takes = [Capability.Services]
@@ -254,7 +262,7 @@ def start(
             host=host,
             port=port,
             capabilities=takes,
-            server_listener=listener,  # type: ignore[arg-type]  # it has all but playback
+            server_listener=listener,  # type: ignore[arg-type]  # all but playback
             supported_encodings=["json", "cdr"],
             services=services,
             context=context,
@@ -273,7 +281,10 @@ def start(
 
 
 class Refusals(logging.Handler):
-    """Log handler that reports each client that foxglove-sdk refuses. Ignores other log lines."""
+    """Log handler that tells viewers about each client that foxglove-sdk refuses.
+
+    It ignores all other log lines.
+    """
 
     def __init__(self, notices: Notices) -> None:
         super().__init__(logging.ERROR)

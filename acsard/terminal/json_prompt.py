@@ -33,12 +33,12 @@ from acsard.terminal.prompt import Ask
 T = TypeVar("T")
 
 HEARD_S = 0.9
-"""Longest silence of the asking program while something may move, s.
+"""Maximum silence of the other program while something may move, s.
 
 After a longer silence the subcommand sends zero speeds, so the robot begins to stop within a second
-of the program's last line. The program sends a line every 0.1 s, even if the line is only `{}`. TCP
-resends a lost packet after 0.2 s, and again after another 0.4 s, so a line that is lost twice still
-arrives in time.
+of the other program's last line. That program sends a line every 0.1 s, even if the line is only
+`{}`. TCP resends a lost packet after 0.2 s, and again after another 0.4 s, so a line that is lost
+twice still arrives in time.
 
 If this computer is too busy to keep the limit, a guided drive ends because it receives nothing from
 the daemon for 0.5 s (calibration/guided/leg_driver.py). When a person drives by hand, the timeout
@@ -52,7 +52,10 @@ LINE_BYTES = 65536
 
 
 class Line(Struct, frozen=True):
-    """An input line. Unknown fields are ignored."""
+    """An input line: an answer, a key press (`key`), or neither as a sign of life.
+
+    `answer` is the number of the answered question, or 0. Unknown fields are ignored.
+    """
 
     answer: int = 0
     value: str | float | None = None
@@ -63,7 +66,7 @@ class Line(Struct, frozen=True):
 
 
 class Subject(Struct, frozen=True):
-    """The first line: the tested subject."""
+    """The first line: the robot or the board that is checked or calibrated."""
 
     subject: str
     simulated: bool
@@ -76,13 +79,13 @@ class JobMessage(Struct, frozen=True):
 
 
 class Doing(Struct, frozen=True):
-    """The current activity; the next one replaces it."""
+    """The current activity. It replaces the previous activity on the screen."""
 
     doing: str
 
 
 class Progress(Struct, frozen=True):
-    """Completed share of the leg or of the check, 0 to 1."""
+    """Completed share of the present drive or of the check, 0 to 1."""
 
     progress: float
 
@@ -91,7 +94,7 @@ class Question(Struct, frozen=True, omit_defaults=True, kw_only=True):
     """A question. The reply is one of `answers`, or a number if `answers` is empty."""
 
     question: int
-    """Number that the answer must quote."""
+    """Number of the question, which the answer must contain."""
     words: str
     answers: Sequence[str] = ()
     unit: str = ""
@@ -100,7 +103,7 @@ class Question(Struct, frozen=True, omit_defaults=True, kw_only=True):
     usual: float | None = None
     """Default for an empty answer."""
     leg: bool = False
-    """True if the robot drives after the answer; a key press stops it."""
+    """True if the robot drives after the answer. A key press then stops the robot."""
     by_key: bool = False
     """True if a key press is the intended end of the drive that follows the answer."""
     wrong: str = ""
@@ -114,13 +117,16 @@ class Found(Struct, frozen=True):
 
 
 class Result(Struct, frozen=True):
-    """The complete result as printed at a terminal; nothing moves any more."""
+    """The complete result, as a terminal shows it. Nothing moves any more."""
 
     result: str
 
 
 class JsonPrompt:
-    """Prompt over standard input and output. The conversation ends when the context is left."""
+    """Prompt that exchanges JSON lines with another program over standard input and output.
+
+    The conversation lasts until the end of the `with` block.
+    """
 
     def __init__(self) -> None:
         self._input, self._left = sys.stdin.fileno(), False
@@ -140,7 +146,8 @@ class JsonPrompt:
     def __exit__(self, *error: object) -> None:
         with self._news:
             self._left = True
-        self._reader.join(1.0)  # the thread does not end if the program does not read
+        # Wait with a limit: the thread hangs if it prints and the other program does not read.
+        self._reader.join(1.0)
 
     # Output
 
@@ -163,7 +170,7 @@ class JsonPrompt:
         self.progress(min(0.99, self._found / 16))
 
     def result(self, text: str) -> None:
-        """Send the result as a terminal shows it. From now on nothing moves."""
+        """Send the result as a terminal shows it, and record that nothing moves any more."""
         self._moves = False
         self.progress(1.0)
         self._tell(Result(text.strip("\n")))
@@ -195,8 +202,8 @@ class JsonPrompt:
     def offer(self, config: str | None, keys: Mapping[str, object], trouble: str = "") -> bool:
         """Offer to write these keys into the configuration file; return whether they were written.
 
-        `config` is the path of the file, or None to search for it. The question is asked only if
-        the file can be changed and `trouble`, a reason not to write, is "".
+        `config` is the path of the file, or None to search for it. `trouble` is a reason not to
+        write, or "". If there is a reason, or if the file cannot be changed, say so and do not ask.
         """
         try:
             if trouble:
@@ -244,7 +251,7 @@ class JsonPrompt:
             self._tell(question)
             with self._news:
                 while self._open:
-                    # Wait with a limit: a signal just before the wait begins would not wake it.
+                    # Wait with a limit: a signal just before the wait begins would not end it.
                     self._news.wait(LISTEN_S)
             try:
                 got = read(self._answer.value)
@@ -257,7 +264,10 @@ class JsonPrompt:
     # Input
 
     def _listen(self) -> None:
-        """Read the input until the conversation is over. If it ends earlier, send SIGINT."""
+        """Read the input until the conversation is over.
+
+        If the input ends earlier, send SIGINT to the main thread.
+        """
         try:
             self._end(self._heard_out())
         except BaseException as error:
@@ -265,7 +275,7 @@ class JsonPrompt:
             raise
 
     def _heard_out(self) -> str:
-        """Read the input. Return why it ended, or "" if the conversation is over."""
+        """Read the input until it ends, and return the reason; "" if the conversation is over."""
         held, heard_s = b"", time.monotonic()
         while not self._left:
             if self._readable(LISTEN_S):
@@ -287,7 +297,7 @@ class JsonPrompt:
         try:
             said = self._lines.decode(line)
         except (msgspec.MsgspecError, ValueError, RecursionError):
-            # The question stays open.
+            # The line answers nothing, so the question stays open.
             return
         with self._news:
             if said.key:
@@ -303,8 +313,8 @@ class JsonPrompt:
         with self._news:
             if self._left:
                 return
-            # Interrupt the main thread first, because that stops the wheels. The message may find
-            # no reader.
+            # Interrupt the main thread first, because that stops the wheels. Printing the message
+            # blocks if the other program does not read.
             signal.pthread_kill(main, signal.SIGINT)
         with suppress(OSError):
             print(f"acsard: {why}", file=sys.stderr, flush=True)

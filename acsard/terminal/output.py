@@ -1,6 +1,7 @@
-"""Prints tables and sentences: on a terminal within its width and in colours, elsewhere plain.
+"""Prints tables and sentences, in color on a terminal and as plain text elsewhere.
 
-The text is never read as markup. The caller must make texts from other programs printable first.
+The text is never interpreted as markup. The caller must first make texts from other programs
+printable.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ from rich.table import Table
 from rich.text import Text
 
 WHOLE = 10_000
-"""Width in characters at which no row of a table is wrapped, so that a row can be copied."""
+"""Width, characters, that is larger than any row of a table. With it, no row is wrapped, so that a
+row can be copied."""
 
 SENTENCES = 100
 """Largest width of output that contains sentences, characters."""
@@ -30,8 +32,8 @@ def table(
 ) -> Table:
     """Return rows as a table in columns.
 
-    `right` are the numbers of the right-aligned columns, counted from 0. `gap` is the number of
-    spaces between columns.
+    `heads` are the headings of the columns. `right` contains the numbers of the right-aligned
+    columns, counted from 0. `gap` is the number of spaces between columns.
     """
     cells = list(rows)
     made = Table(
@@ -51,7 +53,10 @@ def has_screen() -> bool:
 
 
 def show(*parts: RenderableType, most: int = WHOLE) -> None:
-    """Print each part on lines of its own, at most `most` characters wide. `WHOLE` wraps no row."""
+    """Print each part on its own lines, which have at most `most` characters.
+
+    With the default, `WHOLE`, no row of a table is wrapped.
+    """
     console = _console(sys.stdout)
     if console.is_terminal and most < WHOLE:
         console.print(Group(*parts), width=min(most, console.width))
@@ -60,7 +65,7 @@ def show(*parts: RenderableType, most: int = WHOLE) -> None:
 
 
 def show_whole(text: Text) -> None:
-    """Print a text without wrapping it, so that a command in it can be copied from the terminal."""
+    """Print a text without wrapping, so that a command in it can be copied from the terminal."""
     console = _console(sys.stdout)
     if console.is_terminal:
         console.print(text, soft_wrap=True)

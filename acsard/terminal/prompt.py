@@ -1,4 +1,4 @@
-"""The interface of a prompt, and the signals that end a subcommand that asks a person.
+"""The interface `Prompt`, and the signals that end a subcommand that asks a person.
 
 Change the implementations of the interface together: `TerminalPrompt`, `NoPrompt` and `JsonPrompt`.
 """
@@ -24,14 +24,14 @@ class NobodyError(AcsardError):
 
 
 class Ask(Struct, frozen=True):
-    """A question for a number within bounds, such as a tape measurement, with its `unit`."""
+    """A question whose answer is a number within bounds, such as a tape measurement."""
 
     words: str
     unit: str
     least: float
     most: float
     usual: float | None = None
-    """The number that an empty answer stands for, or None if there is none."""
+    """Default, which an empty answer selects; None if there is no default."""
     name: str = ""
     """The name by which a method of calibration refers to the answer."""
 
@@ -57,7 +57,7 @@ class Prompt(Protocol):
     """
 
     def begin(self, subject: str, *, simulated: bool) -> None:
-        """Show which robot or board the subcommand is about."""
+        """Show which robot or board the subcommand checks or calibrates."""
 
     def say(self, text: str) -> None:
         """Show a text that stays visible."""
@@ -72,7 +72,7 @@ class Prompt(Protocol):
         """Show a finding of a check, as soon as it is made."""
 
     def result(self, text: str) -> None:
-        """Show the result. From now on nothing moves."""
+        """Show the result. The caller promises that nothing moves any more."""
 
     def offer(self, config: str | None, keys: Mapping[str, object], trouble: str = "") -> bool:
         """Offer to write the settings `keys` into the configuration file.
@@ -91,13 +91,13 @@ class Prompt(Protocol):
         """
 
     def number(self, ask: Ask) -> float:
-        """Return the number that the person measured, or without a person the default of `ask`.
+        """Ask the question, and return the number. Without a person, return the default of `ask`.
 
         Raises `NobodyError` if there is neither a person nor a default.
         """
 
     def keys(self, wait_s: float) -> str:
-        """Return the pressed keys of the keyboard; wait up to `wait_s` s for the first key."""
+        """Wait up to `wait_s` s for a key press; return the pressed keys, or "" if none."""
 
 
 SIGNALS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP
@@ -109,16 +109,17 @@ because a suspended subcommand would leave a wheel turning."""
 def ended_by_signals(says: str = "", *, exits: bool = False) -> Iterator[None]:
     """Raise `KeyboardInterrupt` in the `with` block on any of `SIGNALS`; ignore further signals.
 
-    The cleanup of the block can then send zero speeds. `says` is printed when a signal arrives.
-    With `exits`, a signal other than Ctrl-C raises `SystemExit` with the exit code of that signal.
+    The cleanup of the block can then send zero speeds. `says` is printed when a signal arrives. If
+    `exits` is true, a signal other than that of Ctrl-C raises `SystemExit` with the exit code of
+    that signal instead.
     """
     before = [signal.getsignal(number) for number in SIGNALS]
 
     def end(number: int, frame: FrameType | None) -> None:
         for each in SIGNALS:
             signal.signal(each, signal.SIG_IGN)
-        # The program that started this one may be gone, or it may not read. The zeros must not
-        # wait.
+        # If the program that started this one is gone or does not read, printing would fail or
+        # block. The zero speeds must not wait for that.
         with suppress(OSError, ValueError):
             if says and select.select([], [sys.stderr], [], 0.0)[1]:
                 print(f"\n{says}", file=sys.stderr)

@@ -33,8 +33,9 @@ COLOURS = {"PASS": "green", "WARN": "yellow", "FAIL": "red", "SKIPPED": "bright_
 class Screen:
     """Output of a subcommand that asks questions.
 
-    On a terminal the present activity is a line that the next output overwrites. With `as_json`,
-    only texts and questions are shown, because the subcommand prints one JSON object at its end.
+    On a terminal the present activity is a line that the next output overwrites. If `as_json` is
+    true, only texts and questions are shown, because the subcommand prints one JSON object at its
+    end.
     """
 
     def __init__(self, as_json: bool = False) -> None:
@@ -87,8 +88,8 @@ class Screen:
 class NoPrompt(Screen):
     """Prompt that asks no person and answers the questions itself.
 
-    It confirms each request that has only one possible answer, starts every drive at once, and
-    gives the default number. It leaves all other questions without an answer.
+    It confirms each request that has only one possible answer, starts every drive without waiting,
+    and returns the default number. It leaves all other questions without an answer.
     """
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
@@ -173,7 +174,7 @@ class TerminalPrompt(Screen):
 
 
 def row(finding: Finding) -> Table:
-    """Return a finding as a table: verdict, name and figure, and below them meaning and remedy."""
+    """Return a finding as a table: verdict, name and figure, then its meaning and its remedy."""
     verdict = Text(f"{finding.verdict:<7}", COLOURS[finding.verdict])
     below = [finding.text, f"-> {finding.mend}" if finding.mend else ""]
     head = f"{finding.name:<22} {finding.figure}"
@@ -182,7 +183,7 @@ def row(finding: Finding) -> Table:
 
 def _read() -> str:
     read = os.read(sys.stdin.fileno(), 256)
-    # The terminal has been closed.
+    # No data means that the terminal has been closed.
     if not read:
         raise KeyboardInterrupt
     return read.decode(errors="replace")

@@ -37,13 +37,16 @@ class Teleop(Struct, frozen=True):
     age: float
     """Seconds since `state` arrived, or since the wait for the first state began."""
     objection: str = ""
-    """Reason why the robot does not follow the keys, or ""."""
+    """Reason why the robot does not obey the keys, or "" if there is none."""
     silent: bool = False
     """True if the robot is silent, so the shown data is old."""
 
 
 def lines(seen: Teleop, width: int, height: int | None = None) -> list[Text]:
-    """Return the screen: at most `height` lines (None: no limit) of at most `width` characters."""
+    """Return the lines of the screen, at most `height` of at most `width` characters each.
+
+    If `height` is None, the number of lines has no limit.
+    """
     width = max(20, width)
     head = printable(f"{seen.robot_id} as {seen.source}  {seen.endpoint}")
     shown = [Text(head, "bold")]
@@ -71,7 +74,7 @@ def lines(seen: Teleop, width: int, height: int | None = None) -> list[Text]:
 
 
 def news(seen: Teleop, width: int) -> list[str]:
-    """Return the content of the screen, without the help, as lines for output without a screen."""
+    """Return the content of the screen, without the help, as lines for printed reports."""
     told = [f"keys ask for {asked(seen)}"]
     if seen.state is None or seen.silent:
         return _words([silence(seen), *told], width)
@@ -82,14 +85,17 @@ def news(seen: Teleop, width: int) -> list[str]:
 
 
 def parting(seen: Teleop, width: int) -> list[str]:
-    """Return the lines printed as `acsard drive` ends: does the robot move, why, and its pose."""
+    """Return the lines to print when `acsard drive` ends.
+
+    They state whether the robot moves, its mode with the reason, and its pose and speeds.
+    """
     if seen.state is None or seen.silent:
-        return _words([f"left: {silence(seen)}"], width)
+        return _words([f"drive ended: {silence(seen)}"], width)
     what = "still moves" if moves(seen.state) else "stands"
     if seen.state.linear is None:
         what = "reports no speed"
     why = f"{printable(seen.state.mode)}: {reason(seen.state)}"
-    return _words([f"left: the robot {what}", why], width, measured(seen.state))
+    return _words([f"drive ended: the robot {what}", why], width, measured(seen.state))
 
 
 def released(seen: Teleop) -> bool:
@@ -105,7 +111,7 @@ def moves(state: RobotState) -> bool:
 
 
 def silence(seen: Teleop) -> str:
-    """Return a sentence which says that no state has arrived yet, or for how long none arrived."""
+    """Return a sentence: no state has arrived yet, or none has arrived for some time."""
     if seen.state is None and not seen.silent:
         return "waiting for the first state message of the daemon"
     return f"nothing received from the daemon for {seen.age:.0f} s: does it run?"
@@ -117,7 +123,10 @@ def reason(state: RobotState) -> str:
 
 
 def refused(objection: str) -> str:
-    """Return why the robot does not follow the keys, and how the keys can send a required zero."""
+    """Return why the robot does not obey the keys.
+
+    If the robot requires a zero, the text also says how to send it with the keys.
+    """
     release = " (release the key, and press it again)" if "must send a zero" in objection else ""
     return f"your keys do not drive the robot: {printable(objection)}{release}"
 

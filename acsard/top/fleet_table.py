@@ -1,4 +1,4 @@
-"""The robots of `acsard fleet`, and one line for each of them, for any width of the terminal."""
+"""Collects the robots that `acsard fleet` shows, and formats them as a table of any width."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def _why(state: RobotState) -> str:
 
 
 def _place(state: RobotState) -> str:
-    """Return x and y in m and the heading in degrees."""
+    """Return the pose as text: x and y in m, and the heading in degrees."""
     figures = (state.x, 1), (state.y, 1), (math.degrees(state.yaw), 0)
     return " ".join(signed(value, decimals, 7).strip() for value, decimals in figures) + "°"
 
@@ -149,8 +149,8 @@ class Roster(Fleet):
     def gather(self) -> list[Row]:
         """Wait until all robots that the user named have answered, and return the rows.
 
-        The wait ends after 1.5 s, or with an empty list after 3 s if no robot has answered. The
-        first answer is late on a busy computer.
+        The wait ends after 1.5 s. If no robot has answered by then, it ends after 3 s with an empty
+        list, because on a busy computer the first answer is late.
         """
         began, rows = time.monotonic(), self.rows()
         while not self.whole:

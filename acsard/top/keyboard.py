@@ -3,8 +3,8 @@
 A terminal reports a key press but never its release. Each press therefore drives the robot for
 `HOLD_S`. Once the keyboard repeats a held key, each repeat drives the robot for `REPEAT_S` only.
 When the time of the last press or repeat is over, `acsard drive` sends three zero commands and then
-nothing. Keys that the operator typed while this program stood still for more than 0.5 s do not
-drive the robot.
+nothing. If this program was not running for more than 0.5 s, the keys that the operator typed in
+that time do not drive the robot.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ operator may have released the key long ago.
 """
 
 BURST_S = 0.2
-"""Time after old keys for which further keys are old too, s. One read does not return all keys that
-waited."""
+"""Time after old keys during which further keys count as old too, s. One read may not return all
+the keys that have waited."""
 
 STOP = " "
 
@@ -69,10 +69,10 @@ class Keyboard:
     def take(self, text: str, now: float, waited: float = 0.0) -> None:
         """Process the keys of one read from the terminal at `now` (monotonic clock, s).
 
-        The keys may have waited for up to `waited` s. Old keys do not show what the operator wants
-        now, so they stop the robot. Keys are old if they may have waited for more than `GRACE_S`,
-        or if more than `BURST` keys arrive together. After such a wait, an earlier press drives
-        the robot no further.
+        The keys may have waited for up to `waited` s. Keys are old if they may have waited for more
+        than `GRACE_S`, or if more than `BURST` keys arrive together. Old keys do not show what the
+        operator wants now, so they stop the robot. After such a wait, an earlier press does not
+        drive the robot any longer either.
         """
         keys = split(text)
         if len(keys) > BURST or waited > GRACE_S:
@@ -116,7 +116,7 @@ class Ride:
         # stopped and cleared during the silence.
         self._commander = Commander(leads=True)
         self._watch = Watch(robot, clock.steady_s())
-        # To subscribe may take long. The terminal discards the keys that are typed meanwhile.
+        # Subscribing may take long. The terminal discards the keys that are typed until it is done.
         self._fine = self._stepped = clock.steady_s()
 
     def step(self, typed: str) -> None:

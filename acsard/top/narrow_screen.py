@@ -1,7 +1,7 @@
 """Builds the parts of the screen of `acsard top` for a narrow terminal. This module is pure.
 
-The screen shows the same values as that of `wide_screen.py`. The values that count from the start
-of the daemon come last, so a screen with few lines cuts these off first.
+The screen shows the same values as the one of `wide_screen.py`. The latencies since the start of
+the daemon come last, so a screen with few lines cuts them off first.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def motion(state: RobotState, width: int) -> list[Text]:
 
 
 def sources(state: RobotState, room: int, width: int) -> list[Text]:
-    """Return lines with each source's priority and age, and what the source waits for.
+    """Return lines about each source: priority, age of the last command, and what it waits for.
 
     If the sources need more than about `room` lines, the last line names the other sources.
     """

@@ -1,4 +1,4 @@
-"""Builds one screen of `acsard top` from a robot's state, as lines of coloured text.
+"""Builds one screen of `acsard top` from a robot's state, as lines of colored text.
 
 This module is pure. Lines are cut to the width of the terminal, so no message can break the layout.
 If the terminal has too few lines, the screen leaves out the empty lines first, and then command
@@ -76,9 +76,9 @@ def _header(seen: ScreenData, width: int) -> Text:
 
 
 def _mode(seen: ScreenData, width: int) -> list[Text]:
-    """Return the robot's mode as a coloured label, with its reason next to it or below it.
+    """Return the robot's mode as a colored label, with the reason of the mode beside or below it.
 
-    A wide screen shows mode and reason on two lines even if one suffices, so that the lines below
+    A wide screen uses two lines for mode and reason even if one suffices, so that the lines below
     do not move when the reason becomes long.
     """
     state = seen.state

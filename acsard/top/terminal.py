@@ -1,6 +1,7 @@
 """Shows the screens of the commands `acsard top`, `acsard fleet` and `acsard drive`.
 
-A signal or the end of the input ends every screen. The letter `q` ends those of `top` and `fleet`.
+A signal or the end of the input ends each screen. The letter `q` ends the screens of `top` and
+`fleet`.
 If the terminal cannot show a screen, `acsard drive` prints lines instead.
 """
 
@@ -39,8 +40,9 @@ KEYS_S = 0.05
 """Longest time between two reads of the keyboard in `acsard drive`, s."""
 
 NEWS_S, SAME_S, QUIET_S = 0.5, 1.0, 10.0
-"""Shortest time between two printed reports of `acsard drive`, s. `NEWS_S`: if the content has
-changed. `SAME_S`: if it has not changed and the robot moves. `QUIET_S`: otherwise."""
+"""Shortest time between two printed reports of `acsard drive`, s: `NEWS_S` if the content has
+changed, `SAME_S` if it has not changed and the robot moves, and `QUIET_S` if it has not changed and
+the robot stands."""
 
 NO_END = 10**9
 
@@ -83,7 +85,7 @@ def drive(ride: Ride) -> None:
 
 
 def part(ride: Ride) -> None:
-    """On a terminal, print a last report when the robot has stopped, or after 2 s at the latest.
+    """Wait until the robot has stopped, but at most 2 s, and print a last report on a terminal.
 
     Without the wait, the report would say that the robot still moves, or that the source of this
     drive still commands it. The daemon follows a source until its timeout, 0.25 s by default.
@@ -187,7 +189,7 @@ def _be_lenient() -> None:
 def until_told() -> Iterator[None]:
     """End the `with` block at the first signal in `LEAVES`, or when the terminal closes.
 
-    Further signals are ignored, because a terminal that closes under a shell causes two signals.
+    Further signals are ignored, because two signals arrive when a terminal with a shell closes.
     """
 
     def deaf() -> None:
@@ -215,10 +217,10 @@ def until_told() -> Iterator[None]:
 
 @contextmanager
 def keys() -> Iterator[Callable[[float], str | None]]:
-    """Yield a function that waits at most a number of seconds for keyboard input, and returns it.
+    """Yield a function that reads the keyboard. Its argument is the maximum time to wait, s.
 
-    The function returns "" if nothing was typed in this time, and None when the input has ended. If
-    the input is not a terminal, the function always waits and returns "".
+    The function returns the typed text, "" if nothing was typed in this time, and None when the
+    input has ended. If the input is not a terminal, the function always waits and returns "".
     """
 
     def read(seconds: float) -> str | None:
@@ -259,7 +261,7 @@ def _drive_in_lines(ride: Ride) -> None:
 def output_size() -> os.terminal_size:
     """Return the size of the terminal that shows the output.
 
-    For an output to a file or a pipe, the size is practically unlimited.
+    If the output goes to a file or a pipe, return a size that is practically unlimited.
     """
     unlimited = os.terminal_size((NO_END, NO_END))
     return shutil.get_terminal_size() if sys.stdout.isatty() else unlimited

@@ -25,7 +25,7 @@ MODES = {
     "stopped": "bold white on red",
     "fault": "bold white on red",
 }
-"""Colours of the modes, as styles of the library rich."""
+"""Color of each mode, as a style of the library rich."""
 
 
 class ScreenData(Struct, frozen=True):
@@ -49,7 +49,7 @@ class ScreenData(Struct, frozen=True):
     passed: float = 0.0
     """Seconds between the arrivals of `before` and `state`, on the local clock.
 
-    If the stamps of these states are a different time apart, the robot's clock was adjusted.
+    If the difference of their stamps is not the same, the robot's clock was adjusted.
     """
 
 
@@ -106,7 +106,7 @@ def ends(left: Text, right: Text, width: int) -> Text:
 
 
 def rule(width: int, titles: Sequence[tuple[int, str | Text]]) -> Text:
-    """Return a horizontal line with titles, each at its column."""
+    """Return a horizontal line with titles, given as pairs (column, title)."""
     line = Text()
     for at, title in titles:
         if at:
@@ -116,7 +116,7 @@ def rule(width: int, titles: Sequence[tuple[int, str | Text]]) -> Text:
 
 
 def flow(parts: Sequence[Text], width: int, inset: int = 0) -> list[Text]:
-    """Arrange the parts in lines of at most `width` cells, with as many parts in a line as fit.
+    """Arrange the parts in lines of at most `width` cells, with as many parts per line as fit.
 
     Lines after the first begin with `inset` blanks.
     """

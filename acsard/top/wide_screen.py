@@ -1,4 +1,4 @@
-"""Builds the lines of `acsard top` that follow the robot's mode, for a wide terminal.
+"""Builds the lines of `acsard top` below the robot's mode, for a wide terminal.
 
 This module is pure.
 """
@@ -70,7 +70,8 @@ def motion(state: RobotState, width: int) -> list[Text]:
 
 
 def speeds(state: RobotState) -> tuple[tuple[float, ...], float]:
-    """Return the four wheel speeds (NaN if unknown) and the speed that fills a bar, in rad/s."""
+    """Return a pair: the four wheel speeds (NaN if unknown), and that of a full bar; both in
+    rad/s."""
     wheels = (*state.wheels[:4], *[math.nan] * (4 - len(state.wheels)))
     top = max((abs(speed) for speed in wheels if math.isfinite(speed)), default=0.0)
     return wheels, next((s for s in (20.0, 40.0, 80.0) if top <= s), 100.0)
@@ -118,9 +119,9 @@ def drives(source: SourceState, state: RobotState) -> bool:
 
 
 def waits(source: SourceState, state: RobotState) -> str:
-    """Return in words what a command source waits for before the robot follows it.
+    """Return in words what a command source waits for before it can drive the robot.
 
-    If it waits for nothing, the text says that it drives, or gives the robot's mode.
+    If the source waits for nothing, the text says that it drives, or names the robot's mode.
     """
     if source.waits_for:
         return clean(source.waits_for)
@@ -140,9 +141,9 @@ def _source(source: SourceState, state: RobotState, room: int) -> Text:
 
 
 def link(seen: ScreenData, state: RobotState, width: int) -> list[Text]:
-    """Return the lines about the serial link, the commands and the rejected input.
+    """Return the lines about the serial link, the commands and the rejected inputs.
 
-    If they exist, also return lines about the gyro, the effective track and the board's inputs.
+    Lines about the gyro, the effective track and the board's inputs follow if the robot has them.
     """
     before = seen.before or state
     head = title(seen, state)
@@ -188,9 +189,10 @@ def certificate(state: RobotState) -> Text:
 
 
 def rates(seen: ScreenData, state: RobotState, before: RobotState) -> Callable[[str], str]:
-    """Return a function that takes a counter's name and returns its rate and total as text."""
-    # The stamps of the states give the exact time between them. If that time differs from the local
-    # one by more than a network's delay, the robot's clock was set, so use the local time.
+    """Return a function that maps a counter's name to a text with the counter's rate and total."""
+    # The stamps give the exact time between the two states. If it differs from the time between the
+    # arrivals of the states by more than a network's delay, the robot's clock was set, so use the
+    # time between the arrivals.
     seconds = (state.stamp.to_ns() - before.stamp.to_ns()) / NS_PER_S
     if abs(seconds - seen.passed) > 0.2:
         seconds = seen.passed

@@ -3,11 +3,11 @@
 A connection goes through these states:
 
 1. silent: no byte has arrived yet. The connection costs only a file descriptor and a place in
-   `Sockets`, because TLS starts with the first byte;
-2. waiting for its TLS handshake, if too many handshakes are running or the client's network has
-   begun too many;
-3. starting: in the TLS handshake;
-4. open: aiohttp reads its requests.
+   `Sockets`, because TLS starts with the first byte.
+2. waiting: the TLS handshake may not start yet, because too many handshakes are running or because
+   the client's network has started too many.
+3. starting: the TLS handshake is running.
+4. open: aiohttp reads the connection's requests.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ from acsard.web.limits import HANDSHAKES, SOCKETS_HERE, UNREAD_BYTES, Sockets, s
 from acsard.web.metrics import Counts
 
 HANDSHAKE_S, HANDSHAKES_AT_ONCE = 3.0, 32
-"""Time limit for a TLS handshake, s; maximum number of handshakes at once."""
+"""Time limit for a TLS handshake, s; maximum number of handshakes that run at the same time."""
 
 HURRIED_S = 0.3
-"""Age, s, from which a TLS handshake may be cut off if `HANDSHAKES_AT_ONCE` handshakes run and
-others wait. Without this rule, clients that fall silent in their handshakes would delay a phone by
-`HANDSHAKE_S`."""
+"""Minimum age, s, of a running TLS handshake that may be aborted to make room for a waiting one.
+This happens only while `HANDSHAKES_AT_ONCE` handshakes run. Without this rule, clients that stop
+sending during their handshakes would delay a phone by `HANDSHAKE_S`."""
 
 REQUEST_S = 10.0
 """Time limit, s, from accepting a connection to the end of the headers of its first request."""
@@ -59,7 +59,7 @@ Factory = Callable[[], "Reader"]
 
 
 class Acceptor:
-    """Accepts TCP connections at the listening addresses, and closes the connections over a limit.
+    """Accepts TCP connections at the listening addresses, and cuts those that exceed a limit.
 
     Connections from the robot itself have a separate limit, so clients on other machines cannot
     lock out a browser on the robot.
@@ -72,19 +72,22 @@ class Acceptor:
         self._away = Sockets["_Connection"](sockets_for(files))
         self._listeners: list[socket.socket] = []
         self._waiting: dict[str, dict[_Connection, None]] = {}
-        """Connections that wait for their TLS handshake, by network. When a handshake of a network
-        starts, the network moves to the end."""
+        """Connections that wait for their TLS handshake, by network. When a network's handshake
+        starts, the network moves to the end of this dict, so the networks take turns."""
         self._handshakes = Buckets(HANDSHAKES)
         self._starting: dict[_Connection, float] = {}
         """Start time of each running TLS handshake, s on the event loop's clock; oldest first."""
         self._again: asyncio.TimerHandle | None = None
         """Timer of the next call of `_next`, or None if no call is scheduled."""
         self._ended: set[_Connection] = set()
-        """The connections whose token was not in the `valid` tokens at the last call of
+        """The connections whose token was missing from the argument `valid` of the last call of
         `tidy()`."""
 
     def listen(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
-        """Accept connections at the listening socket `opened`; `secure` is None for plain HTTP."""
+        """Accept connections at the listening socket `opened`.
+
+        `secure` is None for plain HTTP. `make` creates the HTTP handler of one connection.
+        """
         sslproto.SSLProtocol.max_size = READ_BYTES
         # A browser sends no request before it has the answer to the last one. aiohttp would queue
         # 32 requests, whose headers can take megabytes.
@@ -93,7 +96,7 @@ class Acceptor:
         self._resume(opened, secure, make)
 
     def close(self) -> None:
-        """Stop accepting connections, and cut those whose client has not been identified."""
+        """Stop accepting connections, and cut those whose client is not identified yet."""
         loop = asyncio.get_running_loop()
         for opened in self._listeners:
             loop.remove_reader(opened)
@@ -104,7 +107,10 @@ class Acceptor:
                 one.cut()
 
     def spoke(self, transport: asyncio.BaseTransport | None, body: StreamReader) -> None:
-        """Record that the headers of a request have arrived, so the limit `REQUEST_S` ends."""
+        """Record that the headers of a request have arrived, which ends the time limit `REQUEST_S`.
+
+        `body` is the stream from which the body of this request is read.
+        """
         if (one := _connection(transport)) is not None:
             one.spoke(body)
 
@@ -117,10 +123,10 @@ class Acceptor:
             one.pool.prove(one, who.token)
 
     def tidy(self, valid: Collection[str]) -> None:
-        """Cut the connections whose token is not in `valid`, now and at the previous call.
+        """Cut each connection whose token is missing from `valid` for the second call in a row.
 
-        Call this once a second. The delay of one call lets a WebSocket client receive the reason
-        first.
+        Call this once a second. At the first call, the connection stays open, so a WebSocket client
+        can receive the reason before the second call.
         """
         before = self._ended
         self._ended = {one for pool in (self._here, self._away) for one in pool.ended(valid)}
@@ -133,7 +139,7 @@ class Acceptor:
             loop.add_reader(opened, self._accept, opened, secure, make)
 
     def _accept(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
-        # After this number of connections, other work of the event loop has its turn.
+        # Accept at most 32 connections in a row, so that other work of the event loop has its turn.
         for _ in range(32):
             try:
                 accepted, place = opened.accept()
@@ -162,10 +168,9 @@ class Acceptor:
     # The connections call the methods below.
 
     def crowded(self, one: _Connection) -> None:
-        """Cut a connection and count the refusal as `crowded`.
+        """Cut a connection that has no place or whose request headers are too long.
 
-        The reason is that there is no place for it, or that the headers of its request are too
-        long.
+        The refusal is counted under the reason `crowded`.
         """
         self._counts.refuse("crowded", one.peer)
         one.cut()
@@ -189,7 +194,10 @@ class Acceptor:
             self._waiting.pop(one.network, None)
 
     def started(self, one: _Connection) -> None:
-        """Record that a connection's TLS handshake is over, and start a waiting one if possible."""
+        """Record that a TLS handshake has succeeded or failed, and start a waiting one if possible.
+
+        The handshake is that of the connection `one`.
+        """
         self._starting.pop(one, None)
         if self._again is None:
             self._next()
@@ -200,7 +208,7 @@ class Acceptor:
         if not self._waiting:
             return
         now_ns, begun = clock.mono_ns(), Counter(one.network for one in self._starting)
-        # A network with many handshakes must not delay those of the others.
+        # A network with many handshakes must not delay the handshakes of other networks.
         ready = [name for name in self._waiting if self._handshakes.room(name, now_ns)]
         if ready and self._has_room(loop.time()):
             network = min(ready, key=lambda name: begun[name])
@@ -209,22 +217,24 @@ class Acceptor:
             one = next(iter(same))
             del same[one]
             if same:
-                self._waiting[network] = same  # after all other networks
+                self._waiting[network] = same  # behind all other networks
             self._starting[one] = loop.time()
             one.start()
-        # A handshake occupies the server for 1 to 2 ms, and a stop must not wait for 32 in a row.
+        # A handshake occupies the event loop for 1 to 2 ms. The pause between the handshakes lets
+        # the server send a stop before the next one.
         self._again = loop.call_later(0.005, self._next)
 
     def _has_room(self, now: float) -> bool:
-        """Return whether a TLS handshake may start.
+        """Return whether a TLS handshake may start at the time `now`.
 
-        If too many run, cut the oldest one of the network with the most handshakes, if it is older
-        than `HURRIED_S`.
+        If `HANDSHAKES_AT_ONCE` handshakes run, try to make room: cut the oldest handshake of the
+        network that has the most, unless this handshake is younger than `HURRIED_S`. `now` is in s
+        on the event loop's clock.
         """
         if len(self._starting) < HANDSHAKES_AT_ONCE:
             return True
-        # The most crowded network loses a handshake, so a slow client of another network keeps
-        # its own.
+        # The network with the most handshakes loses one, so a slow client in another network keeps
+        # its handshake.
         networks = Counter(one.network for one in self._starting)
         most = max(networks.values())
         oldest, begun = next(
@@ -294,7 +304,7 @@ class _Connection(asyncio.Protocol):
             self._acceptor.wait(self)
 
     def start(self) -> None:
-        """Start the TLS handshake; for plain HTTP, open the connection at once."""
+        """Start the TLS handshake, or for plain HTTP open the connection."""
         self._task = self._loop.create_task(self._open())
 
     async def _open(self) -> None:
@@ -308,7 +318,8 @@ class _Connection(asyncio.Protocol):
                 ssl_shutdown_timeout=1.0 if secure else None,
             )
         except OSError as error:
-            # The error's frames would keep the memory of TLS until the next garbage collection.
+            # The frames of the traceback would keep the TLS buffers in memory until the next
+            # garbage collection.
             traceback.clear_frames(error.__traceback__)
             if isinstance(error, ConnectionAbortedError):
                 self._acceptor.slow(self)  # `HANDSHAKE_S` is over
@@ -333,7 +344,7 @@ class _Connection(asyncio.Protocol):
                 self._socket.shutdown(socket.SHUT_RDWR)
 
     def spoke(self, body: StreamReader) -> None:
-        """Record that the head of a request has arrived, so the limits on the head end."""
+        """Record that the head of a request has arrived, which ends its limits of size and time."""
         self._head, self._body = 0, body
         self._cancel_timer()
 
@@ -392,7 +403,7 @@ def _connection(transport: asyncio.BaseTransport | None) -> _Connection | None:
 
 
 class Reader(RequestHandler):
-    """aiohttp's handler of one connection, but it answers an invalid request with a JSON error."""
+    """aiohttp's handler of one connection, changed to answer invalid requests with JSON errors."""
 
     def __init__(self, counts: Counts, server: Any) -> None:
         """Create a handler. `server` is the attribute `server` of aiohttp's `AppRunner`."""

@@ -1,8 +1,8 @@
 """Decides whether an HTTP request reaches its handler.
 
-The checks, in this order: whether the client is on the robot (`callers.py`), the origin of the web
-page that sent the request, the token, the request rate, the role. A path that does not exist
-requires a token too, so a client without one does not learn which paths exist.
+It checks, in this order, whether the client is on the robot (`callers.py`), the origin of the web
+page that sent the request, the token, the request rate, and the role. A path that does not exist
+requires a token too, so a client without a token does not learn which paths exist.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class Lookups:
         self._read_s = -READ_EVERY_S
 
     async def read(self) -> Sequence[Token]:
-        """Return the robot's tokens, read from the file after this call.
+        """Return the robot's tokens from a read of the token file that starts after this call.
 
         Raises `TimeoutError` if the disk does not answer.
         """
@@ -103,7 +103,10 @@ class Admission:
         counts: Counts,
         rules: WebConfig,
     ) -> None:
-        """Store the arguments. `names` are the robot's host names and addresses, in lower case."""
+        """Create the checks for the page of the robot with the id `robot`.
+
+        `names` are the robot's host names and addresses, in lower case.
+        """
         self._local, self._origins = Who(rules.local, HERE), frozenset(rules.origins)
         self._robot, self._names, self._vault = robot, names, vault
         self._acceptor, self._counts = acceptor, counts
@@ -156,7 +159,7 @@ class Admission:
                 await self._pace_stranger(request)
                 return self._preflight(request)
             waits = await self._admit(request, self._rows.get(request.match_info.route))
-            # For a POST, only the answer is delayed, so a stop is sent to the robot at once.
+            # For a POST, only the answer is delayed, so the server sends a stop without delay.
             if waits and request.method != "POST":
                 await asyncio.sleep(HOLD_S)
             answer = await handler(request)
@@ -189,17 +192,19 @@ class Admission:
             return problem(error.status, WORDS.get(error.status, error.reason))
 
     async def _pace_stranger(self, request: web.Request) -> None:
-        """Delay a request without a valid token by `HOLD_S` if it exceeds the rate `STRANGERS`.
+        """Delay a request without a valid token by `HOLD_S` if it exceeds the limit `STRANGERS`.
 
-        The rate is for all such requests from the client's network.
+        The limit applies to all requests without a valid token from the client's network.
         """
         if not self._strangers.take(network_of(peer_of(request)), clock.mono_ns()):
             await asyncio.sleep(HOLD_S)
 
     async def _admit(self, request: web.Request, row: Route | None) -> bool:
-        """Store the client's identity in the request; return whether it exceeds its rate limit.
+        """Store the client's identity in the request; return whether the request must be delayed.
 
-        `row` is None for an unknown path. Raises `RefusedError` if the client may not use the path.
+        It must be delayed if the client exceeds the rate limit of a path whose requests wait. `row`
+        is the route of the path, or None for an unknown path. Raises `RefusedError` if the client
+        may not use the path.
         """
         said = asked_of(request)
         here = place(said, self._names | {own_address(request)}) == "here"
@@ -208,9 +213,9 @@ class Admission:
         if request.method not in ("GET", "HEAD") if is_open else not listed:
             require_own_origin(said)
         if is_open:
-            # A browser loads the files of the page over several connections. If these show a valid
-            # token, they must not be closed to make room for others before the browser requests a
-            # row that needs the token.
+            # A browser loads the files of the page over several connections before it requests a
+            # path that needs a token. If such a connection shows a valid token already, this is
+            # recorded, so that the connection is not closed to make room for another one.
             shown = [] if here else tokens_shown(request, self._robot)
             if who := next(filter(None, map(self._vault.known, shown)), None):
                 self._acceptor.admitted(request.transport, who)
@@ -299,12 +304,12 @@ def own_port(request: web.Request) -> int:
 
 
 def tokens_shown(request: web.Request, robot: str) -> list[str]:
-    """Return the tokens from `tokens_sent()`, or else those in the cookies for the robot's id."""
+    """Return the tokens from `tokens_sent()`. If there are none, return those in the cookies."""
     return tokens_sent(request) or tokens_in(request.cookies, robot, own_port(request))
 
 
 def tokens_sent(request: web.Request) -> list[str]:
-    """Return the token in the header `Authorization`, or else those in `Sec-WebSocket-Protocol`."""
+    """Return the token in `Authorization`. If there is none, use `Sec-WebSocket-Protocol`."""
     kind, _, text = request.headers.get("Authorization", "").partition(" ")
     if kind.lower() == "bearer":
         return [text.strip()]

@@ -53,13 +53,13 @@ POLICY = (
     "default-src 'self'; connect-src 'self'{connect}; frame-ancestors 'none'; base-uri 'none'; "
     "form-action 'self'"
 )
-"""Content security policy of every answer except a report. `{connect}` stands for the page's
-WebSocket URLs. In an error answer, these URLs are left out, so that a forged `Host` header is not
-copied into the answer."""
+"""Content security policy of every answer except a report. `{connect}` is replaced by the
+page's WebSocket URLs. An error answer does not contain these URLs, so that a forged `Host` header
+is not copied into it."""
 
 
 class TroubleError(AcsardError):
-    """An allowed request cannot be fulfilled; `status` is the HTTP status of the answer."""
+    """A permitted request cannot be fulfilled. `status` is the HTTP status of the answer."""
 
     def __init__(self, status: int, text: str) -> None:
         super().__init__(text)
@@ -81,7 +81,8 @@ def sent(request: web.Request, file: File) -> web.Response:
     If the client has the file already, return an answer with the status 304 instead.
     """
     headers = {"ETag": file.tag, "Cache-Control": "no-cache", "Vary": "Accept-Encoding"}
-    # A 304 has the policy too, because the browser then replaces the one stored with the file.
+    # An answer with the status 304 contains the policy too, because the browser uses it in place of
+    # the policy that it has stored with the file.
     headers["Content-Security-Policy"] = _policy(request, file.policy)
     if request.headers.get("If-None-Match") == file.tag:
         return web.Response(status=304, headers=headers)
@@ -109,10 +110,10 @@ async def sent_in_pieces(
 async def sent_unpacked(
     request: web.Request, packed: bytes, headers: Mapping[str, str], within: float
 ) -> web.StreamResponse:
-    """Send what the gzip data `packed` contains, for a client that does not take gzip.
+    """Send the decompressed gzip data `packed` to a client that does not accept gzip.
 
-    Each piece is unpacked only when the client has taken the pieces before it, so slow clients cost
-    little memory. If sending takes longer than `within` s, cut the connection.
+    Each piece is decompressed only when the client has received the earlier pieces, so a slow
+    client costs little memory. If sending takes longer than `within` s, cut the connection.
     """
     if request.method == "HEAD":
         return web.Response(headers=headers)
@@ -152,17 +153,18 @@ def takes_gzip(request: web.Request) -> bool:
 
 
 def cut(transport: asyncio.BaseTransport | None) -> None:
-    """End a connection at once. None is a connection that has ended.
+    """Abort a connection without waiting for the client; do nothing if `transport` is None.
 
-    If somebody has closed a TLS connection twice, the limit of its TLS shutdown ends it.
+    A TLS connection that was closed twice cannot be aborted. It ends when the time limit of its TLS
+    shutdown is over.
     """
     if transport is None:
         return
     try:
         transport.abort()  # type: ignore[attr-defined]
     except AttributeError:
-        # After the second close the transport has lost its TLS protocol. Python 3.11.2 overlooks
-        # that, and later versions do nothing.
+        # After a second close, the transport has no TLS protocol any more. Python 3.11.2 does not
+        # check that and raises this error; later versions do nothing.
         if not transport.is_closing():
             raise
 
@@ -203,9 +205,9 @@ INLINED = {
         "style.css": (b'<link rel="stylesheet" href="page/style.css">', "style"),
     }
 }
-"""Maps a file to the files that are sent inside it. Each inner file has two values: the element of
-the outer file that would load the inner file, and the name of the element that replaces it and
-contains the inner file's text."""
+"""Maps a file to the files that are sent inside it. Each inner file has a pair of values: the
+element in the outer file that loads the inner file, and the name of the element that replaces this
+element and contains the text of the inner file."""
 
 
 class File(Struct, frozen=True):

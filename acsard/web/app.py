@@ -65,9 +65,9 @@ DEFAULT = WebConfig()
 
 
 class TokenForm(Struct, frozen=True):
-    """The token of an invitation.
+    """The token of an invitation, which the browser gets back as a cookie.
 
-    If `replace` is true, the token replaces a cookie of the browser that has more permissions.
+    If `replace` is true, this cookie may replace an earlier one that has more permissions.
     """
 
     token: str
@@ -79,7 +79,7 @@ class Caller(Struct, frozen=True):
 
     role: Role
     name: str
-    full: Annotated[str, Meta(description='why the caller may open no other WebSocket, or ""')]
+    full: Annotated[str, Meta(description='why the caller cannot open a WebSocket now, or ""')]
 
 
 class Setting(Struct, frozen=True, omit_defaults=True):
@@ -95,7 +95,7 @@ class Setting(Struct, frozen=True, omit_defaults=True):
 
 
 class Page:
-    """The web application of the robot's page: its request handlers and their common state."""
+    """The web application of the robot's page: the request handlers and the data they share."""
 
     def __init__(
         self,
@@ -105,7 +105,10 @@ class Page:
         acceptor: Acceptor,
         rules: WebConfig = DEFAULT,
     ) -> None:
-        """Make the application. `names` are the robot's host names and addresses, in lower case."""
+        """Create the web application.
+
+        `names` are the robot's host names and addresses, in lower case.
+        """
         self._parts, self._vault, self._acceptor = parts, vault, acceptor
         self._robots, self._files, self._reports = parts.robots, Files(), Reports()
         self._box = BlackBox(parts.robots)
@@ -163,7 +166,8 @@ class Page:
         # Access to the disk starts a thread, and the whole server waits while a thread starts.
         if file is None or now > read + 1.0:
             if file is not None:
-                self._sent[name] = file, now  # until the disk has answered
+                # Other requests get the old file until the disk has answered.
+                self._sent[name] = file, now
             file = await in_thread(lambda: self._files.get(name), READ_S)
             if file is None:
                 self._sent.pop(name, None)
@@ -172,7 +176,7 @@ class Page:
         return sent(request, file)
 
     async def token(self, request: web.Request) -> web.StreamResponse:
-        """Check a posted token, and put the token into a cookie that no script can read."""
+        """Check the posted token, and return it in a cookie that no script can read."""
         form = await _token_posted(request)
         if not request.secure:
             raise RefusedError("plain", "over plain http, no token is needed: connect without one")
@@ -400,7 +404,7 @@ ROUTES: tuple[Route, ...] = (
                          Problem)}),
     Route("GET", "/ws", "viewer", Page.socket,
         "a WebSocket that carries JSON text both ways, to follow Zenoh keys, to drive and to stop",
-        gives={101: Body("It is open.", media="")}, rate=OPENINGS, waits=True),
+        gives={101: Body("The WebSocket is open.", media="")}, rate=OPENINGS, waits=True),
     Route("GET", "/api", "viewer", Page.api, "this document", gives={200: Body("OpenAPI 3.1.")}),
     Route("GET", "/api/whoami", "viewer", Page.whoami, "the caller's role and name",
         gives={200: Body("The caller.", Caller)}, rate=STOPS, waits=True),

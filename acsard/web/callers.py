@@ -2,9 +2,9 @@
 
 This module is pure. A client on the robot itself needs no token and has the role in `web.local`.
 However, any web page in a browser on the robot may open `ws://localhost`, or may let its own host
-name point to 127.0.0.1. So the header `Host` must be a loopback name, and a header `Origin` must be
-that of the robot's own page or one in `web.origins`. A client on another machine must use HTTPS, a
-name or address of the robot, and a token.
+name point to 127.0.0.1. So the header `Host` must be a loopback name. The header `Origin`, if there
+is one, must be the origin of the robot's own page or one of those in `web.origins`. A client on
+another machine must use HTTPS, a name or address of the robot, and a token.
 
 A request through a proxy is refused. A proxy on the robot that rewrites `Host` would make all of
 its clients look local.
@@ -30,7 +30,7 @@ Reason = Literal[
 Place = Literal["here", "away"]
 
 HERE = "here"
-"""Name that stands for every client on the robot itself, because it has no token with a name."""
+"""Name of every client on the robot itself, which has no token from which to take a name."""
 
 COOKIE = "__Host-acsard"
 """Prefix of the cookie names. Browsers accept a cookie with the prefix `__Host-` only with Secure,
@@ -143,8 +143,8 @@ def require_own_origin(asked: Asked) -> None:
 def by_listed_page(asked: Asked, origins: Collection[str]) -> bool:
     """Return whether a web page of an origin in `web.origins` made the browser send this request.
 
-    The result is always False for the robot's own page, because the cookies of a page in
-    `web.origins` are ignored.
+    Return False for the robot's own page, even if `web.origins` lists its origin. Otherwise, the
+    cookies of the robot's own page would be ignored like those of a listed page.
     """
     if asked.origin is None or asked.origin.lower() == _own_origin(asked):
         return False

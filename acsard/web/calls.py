@@ -1,8 +1,8 @@
 """Service calls and queries to the robot.
 
 Each call blocks a thread of its own. Calls of the service `stop` ("stops") have their own limits,
-so a stop never waits for other calls. If several stops are requested at once, the server may send
-one stop for all of them, after the last request has arrived.
+so a stop never waits for other calls. If several stops are requested in quick succession, the
+server may send one stop for all of them, after the last request has arrived.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from acsard.web.limits import STOPS_ELSEWHERE
 from acsard.web.robots import Robots
 
 AT_ONCE, STOPS_AT_ONCE = 16, 32
-"""Maximum number of service calls and queries at the same time; maximum number of stops of the
-page's own robot at the same time, which are counted separately."""
+"""Maximum numbers of simultaneous service calls and queries (`AT_ONCE`), and of simultaneous stops
+of the page's own robot, which are counted separately (`STOPS_AT_ONCE`)."""
 
 ELSEWHERE_AT_ONCE = 8
-"""Maximum number of stops of other robots that wait for a reply. Beyond it, a stop is sent without
-waiting for the reply."""
+"""Maximum number of stops of other robots for whose reply the server waits at the same time. Beyond
+this number, a stop is sent without waiting for its reply."""
 
 MERGE_S = 0.02
 """Shortest interval between two stops that are sent for one client to one robot, s."""
@@ -64,9 +64,10 @@ class Calls:
         ends: Callable[[], Awaitable[Ending]],
         sees: Callable[[str], bool],
     ) -> None:
-        """Store the arguments.
+        """Create the limits, with no call running.
 
-        `ends` interrupts a running check or calibration, and `sees(id)` tells if a robot is known.
+        `ends` interrupts a running check or calibration. `sees(id)` returns whether the robot with
+        this id is known to the server.
         """
         self._robots, self._ends, self._sees = robots, ends, sees
         self._stops, self._merged = Stops(), Merged()
@@ -126,7 +127,7 @@ class Calls:
         return reply
 
     async def get(self, robot: str, name: str) -> tuple[str, bytes]:
-        """Query the last value of a robot's key as JSON; return its encoding and its payload.
+        """Query the last value of a robot's key as JSON; return the pair (encoding, payload).
 
         Raises `MendableError` if there is no connection, if no answer arrives, or if `AT_ONCE`
         requests are running already.

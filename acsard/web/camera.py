@@ -1,4 +1,4 @@
-"""The newest picture of a camera's MJPEG stream, for the clients of the page.
+"""Fetches the newest picture of a camera's MJPEG stream for the clients of the page.
 
 Another program (ustreamer, go2rtc, mjpg-streamer) serves the stream. One connection reads the
 stream while clients ask for pictures. Only the newest picture is kept, so a client with a slow
@@ -34,8 +34,7 @@ MAX_PICTURE, MAX_HEAD = 1_000_000, 4096
 kB."""
 
 SENDS, SENDS_OF_TOKEN = 8, 2
-"""Maximum number of pictures that are being sent at the same time: in all, and to the clients with
-one token."""
+"""Maximum number of pictures that are being sent at the same time: in total, and per token."""
 
 SEND_S = 5.0
 """Time limit for sending a picture, s. The page in the browser waits no longer than this."""
@@ -55,10 +54,10 @@ class Parts:
     """Cuts a `multipart/x-mixed-replace` stream into its parts, the pictures."""
 
     def __init__(self, boundary: str) -> None:
-        """Store the boundary from the content type of the stream.
+        """Store `boundary`, which comes from the content type of the stream.
 
-        Some servers write it with the two dashes that come before it in the stream. They are
-        removed.
+        In the stream, two dashes precede each boundary. Some servers also write these dashes in the
+        content type, so they are removed from `boundary`.
         """
         self._end = b"\r\n--" + boundary.strip('"').removeprefix("--").encode()
         self._buffer = bytearray()
@@ -100,7 +99,8 @@ class Camera:
     def __init__(self, url: str) -> None:
         self._url = url
         self.newest: Picture | None = None
-        """The newest picture. It is None at first, after a failure and while no client asks."""
+        """The newest picture; None before the first one, after a failure, and while no client asks
+        for pictures."""
         self._number = 0
         self._trouble = "the camera's stream has no picture yet"
         self._asked_ns = 0
@@ -143,7 +143,7 @@ class Camera:
                 while not self._sends.enter(token):
                     await self._sent.wait()
         except TimeoutError:
-            text = f"{SENDS_OF_TOKEN} pictures are being sent to this token, or {SENDS} in all"
+            text = f"{SENDS_OF_TOKEN} pictures with this token, or {SENDS} in total, are being sent"
             raise TroubleError(503, f"{text}: ask again when one has arrived") from None
         try:
             yield
@@ -166,7 +166,7 @@ class Camera:
                     self._trouble = f"the camera's stream cannot be read: {error or 'no answer'}"
                     self.newest = None  # clients get the reason instead of an old picture
                 await asyncio.sleep(0.5)
-        self.newest = None  # the next client must not see a picture from before
+        self.newest = None  # the next client must not get this old picture
 
     async def _read(self, session: aiohttp.ClientSession) -> None:
         async with session.get(self._url, allow_redirects=False) as answer:

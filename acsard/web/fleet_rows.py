@@ -1,4 +1,4 @@
-"""The list of the robots on the bus, for viewers of the page that have subscribed to it."""
+"""The list of the robots on the bus, to which viewers of the page can subscribe."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Fleet:
         self._tidy()
 
     def rows(self) -> list[Row]:
-        """Return one row per robot, sorted by id, and start any due query in the background."""
+        """Return one row per robot, sorted by id, and start due queries in the background."""
         self._look()
         rows = [] if self._tracked is None else self._tracked.rows()
         return [_row(one) for one in sorted(rows, key=lambda one: one.robot_id)]
@@ -62,7 +62,8 @@ class Fleet:
     def sees(self, robot: str) -> bool:
         """Return whether the robot is known to this server.
 
-        It is known if it has a liveliness token, or if a state has arrived that a viewer follows.
+        A robot is known if its liveliness token is present, or if a viewer follows its `state` and
+        one has arrived.
         """
         states = self._robots.streams.followed(robot, STATE)
         here = self._tracked is not None and self._tracked.here(robot)
@@ -83,7 +84,7 @@ class Fleet:
             by_name = robots.endpoint.startswith("tls/")
             why = BY_NAME if by_name else "" if client.session.info.routers_zid() else UNROUTED
             self.note = why.format(robot=robots.id, endpoint=robots.endpoint)
-            # A robot that has been silent for this long is dropped, unless its liveliness token is
+            # A robot that has been silent for 30 s is dropped, unless its liveliness token is
             # present.
             return fleet.Fleet(client, [robots.id if by_name else ALL], MOST, 30.0)
 

@@ -1,9 +1,9 @@
-"""Runs a board check or a calibration for a browser, as a child process (`acsard` itself).
+"""Runs a board check or a calibration for a browser, in a child process that runs `acsard` itself.
 
-Only one child runs at a time. Only the WebSocket that started the child receives the lines that the
-child prints (`terminal/json_prompt.py`), and may answer its questions. If this WebSocket ends, the
-child is interrupted as by Ctrl-C, so the child still sends zero speeds. The child also ends when
-this server ends, because the child watches its standard input.
+Only one child runs at a time. The lines that the child prints (`terminal/json_prompt.py`) go only
+to the WebSocket that started the child, and only this WebSocket may answer the child's questions.
+If this WebSocket ends, the child is interrupted as by Ctrl-C, so the child still sends zero speeds.
+The child also ends when this server ends, because the child watches its standard input.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class Choices(Struct, frozen=True):
 
 
 class _Said(Struct, frozen=True):
-    """The fields in the lines of the child process to which this server reacts."""
+    """The fields of the child's output lines that this server uses itself."""
 
     question: int = 0
     leg: bool = False
@@ -121,7 +121,7 @@ class Guide:
             errand.leave()
 
     def begin(self, viewer: object, by: str, asked: Begin) -> str:
-        """Start the check or calibration `asked` for a viewer, whose user is `by`.
+        """Start the check or calibration `asked` for a viewer; `by` is the name of its user.
 
         Return "" or the reason for a refusal.
         """
@@ -159,8 +159,8 @@ class Guide:
     async def stop(self) -> Ending:
         """Interrupt the running check or calibration, because a client stops the robot.
 
-        The client need not be the one that started it. The daemon alone cannot stop the wheels
-        during a check, because the check holds the serial port.
+        Any client may do this, not only the one that started the check or calibration. The daemon
+        alone cannot stop the wheels during a check, because the check holds the serial port.
         """
         if self._errand is None or self._task is None:
             return Ending()
@@ -172,7 +172,7 @@ class Guide:
     def heard(self, viewer: object) -> None:
         """Send a sign of life to the child that the viewer started.
 
-        While the robot may move, the child ends if such signs stop.
+        While the robot may move, the child ends if no sign of life arrives for some time.
         """
         if (errand := self._of(viewer)) is not None:
             errand.relay()
@@ -223,7 +223,7 @@ class Guide:
 def boards(configured: str) -> list[Board]:
     """Return the serial ports, and the simulator, from which the user chooses one to check.
 
-    The configured port is the first. Call this in a thread, because it blocks.
+    The configured port comes first. Call this function in a thread, because it blocks.
     """
     found: dict[str, str] = {}
     for device in serial_devices():
@@ -296,7 +296,7 @@ class _Errand:
         return Guided(Running(self.name, self.by, viewer is self.viewer))
 
     async def run(self, given: Sequence[str]) -> tuple[int, str]:
-        """Run the child; return its exit code and its last error output. Raises `OSError`."""
+        """Run the child; return the pair (exit code, last error output). Raises `OSError`."""
         if self.left:
             return int(Exit.FAILURE), ""
         async with running(acsard(*given), stdin=PIPE, stdout=PIPE, stderr=PIPE) as process:
@@ -341,7 +341,7 @@ class _Errand:
             self._interrupt()
 
     def kill(self) -> None:
-        """Kill the child at once, without letting it send zero speeds."""
+        """Kill the child without letting it send zero speeds."""
         if self._process is not None and self._process.returncode is None:
             self._process.kill()
 

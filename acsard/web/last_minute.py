@@ -1,7 +1,8 @@
-"""The plotted values of the last minute, for a page that has just been opened. Pure.
+"""The plotted values of the last minute, for a page that has just been opened.
 
 The commanded speeds arrive a hundred times a second on `cmd_vel_out`, so the server receives them
-only while a viewer has subscribed to that key. All other values come from the key `state`.
+only while a viewer has subscribed to that key. All other values come from the key `state`. This
+module is pure.
 """
 
 from __future__ import annotations
@@ -39,9 +40,9 @@ Column = Sequence[float | None]
 
 
 class Plotted(Struct, frozen=True):
-    """A column for each line of the plots, thinned to about five rows a second.
+    """The values to plot: one column for each plotted line, with about five rows a second.
 
-    All columns are as long as `age`.
+    All columns have the same length as `age`.
     """
 
     age: Sequence[int]
@@ -59,11 +60,11 @@ class Plotted(Struct, frozen=True):
     wheels: Sequence[Column]
     """Measured wheel speeds in rad/s: front right, front left, rear left, rear right."""
     late_p99: Column
-    """How late the control periods of the daemon began, ms: the 99th percentile over the minute
-    before the row."""
+    """99th percentile of the delays with which the daemon's control periods began, over the minute
+    before the row, ms."""
     late_max: Column
-    """How late the control periods of the daemon began, ms: the maximum over the minute before the
-    row."""
+    """Maximum of the delays with which the daemon's control periods began, over the minute before
+    the row, ms."""
     volts: Column
     """Voltage of the battery, V; None if the board does not report it."""
 

@@ -41,8 +41,8 @@ OVERRUNS = 600
 """Number of messages beyond the rate limit `MESSAGES` after which a WebSocket is closed."""
 
 CONNECTIONS, CONNECTIONS_OF_ONE, CONNECTIONS_OF_TOKEN, CONNECTIONS_ALIKE = 100, 20, 30, 6
-"""Maximum numbers of WebSockets from other machines: in all, per address, per token, and per token
-at one address. Because of the last limit, one program cannot lock out other tokens at its
+"""Maximum numbers of WebSockets from other machines: in total, per address, per token, and per
+token at one address. Because of the last limit, one program cannot lock out other tokens at its
 address."""
 
 CONNECTIONS_HERE = 20
@@ -50,8 +50,8 @@ CONNECTIONS_HERE = 20
 robot."""
 
 STREAMS, STREAMS_OF_ONE = 200, 50
-"""Maximum numbers of subscribed keys of other robots: in all, and per token. Keys of the page's own
-robot are few and are not counted."""
+"""Maximum numbers of subscribed keys of other robots: in total, and per token. Keys of the page's
+own robot are few and are not counted."""
 
 
 REQUESTS = Rate(50.0, 200.0)
@@ -66,15 +66,15 @@ second."""
 STRANGERS = Rate(30.0, 150.0)
 """Limit on requests without a valid token from one network, as a rate per second and a largest
 burst. Requests beyond the limit wait. A phone loads the page with 16 requests, so eight phones
-behind one address can load the page at once."""
+behind one address can load the page at the same time."""
 
 HANDSHAKES = Rate(30.0, 100.0)
 """Limit on TLS handshakes per network, as a rate per second and a largest burst. Handshakes beyond
 the limit wait. A browser needs six."""
 
 HOLD_S = 0.5
-"""Delay of a request beyond a rate limit, s. Refusing the request at once would not help, because a
-refusal costs the server as much as an answer."""
+"""Delay of a request beyond a rate limit, s. Refusing the request immediately would not help,
+because a refusal costs the server as much as an answer."""
 
 MESSAGES = Rate(200.0, 400.0)
 """Limit on messages per WebSocket, as a rate per second and a largest burst. A client sends a burst
@@ -88,11 +88,10 @@ daemon drop half of the commands of a client that was driving."""
 
 STOPS_ELSEWHERE = Rate(4.0, 16.0)
 """Limit on stops per token to robots that may not exist, as a rate per second and a largest burst.
-A robot may not exist if this server neither sees it on the bus nor has received its answer to a
-stop."""
+A robot is known to exist if this server sees it on the bus or has received its answer to a stop."""
 
 GUESSES_OF_ONE, GUESSES = Rate(10 / 60, 10.0), Rate(100 / 60, 100.0)
-"""Limits on wrong tokens, from one network and in all, as rates per second and largest bursts."""
+"""Limits on wrong tokens, from one network and in total, as rates per second and largest bursts."""
 
 
 C = TypeVar("C", bound=Hashable)
@@ -105,11 +104,12 @@ def sockets_for(files: int) -> int:
 
 
 class Sockets(Generic[C]):
-    """The open TCP connections. When all places are taken, a new connection displaces an old one.
+    """The open TCP connections. When all places are taken, a new connection displaces an older one.
 
     1. The network with the most connections without a valid token loses the oldest of these.
     2. If every connection has shown a valid token, the token with the most connections loses its
-       oldest one. If this token has only `SOCKETS_OF_BROWSER`, the new connection is refused.
+       oldest one. If this token has at most `SOCKETS_OF_BROWSER` connections, the new connection is
+       refused instead.
     """
 
     def __init__(self, most: int) -> None:
@@ -233,9 +233,10 @@ class Seats:
             places.leave(name)
 
     def _places(self, address: str, token: str) -> list[tuple[Places, str, str]]:
-        """Return the limits that apply to a WebSocket.
+        """Return the limits that apply to a WebSocket, as triples.
 
-        Each has the name under which the WebSocket is counted, and the text of a refusal.
+        A triple holds the limit, the name under which the limit counts the WebSocket, and the text
+        of a refusal.
         """
         if not token:
             here = f"{CONNECTIONS_HERE} pages are open on the robot itself: close some"
@@ -260,7 +261,8 @@ class Shares:
     """Limits the number of resources in use, in total and per holder.
 
     A resource that several holders share counts once in the total. The server uses this class for
-    subscriptions to keys of other robots. The holders of these are tokens.
+    subscriptions to keys of other robots. Each holder is then a token, or the name of a client
+    without a token.
     """
 
     def __init__(self, most: int, of_one: int) -> None:

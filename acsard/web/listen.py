@@ -91,7 +91,7 @@ def invitations(listen: Sequence[Listen], tls: str) -> list[str]:
 
 
 def opened_by(one: Listen, tls: str) -> list[str]:
-    """Return the URLs with which a browser opens the page at this address, the best one first."""
+    """Return the URLs that open the page at the address `one`, the most reliable one first."""
     return invitations([one], tls) if one.secure else [one.url]
 
 
@@ -128,9 +128,10 @@ def _older_ports(listen: Sequence[Listen]) -> set[int]:
 
 
 def _bound(one: Listen, next_port: bool, both: bool) -> tuple[Listen, socket.socket]:
-    """Open a socket at the port of `one`, or with `next_port` at the first free port from there.
+    """Open a socket at the address and port of `one`.
 
-    If `both` is true, a socket at `::` accepts IPv4 connections too.
+    If `next_port` is true and the port is taken, use the first free one of the following ports. If
+    `both` is true, a socket at `::` accepts IPv4 connections too.
     """
     ports = range(one.port, min(65536, one.port + TRIES)) if next_port else [one.port]
     both = both and one.host == EVERYWHERE_6 and socket.has_dualstack_ipv6()

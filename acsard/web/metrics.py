@@ -32,8 +32,8 @@ def text(
 ) -> str:
     """Return all metrics in the text format of Prometheus.
 
-    The robot's metrics are left out unless `heard` is true, which means that messages from the
-    daemon arrive. `viewers` is the number of WebSockets.
+    `heard` is true while messages from the daemon arrive; if it is false, the robot's metrics are
+    left out. `viewers` is the number of open WebSockets.
     """
     lines: list[str] = []
 
@@ -142,8 +142,8 @@ NAMED = 5
 """Maximum number of clients that a log line about refusals names, the most frequent ones first."""
 
 KNOWN = 1000
-"""Maximum number of clients whose refusals are counted by client between two log lines. There is a
-maximum, because one client may use many addresses."""
+"""Maximum number of clients for which refusals are counted separately between two log lines. The
+limit exists because one client may use many addresses."""
 
 
 class Counts:

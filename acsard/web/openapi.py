@@ -25,7 +25,7 @@ Refs = dict[Any, Described]
 """Maps each type to a reference to its schema."""
 
 TO_ROBOT, FROM_ROBOT = "ToRobot", "FromRobot"
-"""Names of the schemas of the WebSocket messages to the robot's server and from it."""
+"""Names of two schemas: the WebSocket messages to the page's server, and those from it."""
 
 VALUE = "Value."
 """Prefix of the schema names for the messages of subscribed keys."""
@@ -176,7 +176,10 @@ def _messages() -> Described:
 
 
 def _flat(node: Any, before: str) -> Any:
-    """Return `node` with each reference `#/$defs/X` changed to the component `before` + X."""
+    """Return a copy of `node` in which each reference `#/$defs/X` names the component `before` + X.
+
+    `node` is a JSON Schema or a part of one.
+    """
     if isinstance(node, list):
         return [_flat(one, before) for one in node]
     if not isinstance(node, dict):
@@ -187,7 +190,7 @@ def _flat(node: Any, before: str) -> Any:
 
 
 def _components(kinds: Iterable[Any]) -> tuple[Described, Refs]:
-    """Return the schemas of `kinds` and their nested types, and a reference to each kind."""
+    """Return a pair: the schemas of `kinds` and their nested types, and a reference per kind."""
     # In one call, msgspec gives different names to two types that have the same name.
     unique = list(dict.fromkeys(kinds))
     refs, parts = msgspec.json.schema_components(

@@ -80,7 +80,7 @@ class Recording(Struct, frozen=True):
 
 
 class BlackBox:
-    """The recordings that the daemon of the page's robot has written.
+    """The recordings that the daemon of the page's robot has made.
 
     Every method raises `TroubleError` if the recordings are not available.
     """
@@ -94,14 +94,15 @@ class BlackBox:
     async def rows(self) -> list[Recording]:
         """Return all recordings, oldest first. The list may be `LISTED_NS` old.
 
-        All requests within this time share one list. To read the files takes processor time, which
-        a client that asks without end would otherwise take from the stops of others.
+        All requests within this time share one list. Otherwise, a client that requests the list all
+        the time would use so much processor time that the stops of other clients are delayed.
         """
         place, now_ns = self._place(), clock.mono_ns()
         old = now_ns - self._listed_ns > LISTED_NS
         if self._listing is None or (old and self._listing.done()):
             self._listing = asyncio.ensure_future(in_thread(lambda: rows(place), READ_S))
-            # All clients may be gone by the time an error comes; nobody would then read it.
+            # Read the error here too, because all clients may be gone by then. asyncio would log an
+            # error that nothing has read.
             self._listing.add_done_callback(
                 lambda listing: listing.cancelled() or listing.exception()
             )
@@ -112,7 +113,7 @@ class BlackBox:
             raise _unread(place, error) from None
 
     async def found(self, name: str) -> tuple[Path, tuple[int, int]]:
-        """Return a recording's path, and a stamp that changes when the recording changes.
+        """Return a pair: a recording's path, and a stamp that changes when the recording changes.
 
         Raises `RefusedError` if the recording does not exist.
         """
@@ -166,14 +167,16 @@ def _files(directory: Path) -> list[Path]:
 def _row(path: Path) -> Recording:
     size = path.stat().st_size
     if path.name.endswith(PART):
-        words = "being recorded" if is_being_recorded(path, time.time()) else "no end: cut off"
+        words = (
+            "being recorded" if is_being_recorded(path, time.time()) else "cut off: no end marker"
+        )
         return Recording(path.name, _begun(path), None, size, words)
     try:
         last = read_end(path)
     except RecordingError as error:
         return Recording(path.name, _begun(path), None, size, str(error))
     if last is None:
-        return Recording(path.name, _begun(path), None, size, "no end: cut")
+        return Recording(path.name, _begun(path), None, size, "cut off: no end marker")
     events = "; ".join(filter(None, [last.said, how_it_ends(last.cut, last.why)]))
     seconds = (last.last_ns - last.wall_ns) / NS_PER_S
     return Recording(path.name, last.wall_ns / NS_PER_S, round(seconds, 3), size, events)
@@ -249,8 +252,9 @@ class Reports:
     def ask(self, path: Path, stamp: tuple[int, int]) -> ReportState:
         """Return the progress of the report of a recording, and start drawing the report if needed.
 
-        A report is drawn again if it failed, or if `stamp` shows that the recording has changed
-        since. This happens only after a client has received the result of the previous drawing.
+        `stamp` is the one from `BlackBox.found()`. A report is drawn again if the previous drawing
+        failed or if `stamp` shows that the recording has changed since then, but only after a
+        client has received the previous result.
         """
         one, now_ns = self._one, clock.mono_ns()
         if one is not None and not one.ended and one.path != path:
@@ -353,7 +357,7 @@ async def _body(child: Process) -> bytes:
 async def _listened(child: Process, one: _Drawing) -> str:
     """Read the child's error output until it ends, and return its lines as text.
 
-    Lines that are numbers are not returned. They are stored as the progress of the drawing `one`.
+    A line that is a number is the progress in percent. It is stored in `one` and not returned.
     """
     assert child.stderr is not None
     said = ""

@@ -33,8 +33,8 @@ AGAIN_S = 1.0
 """Delay before the next attempt to reach a daemon that does not answer, s."""
 
 ASK_S, ASK_SOON_S = 10.0, 1.0
-"""Time until the next query of the values of `About`, s: after an answer, and after a query without
-an answer."""
+"""Time until the next query of the values of `About`, s: after a query that was answered, and after
+a query that was not answered."""
 
 PATH_S, PATH_POINTS, PATH_STEP_M = 600.0, 5000, 0.02
 """Limits of the drawn path: maximum age of a point, s; maximum number of points; minimum distance
@@ -63,13 +63,13 @@ class About(Struct, frozen=True):
 
 
 def _path() -> Track:
-    # The last argument is a distance, 1 m. No robot drives this far between two states, so after a
-    # larger step, the pose must have been set, and the path restarts.
+    # The last argument, 1 m, is the longest step of a path. No robot drives this far between two
+    # states, so a longer step means that the pose was set, and the path restarts.
     return Track(PATH_POINTS, PATH_STEP_M, PATH_S, 1.0)
 
 
 class _Asking:
-    """The bus client of a `Watch`. Queries run in threads and do not block the event loop."""
+    """The bus client that a `Watch` uses. Queries run in threads, so they do not block the loop."""
 
     def __init__(self, client: Client) -> None:
         self.subscribe, self._client = client.subscribe, client
@@ -92,9 +92,10 @@ class Robots:
     """The connection to the daemon of the page's robot, and the data for a newly opened page."""
 
     def __init__(self, address: Address, connect: Connect, about: About, counts: Counts) -> None:
-        """Store the arguments.
+        """Start without a connection.
 
-        `about` holds values of the local configuration. They are used until the daemon answers.
+        `about` holds the values of the local configuration, which are used until the daemon
+        answers.
         """
         self.id, self.endpoint = address.robot_id, address.endpoint
         self.certificate = shown_at(address.endpoint, address.tls)
@@ -134,7 +135,7 @@ class Robots:
         return None if self._watch is None else self._watch.state
 
     def ask_anew(self) -> None:
-        """Query the values of `about` again at once, because they may have changed."""
+        """Query the values of `about` now, without waiting for the next regular query."""
         self._asks.set()
 
     def way(self) -> dict[str, list[tuple[float, float]]]:
@@ -205,9 +206,9 @@ class Robots:
             self._minute.add(now_ns, state, self._wished(now_ns))
 
     def _wished(self, now_ns: int) -> Twist | None:
-        """Return the last twist that was published on the key `cmd_vel_out`.
+        """Return the newest twist that the daemon has published on the key `cmd_vel_out`.
 
-        Return None if the twist is too old, or if no viewer is subscribed to this key.
+        Return None if this twist is too old, or if no viewer is subscribed to the key.
         """
         stream = self.streams.followed(self.id, "cmd_vel_out")
         raw = None if stream is None else stream.raw()

@@ -1,6 +1,7 @@
-"""The rows of the table of paths, `app.ROUTES`. This module is pure.
+"""Defines `Route`, a row of the table of paths `app.ROUTES`. This module is pure.
 
-The router, the admission of requests, the rate limits and the OpenAPI document use this table.
+The router, the admission of requests, the rate limits and the OpenAPI document use that table. The
+rows for the keys and services of the bus are made here.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ _PARAMETER = re.compile(r"{(\w+)}")
 
 
 class Which(Struct, frozen=True):
-    """The robot to stop: the page's own, or another one of the same router."""
+    """The robot to stop, by its id; "" is the page's own robot."""
 
     robot: str = ""
 
@@ -69,21 +70,21 @@ class Route(Struct, frozen=True):
     summary: str = ""
     """Description for the OpenAPI document; "" leaves the row out of it."""
     takes: type | str | None = None
-    """Type of the request's body, or the name of a bus message in `SCHEMAS`; None without a
+    """Type of the request's body, or the name of a bus message in `SCHEMAS`; None if there is no
     body."""
     forms: tuple[str, ...] = (JSON,)
     """Media types of the request's body."""
     gives: Mapping[int, Body] = {}
-    """Maps each HTTP status to the body of the answer. For a status that is missing here, the body
-    is a `Problem`."""
+    """Maps an HTTP status to the body of the answer. An answer with any other status contains a
+    `Problem`."""
     rate: Rate = REQUESTS
     """Limit on the rate of the requests of one token. All routes with the same rate share one
     limit."""
     waits: bool = False
     """True if a request beyond `rate` is delayed; False if it is refused. If true, a POST is
-    carried out at once and only its answer is delayed, and `rate` applies to each token in each
-    network separately, so a program cannot use up the limit of a page that uses the same token in
-    another network."""
+    carried out immediately and only its answer is delayed. `rate` then applies to each token in
+    each network separately, so a program cannot use up the limit of a page that uses the same token
+    in another network."""
 
     @property
     def parameters(self) -> list[str]:
@@ -97,7 +98,7 @@ class Route(Struct, frozen=True):
 
 
 def asked(topic: Topic) -> bool:
-    """Return whether the topic has a last value that a program may query."""
+    """Return whether a program may query the last value of the topic."""
     own = topic.direction in ("out", "query") and "<key>" not in topic.key
     return own and topic.query in ROLES
 

@@ -64,7 +64,7 @@ class Wanted(Struct, frozen=True):
 
 
 async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], log: Log) -> None:
-    """Serve until a signal arrives or the daemon that started this server ends.
+    """Run the page's server until a signal arrives, or until the daemon that started it ends.
 
     `announce` is called with the bound addresses. Raises `MendableError`.
     """
@@ -187,9 +187,10 @@ def _about(wanted: Wanted) -> About:
 
 
 def _certified(wanted: Wanted) -> tuple[ssl.SSLContext | None, set[str]]:
-    """Return the TLS context, and the host names by which other machines reach this one.
+    """Return a pair: the TLS context, and the host names by which other machines reach this one.
 
-    Without HTTPS, return None and an empty set. Raises `MendableError` for a bad certificate.
+    If no address uses HTTPS, return None and an empty set. Raises `MendableError` for a bad
+    certificate.
     """
     if not any(one.secure for one in wanted.listen):
         return None, set()
@@ -205,7 +206,7 @@ def _load(context: ssl.SSLContext, directory: str) -> None:
 
 
 def _names(directory: str) -> set[str]:
-    """Return this machine's names and those in its certificate, without loopback names."""
+    """Return the names of this machine and the names in its certificate, without loopback names."""
     names = {socket.gethostname().lower(), own_name(), *map(str.lower, names_in(directory))}
     return {one for one in names if one != "localhost" and not is_loopback(one)}
 
@@ -213,12 +214,12 @@ def _names(directory: str) -> set[str]:
 async def _renew(
     context: ssl.SSLContext, names: set[str], files: CertificateFiles, directory: str, log: Log
 ) -> None:
-    """Use changed certificate files for later connections, and add their names to `names`."""
+    """Use changed certificate files for later connections, and add the new names to `names`."""
     while True:
         await asyncio.sleep(TIDY_S)
         if not files.renewed():
             continue
-        # If the files change again while they are read, the next round finds the new ones.
+        # If the files change while they are read, the next round reads them again.
         with suppress(OSError, ValueError):
             _load(context, directory)
             names |= _names(directory)

@@ -3,8 +3,8 @@
 Each message is one JSON object. An incoming message is called a frame. It contains exactly one of
 the fields in `KINDS` (`subscribe`, `cmd`, `call`, ...), which gives its kind. A frame with none or
 two of these fields, or with an unknown field, is refused as a whole. An outgoing message is
-identified by its first field. The messages with the values of subscribed keys are not here:
-socket_sender.py builds them, because their values are already JSON.
+identified by its first field. `socket_sender.py` builds the messages with the values of subscribed
+keys, because these values are JSON already.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ Device = Annotated[str, Meta(max_length=200)]
 class FrameError(AcsardError):
     """A message of a client is not valid.
 
-    `about` is the kind that the message was meant to have, or "message" if that is unclear.
+    `about` is the kind that the client meant, or "message" if the kind is unclear.
     """
 
     def __init__(self, about: str, text: str) -> None:
@@ -62,7 +62,7 @@ class _Frame(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Subscribe(_Frame, frozen=True):
-    """Send the messages of a key from now on, at most `rate` per second."""
+    """Subscribe to a key of a robot: send its messages from now on, at most `rate` per second."""
 
     subscribe: Short
     rate: float = USUAL_RATE
@@ -70,7 +70,7 @@ class Subscribe(_Frame, frozen=True):
 
 
 class Unsubscribe(_Frame, frozen=True):
-    """Stop sending the messages of this key."""
+    """End the subscription to a key of a robot."""
 
     unsubscribe: Short
     robot: Short = ""
@@ -86,7 +86,7 @@ class Wish(_Frame, frozen=True):
 class Command(_Frame, frozen=True):
     """Drive at this velocity.
 
-    `stamp` is the time of the command on the sender's own clock, ms.
+    `stamp` is the time of the command on the sender's own clock, ms since 1970.
     """
 
     least: ClassVar[Role] = COMMAND_ROLE
@@ -109,7 +109,7 @@ class Command(_Frame, frozen=True):
 
 
 class Call(_Frame, frozen=True):
-    """Call a service of the robot; the answer carries the same `id`."""
+    """Call a service of the robot. The answer has the `id` of the call."""
 
     call: Short
     id: int | Short = 0
@@ -118,7 +118,7 @@ class Call(_Frame, frozen=True):
 
 
 class Ping(_Frame, frozen=True):
-    """Ask for a pong with the same number."""
+    """Ask the server to send a pong with the number of this ping."""
 
     ping: float
 
@@ -135,14 +135,14 @@ class Begin(_Frame, frozen=True):
 
 
 class Reply(_Frame, frozen=True):
-    """Answer the question with this number; null takes the default."""
+    """Answer the question whose number is `reply`. The value null selects the default."""
 
     reply: Annotated[int, Meta(ge=0, le=1 << 31)]
     value: float | Short | None = None
 
 
 class Press(_Frame, frozen=True):
-    """Press a key at the running check or calibration, or interrupt it like Ctrl-C ("leave")."""
+    """Press a key in the running check or calibration ("key"), or interrupt it ("leave")."""
 
     press: Literal["key", "leave"]
 
@@ -202,7 +202,7 @@ class Greeting(Struct, frozen=True):
     version: str
     role: Role
     sender: str
-    """Public name of the receiving client: the value of `state.sender` while this client drives."""
+    """Public name of this viewer, which is the value of `state.sender` while the viewer drives."""
     limits: Limits
     simulated: bool
     state_rate: float
@@ -211,7 +211,7 @@ class Greeting(Struct, frozen=True):
     """The actions that the client's role does not allow, each with the reason in words. An action
     is the name of a service, "drive", "recordings" or "begin" (a check or calibration)."""
     camera: bool
-    """Whether `GET /api/camera` has pictures."""
+    """True if a camera is configured, whose pictures `GET /api/camera` returns."""
 
 
 class Hello(Struct, frozen=True):
@@ -221,7 +221,7 @@ class Hello(Struct, frozen=True):
 
 
 class DrivenPath(Struct, frozen=True):
-    """Path of the robot in the last ten minutes: m in the odom frame, oldest first."""
+    """Points (x, y) of the robot's path in the last ten minutes, m, odom frame, oldest first."""
 
     path: Sequence[Point]
     truth: Sequence[Point]
@@ -235,7 +235,7 @@ class LastMinute(Struct, frozen=True):
 
 
 class Answer(Struct, frozen=True):
-    """Answer to a call, with the id of that call."""
+    """Answer to a call. `answer` is the id of the call."""
 
     answer: int | str
     ok: bool
@@ -281,22 +281,22 @@ class Pong(Struct, frozen=True):
 
 
 class Refused(Struct, frozen=True):
-    """A message that was refused, and the reason."""
+    """Report of a refused message: the kind of the message (`refused`), and the reason."""
 
     refused: str
     reason: str
 
 
 class Gone(Struct, frozen=True):
-    """The daemon is not reachable, with the reason."""
+    """Report that the daemon is not reachable. `gone` is the reason."""
 
     gone: str
 
 
 class Running(Struct, frozen=True, omit_defaults=True):
-    """The running check or calibration, or "" if nothing runs.
+    """Name of the running check or calibration, or "" if neither runs.
 
-    `by` is the user who started it, and `yours` is true if this viewer started it.
+    `by` is the name of the user who started it. `yours` is true if this viewer started it.
     """
 
     running: str
@@ -305,7 +305,7 @@ class Running(Struct, frozen=True, omit_defaults=True):
 
 
 class Ended(Struct, frozen=True):
-    """End of a check or calibration: exit code, its meaning, and the error text."""
+    """Report that a check or calibration has ended: exit code, its meaning, and error text."""
 
     ended: int
     meaning: str
@@ -313,6 +313,6 @@ class Ended(Struct, frozen=True):
 
 
 class Guided(Struct, frozen=True):
-    """News of a check or calibration: that it is running, a line that it printed, or its end."""
+    """Report about a check or calibration: that it runs, a line that it printed, or its end."""
 
     guide: Running | msgspec.Raw | Ended

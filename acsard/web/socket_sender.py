@@ -28,15 +28,15 @@ from acsard.web.socket_messages import Refused, Subscribe, Unsubscribe
 from acsard.web.streams import KEYS, UNREADY, Stream
 
 REPORTS = Rate(1.0)
-"""Limit on the reports to a client that its messages are refused, per second. It applies to each
-kind of message and each reason separately."""
+"""Limit on the reports with which the server tells a client about its refused messages, per second.
+It applies to each kind of message and each reason separately."""
 
 
 class Following:
-    """A key to which the client has subscribed, and the time at which its next value is due."""
+    """A key to which the client has subscribed, and the time at which to send its next value."""
 
     def __init__(self, robot: str, name: str, own: str, period: float) -> None:
-        """Store a subscription to the key `name` of `robot`, with a value every `period` s.
+        """Store a subscription to the key `name` of `robot`, with at most one value per `period` s.
 
         `own` is the id of the page's own robot.
         """
@@ -59,7 +59,7 @@ class Outgoing:
         self._origin = origin
         self.following: dict[tuple[str, str], Following] = {}
         """Subscribed keys by (robot, key)."""
-        # If more messages than this wait, the oldest are dropped.
+        # If more than 200 messages wait, the oldest ones are dropped.
         self._out: deque[bytes] = deque(maxlen=200)
         self._pong: bytes | None = None
         """Data of the newest ping that has no answer yet, or None."""
@@ -122,15 +122,15 @@ class Outgoing:
             await self._socket.send_frame(said, aiohttp.WSMsgType.CLOSE)
 
     def cut(self) -> None:
-        """End the connection at once, without a reason."""
+        """End the connection without telling the client the reason."""
         self._closing = True
         cut(self._transport)
 
     def pong(self, data: bytes) -> None:
-        """Queue the answer to a ping, in place of an unsent answer to an earlier ping.
+        """Queue the answer to a ping; it replaces an unsent answer to an earlier ping.
 
-        The WebSocket protocol allows this. So a client that sends pings and does not read cannot
-        fill the memory.
+        The WebSocket protocol allows the replacement. Because of it, a client that sends pings and
+        does not read the answers cannot fill the memory.
         """
         self._pong = data
         self._news.set()
@@ -147,7 +147,7 @@ class Outgoing:
             await self._send(self._out.popleft())
 
     async def _send_due(self, one: Following, now: float) -> float:
-        """Send the newest value of a key if a value is due and this one has not been sent yet.
+        """Send the newest value of a key if its time has come and the value is not sent yet.
 
         Return the time at which the next value is due, s on the event loop's clock.
         """
@@ -174,14 +174,15 @@ class Outgoing:
 MOST = 32
 
 FRAMES_HZ = 300.0
-"""Maximum sum of the message rates of all keys of one WebSocket, Hz. The rest of the processor time
-is for driving."""
+"""Maximum sum of the message rates of all keys of one WebSocket, Hz. A higher sum would take
+processor time from the commands."""
 
 
 class Keys:
     """The subscriptions of one WebSocket.
 
-    They are counted under `holder`, which is the client's token, or its name without a token.
+    `holder` is the name under which the limits count the subscriptions: the client's token, or the
+    name of a client without a token.
     """
 
     def __init__(
@@ -194,7 +195,7 @@ class Keys:
         self._out, self._robots, self._start, self._holder = out, robots, start, holder
 
     def subscribe(self, frame: Subscribe) -> None:
-        """Subscribe to a key, or change its rate. If this is refused, tell the client why."""
+        """Subscribe to a key or change its rate, or tell the client why this is refused."""
         robot, key = frame.robot or self._robots.id, frame.subscribe
         try:
             require_id(robot)
@@ -222,7 +223,7 @@ class Keys:
             )
         elif robot != self._robots.id and not self._shares.enter(self._holder, (robot, key)):
             text = (
-                f"one token may follow at most {STREAMS_OF_ONE} keys of other robots at once, "
+                f"one token may follow at most {STREAMS_OF_ONE} keys of other robots, "
                 f"and all tokens together at most {STREAMS}"
             )
             self._out.refuse("subscribe", "too_many", f"{text}: unsubscribe from some")

@@ -1,7 +1,7 @@
-"""The newest message of a key, as JSON, shared by all viewers of the page.
+"""Keeps the newest message of each followed key, as JSON for all viewers of the page.
 
-The daemon sends msgpack. Zenoh's thread only stores the message, which is converted to JSON when a
-viewer first needs it.
+The daemon sends msgpack. Zenoh's thread only stores a message. It is converted to JSON when the
+first viewer needs it.
 """
 
 from __future__ import annotations
@@ -32,8 +32,9 @@ KEYS = frozenset(topic.key for topic in FOLLOWED)
 DECLARE_S = 3.0
 
 STATE = "state"
-"""Key of a robot's state. The server does not query the state of another robot, because the storage
-of a router would answer with an old state even if the robot has been off for a week."""
+"""Key of a robot's state. The server queries this key only of the page's own robot. For another
+robot, a router's storage would answer with an old state even if that robot has been off for a
+week."""
 
 UNREADY = (TimeoutError, zenoh.ZError, UsageError)
 """Errors that mean that the bus is stuck or the session is closed. A later attempt may succeed."""
@@ -74,14 +75,14 @@ class Stream:
                 self._newest = (1, sample, clock.steady_ns())
 
     def value(self) -> tuple[int, bytes, float]:
-        """Return the number, the JSON text and the age in ms of the newest message."""
+        """Return a triple for the newest message: its number, its JSON text, and its age in ms."""
         number, sample, at_ns = self._newest
         if sample is not None and self._text[0] != number:
             self._text = number, as_json(*encoded(sample))
         return number, self._text[1], max(0.0, (clock.steady_ns() - at_ns) / 1e6)
 
     def raw(self) -> tuple[str, bytes] | None:
-        """Return the encoding and the payload of the newest message, or None before the first."""
+        """Return the newest message as the pair (encoding, payload), or None before the first."""
         sample = self._newest[1]
         return None if sample is None else encoded(sample)
 
@@ -100,9 +101,9 @@ class Streams:
         calls `follow()` for such a key, and release the share when it calls `leave()`."""
 
     async def follow(self, client: Client, robot: str, key: str) -> Stream:
-        """Return the stream of a robot's key. Subscribe to the key if no other user has done so.
+        """Return the stream of a robot's key, and subscribe to the key if it has no user yet.
 
-        Call `leave` after use. If the bus is not ready, one of the errors in `UNREADY` is raised.
+        Call `leave` after use. Raises one of the errors in `UNREADY` if the bus is not ready.
         """
         name = robot, key
         stream = self._streams.get(name)
@@ -154,7 +155,7 @@ class Streams:
             if not asks:
                 return heard
             try:
-                # The query gives a value at once, even if the key is published seldom.
+                # The query gives a first value soon, even if the key is published rarely.
                 client.ask(key, of_it(stream.answered))
             except zenoh.ZError:
                 heard.undeclare()

@@ -1,6 +1,7 @@
-"""Access tokens for clients on other machines, stored as hashes until they expire or are revoked.
+"""Access tokens for clients on other machines.
 
-A token is 32 random bytes, so a plain SHA-256 hash of it cannot be reversed.
+Only a hash of each token is stored, until the token expires or is revoked. A token is 32 random
+bytes, so nobody can compute it from its SHA-256 hash.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ class Vault:
         return owner_in(self._own(self._read[1]), text)
 
     def left_s(self, digest: str) -> int:
-        """Return the seconds until the token with this digest expires, 0 if there is none."""
+        """Return the seconds until the token with this digest expires; 0 if it does not exist."""
         ends = [one.ends for one in self.all() if one.digest == digest]
         return max(0, int(max(ends, default=0) - time.time()))
 
@@ -106,9 +107,10 @@ class Vault:
         )
 
     def invite(self, role: Role, name: str, days: int, hours: int = 0) -> tuple[str, Token]:
-        """Create a token that expires after `days` and `hours`; return its text and its record.
+        """Create a token that expires after `days` plus `hours`; return the pair (text, record).
 
-        The text is not stored, so the caller must show it to the user. Raises `UsageError`.
+        The text is the token itself. It is not stored, so the caller must show it to the user.
+        Raises `UsageError` if the name is taken or if the robot has `MOST` tokens already.
         """
         with self._changing() as tokens:
             now_s = int(time.time())
@@ -146,9 +148,9 @@ class Vault:
 
     @contextmanager
     def _changing(self) -> Iterator[list[Token]]:
-        """Yield the tokens of all robots, with exclusive access to the file for the `with` block.
+        """Lock the token file for the duration of the `with` block, and yield all robots' tokens.
 
-        At the end of the block, write the tokens back unless an exception occurred.
+        At the end of the block, write the yielded list back, unless an exception occurred.
         """
         directory = self.path.parent
         try:
@@ -186,7 +188,7 @@ class Vault:
 
 
 def place() -> Path:
-    """Return the directory of the token file: that of the service, or that of the user."""
+    """Return the directory of the token file: the service's directory, or the user's."""
     if "STATE_DIRECTORY" in os.environ:
         return Path(os.environ["STATE_DIRECTORY"].partition(":")[0])
     if os.geteuid() == 0 and SERVICE.is_dir():

@@ -57,7 +57,8 @@ ACTIONS: dict[str, Role] = {
 """Maps each action that has a control on the page to the least role that may use it."""
 
 HEARTBEAT_S = 10.0
-"""Interval of the pings, s. The connection ends if a ping is not answered within half of it."""
+"""Interval of the pings, s. The connection ends if a ping is not answered within half of this
+time."""
 
 CALLS_AT_ONCE = 8
 
@@ -69,7 +70,7 @@ the first list, s. Without the delay, the first list would be empty."""
 class ViewerCommands:
     """Puts the newest velocity command of each viewer on the bus.
 
-    A command is either sent once, with the stamp of its sender, or dropped. The server itself
+    A command is sent once, with the stamp of its sender, or it is dropped. The server itself
     creates only one kind of command: a zero velocity for a viewer that was driving and has
     disconnected.
     """
@@ -84,7 +85,7 @@ class ViewerCommands:
     def give(
         self, owner: str, source: str, commander: Commander, sender: Sender, wish: Wish
     ) -> bool:
-        """Queue a command, in place of an older command of the same commander that still waits.
+        """Queue a command; it replaces an older command of the same commander that still waits.
 
         `owner` is the client's token, or the public name of a viewer on the robot itself. If the
         owner exceeds the rate limit `COMMANDS`, return False and queue nothing. However, a zero
@@ -143,7 +144,8 @@ class Viewer:
         whole = sender_id(who.name)
         self._sender, self._commanders = Sender(whole), dict[str, Commander]()
         self.sender = public_name(whole, parts.robots.certificate)
-        """Public name of this client in `state.sender`. It does not reveal the secret sender id."""
+        """Public name of this client, as in `state.sender`. It does not reveal the secret sender
+        id."""
         self._socket = socket
         self._bucket = Bucket(MESSAGES)
         self._overruns = self._calling = 0
@@ -210,7 +212,7 @@ class Viewer:
         except FrameError as error:
             self._out.refuse(error.about, "malformed", str(error))
         else:
-            # What lets go or stops is obeyed beyond the limit.
+            # A message that ends a drive or stops the robot is obeyed even beyond the limit.
             urgent = (
                 isinstance(frame, Press)
                 or (isinstance(frame, Call) and frame.call == "stop")

@@ -1,6 +1,6 @@
-"""The ROS side of the robot: its description always, ros2_control and RViz on request.
+"""Starts the ROS side of the robot: its description and, on request, ros2_control and RViz.
 
-acsard itself is not started here: it runs without ROS, as a service on the robot.
+This file does not start acsard, which runs without ROS, as a service on the robot.
 
     ros2 launch ./acsar.launch.py [use_ros2_control:=true] [use_rviz:=true] [namespace:=robot1]
 """
@@ -19,8 +19,8 @@ URDF = HERE / "acsar.urdf"
 CONTROLLERS = HERE / "controllers.yaml"
 RVIZ = HERE / "acsar.rviz"
 
-# tf2 writes to /tf with a leading slash; acsard and the bridge put TF below the namespace with the
-# rest. In the root namespace these remappings change nothing.
+# tf2 publishes on /tf, with a leading slash. acsard and the bridge put TF into the robot's
+# namespace, like all other topics. In the root namespace these remappings change nothing.
 TF = [("/tf", "tf"), ("/tf_static", "tf_static")]
 
 
@@ -64,9 +64,9 @@ def nodes(context: LaunchContext) -> list[Node]:
             remappings=TF,
             output="both",
         ),
-        # The controller manager takes the URDF from the topic robot_description, as it does since
-        # Jazzy. The hardware's node lives in the same process, so each remapping here applies to it
-        # too. Do not remap joint_states: the hardware reads the wheels from that topic.
+        # Since Jazzy, the controller manager takes the URDF from the topic robot_description. The
+        # hardware's node runs in the same process, so each remapping here applies to that node too.
+        # Do not remap joint_states, because the hardware reads the wheel speeds from that topic.
         Node(
             package="controller_manager",
             executable="ros2_control_node",
@@ -76,8 +76,9 @@ def nodes(context: LaunchContext) -> list[Node]:
             output="both",
             condition=with_control,
         ),
-        # The controller listens on the cmd_vel everybody sends to; its odometry is kept apart from
-        # acsard's. Both remappings in one argument, as not every version takes it twice.
+        # The controller subscribes to the cmd_vel on which all nodes publish. Its odometry gets
+        # another topic than acsard's. Both remappings are in one argument, because not every
+        # version accepts --controller-ros-args twice.
         Node(
             package="controller_manager",
             executable="spawner",
@@ -110,7 +111,10 @@ def nodes(context: LaunchContext) -> list[Node]:
 
 
 def description(prefix: str) -> str:
-    """The URDF with the two topics of the hardware, which are absolute, below the namespace."""
+    """Return the URDF with `prefix`, the namespace, before the two topics of the hardware.
+
+    These two topics are absolute, so a namespace has no effect on them otherwise.
+    """
     text = URDF.read_text(encoding="utf-8")
     for topic in ("/joint_commands", "/joint_states"):
         text = text.replace(f">{topic}</param>", f">{prefix}{topic}</param>")

@@ -1,7 +1,7 @@
 """Drive the robot from a ROS machine: zeros first, then one speed for a while, then zeros.
 
-acsard follows a publisher only after it has sent a zero. `ros2 topic pub` of a speed never sends
-one, so use this script instead.
+acsard follows a publisher only after the publisher has sent a zero. `ros2 topic pub` with a speed
+never sends a zero, so use this script instead.
 
     python3 drive.py [LINEAR m/s] [ANGULAR rad/s] [SECONDS] [--ros-args -r __ns:=/robot1]
 """
@@ -18,15 +18,18 @@ from rclpy.utilities import remove_ros_args
 
 PERIOD_S = 0.05
 PATIENCE_S = 10.0
-"""How long to wait for a subscriber. A bridge makes its route only when a publisher appears."""
+"""Longest wait for a subscriber, s. A bridge creates its route only when a publisher appears."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 ZEROS_S = 1.5
-"""Behind a bridge all publishers look like one sender: a zero counts when no speed has followed it
-for a second. Over rmw_zenoh a quarter of a second is enough."""
+"""Duration of the zeros before the drive, s. Behind a bridge all publishers look like one sender,
+so a zero counts only when no speed has followed it for 1 s. Over rmw_zenoh 0.25 s is enough."""
 
 
 def end(number: int, frame: object) -> NoReturn:
-    """End after a signal. The zeros are still sent, and further signals are ignored meanwhile."""
+    """End the program after a signal.
+
+    The final zeros are still sent. While they are sent, further signals are ignored.
+    """
     for one in SIGNALS:
         signal.signal(one, signal.SIG_IGN)
     sys.exit(128 + number)

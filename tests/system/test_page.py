@@ -1489,7 +1489,7 @@ SEEN = """(() => {
 @pytest.mark.parametrize("size", [PHONE, DESKTOP])
 def test_the_signs_of_the_map_are_explained(page: Phone, size: tuple[int, int]) -> None:
     page.browser.size(*size, touch=size == PHONE)
-    words = {"recentre": "Centre map", "turns": "Rotate map", "erase": "Erase path"}
+    words = {"recentre": "Center map", "turns": "Rotate map", "erase": "Erase path"}
     for name, word in words.items():
         button = f"document.getElementById({name!r})"
         assert page.browser.js(f"{button}.title")

@@ -216,7 +216,7 @@ def test_a_recording_that_was_cut_on_a_disk_without_room_for_its_end_keeps_every
         assert "the disk is full" in recover(part, whole, "crash", room=False)
         assert list(Recording(whole).messages()) == before_it
         assert len(before_it) == 3
-        assert [row.events for row in rows(path)] == ["no end: cut"]
+        assert [row.events for row in rows(path)] == ["cut off: no end marker"]
 
 
 def test_for_want_of_inodes_one_recording_goes_and_no_other_where_that_does_not_help(

@@ -6,8 +6,8 @@ const SHUT = [401, 403, 429]; // HTTP statuses for which a repeated request is p
 
 /** Exchange the token of an invitation (behind the # of the URL) for a cookie. If the present cookie has more
  *  permissions, ask first. The token is removed from the URL once it was accepted or finally rejected. Returns
- *  the reason for a rejection, or "" without one or without an invitation. `waiting(why)` is called while the
- *  robot does not answer. */
+ *  the reason for a rejection, or "" if there is no rejection or no invitation. `waiting(why)` is called while
+ *  the robot does not answer. */
 export async function invited(waiting) {
   const token = new URLSearchParams(location.hash.slice(1)).get("token");
   if (!token) return "";
@@ -31,7 +31,7 @@ async function shown(token, replace) {
 }
 
 /** Return why a WebSocket is refused, as {why, shut, barred}, because no browser reports this. `shut` means that a
- *  repeated attempt is pointless, `barred` that the robot refuses this browser, also its STOP. */
+ *  repeated attempt is pointless. `barred` means that the robot refuses everything from this browser, also STOP. */
 export async function refusal() {
   const { status, error, full } = await asked("api/whoami", {}, 2000);
   return { why: error || full || "", shut: SHUT.includes(status), barred: BARRED.includes(status) };
@@ -48,7 +48,7 @@ async function asked(path, how, within, special = () => null) {
   }
 }
 
-/** Return why this client may not do something ("drive", a service, ...), in words, or "" if it may. */
+/** Return why this client may not do `what` ("drive", a service, ...), in words, or "" if it may. */
 export function barred(hello, what) {
   return hello ? (hello.barred[what] ?? "") : "no connection yet";
 }
@@ -60,9 +60,9 @@ export function hint(hello, other) {
   return barred(hello, "drive") ? "You may watch and stop, but not drive." : "Hold and push to drive; release to stop.";
 }
 
-/** Disable the controls that this client may not use and explain why, on the control and in its description.
- *  `reason` disables all of them for that reason. `needless` has the reason by control for those that would change
- *  nothing now. `hello` is undefined while no robot has answered. */
+/** Disable the controls that this client may not use and explain why, on the control and in its description. If
+ *  `reason` is not "", all controls are disabled for this reason. `needless` maps each control that would change
+ *  nothing now to the reason. `hello` is undefined while no robot has answered. */
 export function permit(hello, reason = "", needless = {}) {
   document.getElementById("barred").textContent = reason || barred(hello, "drive");
   for (const one of document.querySelectorAll("[data-does]")) {

@@ -1,5 +1,5 @@
-// Keeps the screen on while this page moves something. A screen that locks releases the stick and ends a
-// calibration leg.
+// Keeps the screen on while this page moves something. When the screen locks, the browser hides the page, which
+// releases the stick and ends a drive of a calibration.
 
 const movers = new Set();
 let lock = null;

@@ -1,11 +1,11 @@
-// The camera beside the stick: fetches one picture after another, draws it, and says how old it is. A picture that
-// no newer one replaces is marked, because a person would drive by it.
+// The camera beside the stick: fetches one picture after another, draws it, and shows its age. A picture is marked if
+// no newer one arrives in time, because a person drives by what the picture shows.
 
 import { age } from "./words.js";
 
-const FROZEN = 800; // ms; the mark appears within 1 s
+const FROZEN = 800; // age of a picture, ms, above which it is marked; the mark appears within 1 s
 const AGAIN = 500; // ms before the next attempt after a failure
-const LEAST = 50; // ms between two requests, so that a page leaves room for the others of its token
+const LEAST = 50; // ms between two requests, so that a page leaves room for other pages with the same token
 
 export class Camera {
   #figure;
@@ -16,7 +16,8 @@ export class Camera {
   #trouble = "";
   #shows = false;
   #runs = false;
-  /** Whether the page has a connection. Without one, each request might be a guess of a token that has ended. */
+  /** Whether the page has a connection. Without a connection, the token may have expired, and each request with it
+   *  would count as a guess. */
   connected = false;
 
   constructor(figure) {
@@ -32,7 +33,7 @@ export class Camera {
     if (wanted && !this.#runs) this.#run();
   }
 
-  /** Say how old the picture is at `now`, ms. */
+  /** Show how old the picture is at `now`, ms. */
   look(now) {
     if (!this.#shows) return;
     const old = now - this.#at;
@@ -61,9 +62,9 @@ export class Camera {
       const headers = this.#tag ? { "If-None-Match": this.#tag } : {};
       const answer = await fetch("api/camera", { headers, cache: "no-store", signal: expiring(5000) });
       if (answer.status === 304) return "";
-      // The reason behind the colon is for the person who sets the camera up: the interface has it.
+      // The text behind the colon is for the person who sets up the camera, who can request api/camera.
       if (!answer.ok) return (await answer.json()).error?.split(":")[0] ?? `${answer.status}`;
-      // The picture counts as old as if the way of the request had taken no time: a slow network ages pictures.
+      // The time for which the request traveled is unknown and counts as 0, so the shown age is never too low.
       const held = Number(answer.headers.get("Waited-Ms")) - Number(answer.headers.get("Age-Ms"));
       const picture = await createImageBitmap(await answer.blob());
       this.#tag = answer.headers.get("ETag");

@@ -1,7 +1,7 @@
 // Decides which commands a held stick sends, and when. This module is pure: times in ms come in, commands go
 // out.
 //
-// A hold begins with zeros until the robot follows this sender, because the daemon must hear a zero from a
+// A hold begins with zeros until the robot follows this sender, because the daemon must receive a zero from a
 // new sender before it lets the sender drive. Then the wished velocity is sent at 20 Hz. A release sends one
 // zero (`drive.js` repeats it once), then nothing. A hold that ended by itself needs a new press, so a finger
 // that was left on the stick never drives again by accident.
@@ -10,12 +10,12 @@ import { person } from "./words.js";
 
 export const PERIOD = 50;
 export const OPENING = 20;
-export const PATIENCE = 2000; // for the robot to follow after a press
-export const GRACE = 500; // for the robot to follow again after an interruption
-export const HICCUP = 250; // between two looks; after a longer gap the robot has braked, so the hold opens again with zeros
-export const FROZEN = 1000; // after a longer gap the page stood still, and the finger may be gone
+export const PATIENCE = 2000; // longest wait until the robot follows after a press
+export const GRACE = 500; // longest time for which the robot may cease to follow during a hold
+export const HICCUP = 250; // after a longer gap between two calls of `look` the robot has braked, so zeros come first
+export const FROZEN = 1000; // after a longer gap between two calls of `look` the finger may be gone, so the hold ends
 
-/** What keeps the robot from driving in a mode, and the remedy. */
+/** Maps a mode to the reason why the robot does not drive in it, with the remedy. */
 const BARS = {
   inactive: "Switched off. Press Switch on first.",
   stopped: "Stopped. Press Release STOP first.",
@@ -25,19 +25,19 @@ const BARS = {
 const NEVER = ["inactive", "stopped", "fault", "shutdown"];
 export const ZERO = { linear_x: 0, angular_z: 0 };
 
-/** What to do first while the emergency stop at the robot counts as pressed, by its state. */
+/** Maps a state of the emergency stop at the robot that counts as pressed to the remedy. */
 const PRESSED = {
   pressed: "Emergency stop: release it at the robot first.",
   silent: "Emergency stop silent: check the board first.",
 };
 
-/** Return whether the link to the board is up. While it is not, nobody can stop the motors from here. */
+/** Return whether the link to the board is up. While it is down, nobody can stop the motors from here. */
 export function boarded(state) {
   return state.link === "up";
 }
 
 /** Return why a push of the stick by `sender` would not move the robot, in words, or "". A push takes over from a
- *  source of a lower priority, but not from another sender of this one. */
+ *  source with a lower priority than `source`, but not from another sender with the same source. */
 export function still(state, source, sender) {
   if (!state) return "Nothing is received from the robot.";
   if (state.mode === "stopped" && PRESSED[state.emergency_stop]) return PRESSED[state.emergency_stop];
@@ -51,7 +51,7 @@ export function still(state, source, sender) {
   return above ? `${driver} drives and has priority: you can drive when it stops.` : "";
 }
 
-/** Return who drives instead of `sender`, in words, or "". */
+/** Return who drives the robot, in words, or "" if nobody or `sender` drives. */
 export function driving(state, source, sender) {
   if (state?.mode !== "driving") return "";
   if (state.source === source) return state.sender && state.sender !== sender ? person(state.sender, sender) : "";
@@ -106,8 +106,8 @@ export class Commander {
     this.#sent = -Infinity;
   }
 
-  /** Return the command to send now and, if the hold has ended, the reason: {send, ended}. `heard` is the
-   *  time at which `state` was true. */
+  /** Return {send, ended}: the command to send now and, if the hold has ended, the reason. Both may be missing.
+   *  `heard` is the time at which `state` was true. */
   look(now, state, heard, source, sender) {
     if (!this.held) return {};
     if (now - this.#looked > FROZEN) return { send: this.release(), ended: "this page was suspended: press again" };
@@ -115,7 +115,7 @@ export class Commander {
     this.#looked = now;
     const why = objection(state, source, sender);
     if (state && NEVER.includes(state.mode)) return { send: this.release(), ended: why };
-    // A state from before the hold opened cannot confirm it.
+    // A state from before the hold began cannot show that the robot follows it.
     if (!why && heard > this.#begun) {
       this.#fine = now;
       this.phase = "driving";

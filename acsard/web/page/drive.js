@@ -4,7 +4,7 @@
 import { awake } from "./awake.js";
 import { Commander, twist, ZERO } from "./commander.js";
 
-export const SOURCE = "teleop"; // a person; a program is "app", which has a lower priority
+export const SOURCE = "teleop"; // the command source for persons; programs use "app", which has a lower priority
 const LOOK = 10;
 const TWICE = 50; // ms between the first and the second zero command
 const KEYS = {
@@ -21,7 +21,7 @@ export class Drive {
   #told;
   #timer = null;
   #again = null;
-  #by = null; // the input that drives: "stick", "keys" or "pad"; only that one can release
+  #by = null; // the input that drives: "stick", "keys" or "pad"; only this input can release
   #push = [0, 0];
   #pressed = new Set();
   #pointer = null;
@@ -78,7 +78,8 @@ export class Drive {
     this.#look();
   }
 
-  /** Show whether the robot follows this page. While another sender drives, the ring is not blue. */
+  /** Send the command that is due, and show whether the robot follows this page. While another sender drives, the ring
+   *  of the stick is not blue. */
   #look() {
     this.stick.classList.toggle("follows", this.#commander.phase === "driving");
     this.#commander.wish(...twist(...this.#push, this.limit, this.limits));
@@ -106,9 +107,9 @@ export class Drive {
     this.#told(why);
   }
 
-  /** Send a command. A release bypasses a congested connection. Some browsers' clocks stand still for 100 ms,
-   *  so the stamp always grows: of two commands with one stamp, the daemon would drop the second, maybe a
-   *  zero, as a replay. */
+  /** Send a command. A release is sent even over a congested connection. The clock of some browsers stands still for
+   *  100 ms, so the stamp is increased by hand. Otherwise the daemon would drop the second of two commands with the
+   *  same stamp as a replay, and that command may be a zero. */
   #send(cmd) {
     this.#stamp = Math.max(performance.timeOrigin + performance.now(), this.#stamp + 0.001);
     const message = { cmd, stamp: this.#stamp, steady: true, source: SOURCE };
@@ -222,15 +223,14 @@ export class Drive {
   }
 }
 
-/** Return whether a key belongs to the focused control or to a shortcut. A slider uses the arrow keys only.
- *  */
+/** Return whether a key belongs to the focused control or to a shortcut. A slider uses the arrow keys only. */
 function busy(event) {
   if (event.ctrlKey || event.altKey || event.metaKey) return true;
   const slider = event.target.matches?.("input[type=range]") && event.code?.startsWith("Key");
   return !slider && event.target.matches?.("input, select, textarea");
 }
 
-/** Return the axis that is pushed farther, or 0 within the slack of its spring. */
+/** Return the value of the axis that is pushed farther, or 0 if it is within the slack of the spring. */
 function farther(one = 0, other = 0) {
   const most = Math.abs(one) > Math.abs(other) ? one : other;
   return Math.abs(most) < 0.12 ? 0 : most;

@@ -12,15 +12,15 @@ const LABELS = {
 };
 const NAMES = { check: "Check of the board", calibrate: "Calibration" };
 const LOOKS = { PASS: "", WARN: "warning", FAIL: "error", SKIPPED: "skipped" };
-const LIFE = 100; // ms between two signs of life while the command runs; after 900 ms without one, the command stops the wheels
+const LIFE = 100; // ms between two signs of life for the running command; after 900 ms without one, it stops the wheels
 const MODIFIERS = ["Shift", "Control", "Alt", "AltGraph", "Meta", "Tab"];
 
 export class Guide {
   #link;
   #running = false; // this page started the running command
   #question = null;
-  #rides = false; // a leg is under way, and a key press stops it
-  #busy = ""; // who else runs a check or calibration, in words
+  #rides = false; // the robot drives for a calibration, and a key press stops it
+  #busy = ""; // that another page runs a check or calibration, in words, or ""
 
   constructor(link) {
     this.#link = link;
@@ -29,7 +29,7 @@ export class Guide {
     $("check").addEventListener("click", () => this.#begin({ begin: "check", port: $("check-port").value }));
     $("calibrate").addEventListener("click", () => this.#begin({ begin: "calibrate", ...this.#method() }));
     $("method").addEventListener("change", () => this.#methods());
-    // Act on pointerdown, like STOP: a finger that stays down or slides off has also pressed.
+    // Act on pointerdown, like STOP, so a finger that stays down or slides off counts as a press too.
     for (const [name, act] of [["guide-halt", () => this.#key()], ["guide-leave", () => this.leave()]]) {
       $(name).addEventListener("pointerdown", act);
       $(name).addEventListener("click", (event) => event.detail === 0 && act()); // Enter or Space key
@@ -209,7 +209,7 @@ export class Guide {
     this.#link.urge({ press: "key" });
   }
 
-  /** Keys work as at a terminal: Escape ends the command, and any other key ends a leg. Space is STOP
+  /** Keys work as at a terminal: Escape ends the command, and any other key ends the present drive. Space is STOP
    *  everywhere. */
   #pressed(event) {
     if (!this.#running || event.repeat || MODIFIERS.includes(event.key)) return;
@@ -250,8 +250,8 @@ export function worded(words) {
     .replace("any key stops it", "any key or the button stops it");
 }
 
-/** Return the typed number, or null for an empty answer to a question with a default. Other text is returned
- *  as it is, and the command rejects it. */
+/** Return the typed number, or null for an empty answer to a question with the default `usual`. A text that is not a
+ *  number is returned unchanged, and the command rejects it. */
 export function typed(words, usual) {
   if (words.trim() === "") return usual === undefined ? "" : null;
   const value = number(words);
@@ -264,7 +264,7 @@ function options(select, rows) {
   if (rows.some(([value]) => value === before)) select.value = before;
 }
 
-/** Move the focus of the eye and of the screen reader, if this view is visible. */
+/** Move the keyboard focus, which a screen reader follows, to an element if this view is visible. */
 function focus(id) {
   if (!$("set").hidden) $(id).focus({ preventScroll: false });
 }

@@ -21,8 +21,7 @@ export class Link extends EventTarget {
   open = false;
   way = null; // round trip, ms
 
-  /** `refused()` is called when the robot rejects a connection; true means that another attempt is pointless.
-   *  */
+  /** `refused()` is called when the robot rejects a connection. It resolves to true if another attempt is pointless. */
   constructor(refused) {
     super();
     this.#refused = refused;
@@ -43,15 +42,15 @@ export class Link extends EventTarget {
     return Math.max(this.way ?? 0, this.#asked === null ? 0 : performance.now() - this.#asked);
   }
 
-  /** Ping every `every` ms; pings are also the signs of life of this page. */
+  /** Send a ping every `every` ms. The pings are also the signs of life of this page. */
   beat(every = BEAT) {
     clearInterval(this.#timer);
     this.#timer = setInterval(() => this.#ping(), every);
     this.#ping();
   }
 
-  /** Subscribe to a key at most `rate` times a second, again after each reconnection. `robot` names a robot
-   *  other than the page's own. */
+  /** Subscribe to a key with at most `rate` messages a second, again after each reconnection. `robot` is the id of a
+   *  robot other than the page's own. */
   subscribe(key, rate, robot) {
     const asked = { subscribe: key, rate, robot };
     this.#wanted.set(key, asked);
@@ -76,8 +75,8 @@ export class Link extends EventTarget {
     if (this.open) this.#socket.send(JSON.stringify(message));
   }
 
-  /** Call a service, on another `robot` if it is named. Resolves to the answer, or to the reason why there is
-   *  none. */
+  /** Call a service of the page's robot, or of `robot` if it is given. Resolves to the answer; if there is none, to an
+   *  answer with `lost` and the reason. */
   call(verb, payload, robot) {
     const id = ++this.#number;
     return new Promise((done) => {

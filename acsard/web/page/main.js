@@ -25,18 +25,18 @@ if (!stopping) {
 const OTHER = new URLSearchParams(location.search).get("robot") || undefined;
 const VIEWS = ["drive", "status", "events", "set", "robots"];
 const words = (told) => clickable(named(told), OTHER);
-const READ = 8000; // ms in which a message can be read
+const READ = 8000; // time that a person needs to read a message, ms
 const LATCHED = ["stopped", "fault"];
 const ON = { activate: "the robot is already on" };
-/** The switch that changes nothing in a mode, with the reason. */
+/** Maps a mode to the button that would change nothing in it, with the reason. */
 const NEEDLESS = { waiting: ON, driving: ON, ready: ON, inactive: { deactivate: "the robot is already off" } };
-/** ms for which the release button shows what it does before a press of it counts. A double click may take 900 ms, and
- *  a held Enter key may click again after 1000 ms. */
+/** Time, ms, for which the release button must show the same text before a press of it counts. A double click may take
+ *  900 ms, and a held Enter key may click again after 1000 ms. */
 const SETTLED = 1000;
 const HASTY = "this button has just appeared or changed, or was pressed twice: read it, wait a second, then press it once";
-const DATED = "nothing is received from the robot, so this press did nothing: press again when this button is not grey";
+const DATED = "nothing is received from the robot, so this press did nothing: press again when this button is not gray";
 const UNSHOWN = "nothing is received from the robot, so this page does not know what it would release";
-const SOON = 300; // ms in which the WebSocket answers a STOP, unless it is dead but still open
+const SOON = 300; // ms within which a STOP is answered over the WebSocket, unless the connection is dead but still open
 
 const link = new Link(refused);
 const map = new PathMap($("map"));
@@ -63,7 +63,8 @@ let settling = 0; // time at which `offer` changed or the release button was las
 let down = null; // time at which a finger came down on the release button
 let period = 0; // seconds between two states of another robot
 
-/** Whether this page has a view of settings: another robot has it on its own page, and a viewer may do nothing there. */
+/** Return whether this page has the view Settings. The settings of another robot are on that robot's own page, and a
+ *  user with the role viewer may not change any. */
 function settable() {
   return !OTHER && (!hello || !barred(hello, "activate"));
 }
@@ -110,7 +111,8 @@ function complain(why) {
   views.complain(words(why));
 }
 
-/** Release what this page shows. Without a state it has shown nothing, and the call would release anything. */
+/** Call the service `verb` to release the latch that this page shows. Without a state, the page shows none, and the
+ *  call could release a latch that nobody has seen. */
 function released(verb) {
   if (state) return asked(verb, { latch: state.latch });
   return answered({ ok: false, text: UNSHOWN });
@@ -121,7 +123,7 @@ async function set(payload) {
   configured();
 }
 
-/** Show a message at the stick. A reason that the banner already shows is not repeated. */
+/** Show the message `why` at the stick. A reason that the banner shows already is not repeated. */
 function told(why) {
   note = { why, at: performance.now(), objects: Boolean(why) && why === objection(state, SOURCE, hello?.sender) };
   views.text("told", why && why === state?.reason ? "not driving: the reason is shown above" : words(why));
@@ -166,12 +168,12 @@ function limited() {
   $("most").textContent = `${drive.limit.toFixed(2)} m/s`;
 }
 
-/** How long a state counts as fresh, ms; the time grows with the interval between two states. */
+/** Return for how long a state counts as fresh, ms. This time grows with the interval between two states. */
 function lasts() {
   return Math.max(500, OTHER ? 2500 * (period || 1) : 2500 / (hello?.state_rate || 10));
 }
 
-/** Whether the state that this page shows is old. */
+/** Return whether the state that this page shows is not fresh any more. */
 function dated() {
   return Boolean(state) && performance.now() - heard > lasts();
 }
@@ -190,29 +192,29 @@ function looked() {
   views.text("unknown", plots.lacks(performance.now()));
 }
 
-/** Drop what a button or a press of the stick was told in the mode before. */
+/** Remove the messages about a button or the stick that belong to the previous mode. */
 function outdated() {
   complain("");
   if (note.why && (note.why === state.reason || LATCHED.includes(state.mode))) told("");
 }
 
-/** Drop the message about a button: at once if it says that nothing is received and the state is fresh, otherwise after a
- *  time to read it. */
+/** Remove the message about a button after the time `READ`. If it says that nothing is received, remove it as soon as
+ *  the state is fresh. */
 function expired() {
   if (!complaint.why) return;
   const untrue = [DATED, UNSHOWN].includes(complaint.why) && !dated();
   if (untrue || performance.now() - complaint.at > READ) complain("");
 }
 
-/** Drop a message at the stick whose cause is gone: at once if it is what keeps the robot from following this page,
- *  otherwise after a time to read it. */
+/** Remove the message at the stick after the time `READ`. If it says why the robot does not follow this page, remove it
+ *  when this reason is gone instead. */
 function forgotten() {
   if (!note.why || drive.held || drive.strange) return;
   const why = objection(state, SOURCE, hello?.sender);
   if (note.objects ? why !== note.why : performance.now() - note.at > READ) told("");
 }
 
-/** Grey the stick while a push would not move the robot, and say why beside it. */
+/** Disable the stick while a push would not move the robot, and show the reason beside it. */
 function readied() {
   const fresh = link.open && performance.now() - heard <= 2 * lasts();
   drive.barred = link.open ? still(fresh ? state : null, SOURCE, hello?.sender) : "No connection.";
@@ -223,8 +225,8 @@ function readied() {
   views.text("hint", ((drive.allowed || !link.open) && (drive.barred || over)) || hint(hello, OTHER));
 }
 
-/** Show the button that ends the mode. While no new state confirms the mode, the button stays in place and does nothing: if
- *  it disappeared, STOP would grow into its place under a finger. */
+/** Show the button that ends the mode. While no new state confirms the mode, the button stays in place and does
+ *  nothing. If the button disappeared, STOP would grow into its place under a finger. */
 function releasable() {
   const shown = !OTHER && state && state.mode in RELEASE;
   $("clear").hidden = !shown;
@@ -234,8 +236,9 @@ function releasable() {
   $("clear").setAttribute("aria-disabled", String(dated()));
 }
 
-/** Release what the button showed when the person's finger came down on it. The button follows the mode in place, and it
- *  appears at the place of STOP, so the second click of a double click would release a cause that nobody has read. */
+/** Release the mode that the button named when the person's finger touched the button. The text of the button changes
+ *  with the mode, and the button appears where STOP was. Without the wait of `SETTLED`, the second click of a double
+ *  click would release a mode whose reason nobody has read. */
 async function pressed(event) {
   // A click by a key has no pointerdown. If a finger slides off the button, its pointerdown stays in `down`.
   const since = ((event.detail && down) || event.timeStamp) - settling;
@@ -282,7 +285,7 @@ function stated({ detail }) {
   views.counters($("counters"), state);
 }
 
-/** Show the measured speeds and the commanded ones, which are known without feedback too. */
+/** Show the measured speeds, and the commanded speeds, which are known even without feedback from the board. */
 function dialled() {
   const [unit, times, decimals] = degrees ? ["°/s", 180 / Math.PI, 0] : ["rad/s", 1, 2];
   const shown = (value, by = 1) => (value === null || value === undefined ? null : value * by);
@@ -346,7 +349,8 @@ async function refused() {
   return shut;
 }
 
-/** Resolve to the answer to a STOP, by the WebSocket or, if that does not answer soon, also by `post`. */
+/** Resolve to the answer to a STOP. `called` is its call over the WebSocket. If this call is not answered within
+ *  `SOON`, the STOP is also sent by `post`. */
 async function hedged(called, post) {
   const told = await Promise.race([called, new Promise((done) => setTimeout(done, SOON))]);
   if (told && !told.lost) return told;
@@ -413,7 +417,7 @@ document.querySelector("nav").addEventListener("keydown", (event) => {
   open(there[(there.indexOf(view) + step + there.length) % there.length]);
   $(`tab-${view}`).focus();
 });
-// The daemon refuses if a stop or a "deactivate" came after the state that this person sees.
+// The daemon refuses the release if a stop or a "deactivate" came after the state that this person sees.
 $("clear").addEventListener("pointerdown", (event) => (down = event.timeStamp));
 $("clear").addEventListener("click", pressed);
 $("activate").addEventListener("click", () => released("activate"));
@@ -426,8 +430,8 @@ $("turns").addEventListener("click", () => $("turns").setAttribute("aria-pressed
 $("erase").addEventListener("click", () => map.erase());
 $("limit").addEventListener("input", limited);
 $("unit").addEventListener("click", converted);
-// After a mouse or a finger has set the slider, the arrow keys drive again. A user who reached it by Tab
-// keeps them.
+// After a mouse or a finger has set the slider, the arrow keys drive again. If the user reached the slider by Tab, the
+// arrow keys keep moving the slider.
 for (const name of ["pointerup", "click", "change"])
   $("limit").addEventListener(name, ({ target }) => target.matches(":focus-visible") || target.blur());
 $("again").addEventListener("click", () => location.reload());
@@ -446,7 +450,7 @@ setInterval(() => view === "events" && !document.hidden && listed(), 5000);
 const post = stopping.send;
 stopping.send = () => (link.open ? hedged(link.call("stop", undefined, OTHER), post) : post());
 stopping.after = (told) => {
-  if (state?.mode === "fault") answered({ ok: false, text: "STOP is latched behind the fault: Release fault leads to STOPPED" });
+  if (state?.mode === "fault") answered({ ok: false, text: "STOP is latched, too: when Release fault has ended the fault, the mode is STOPPED" });
 };
 stopping.before = () => {
   complain("");

@@ -1,15 +1,16 @@
-// The map: path, robot with the direction that it faces, and a grid with its scale in metres. Dragging moves it,
-// wheel and pinch zoom it, "Centre map" follows the robot again. It has x to the right, or the robot's front up.
+// The map: the path, the robot with the direction that it faces, and a grid with a scale in meters. Dragging moves the
+// map, wheel and pinch zoom it, and after "Center map" it follows the robot again. The x axis points to the right, or
+// after "Rotate map" the robot's front points up.
 
 const MOST = 20000;
-const WORDS = 24; // height of the words of the pose below the map, px
+const WORDS = 24; // height of the text with the pose at the lower edge of the map, px
 
 export class PathMap {
   #canvas;
   #pose = null;
   #truth = null;
   #trail = [];
-  #zoom = 90; // pixels per metre
+  #zoom = 90; // pixels per meter
   #centre = [0, 0];
   #follow = true;
   #turns = false; // the robot's front is up
@@ -51,7 +52,7 @@ export class PathMap {
     this.redraw();
   }
 
-  /** Break the path and grey the robot while it may move unseen. */
+  /** Interrupt the path and draw the robot in gray while the robot may move without feedback (`lost`). */
   lose(lost) {
     if (lost === this.#lost) return;
     this.#lost = lost;
@@ -69,7 +70,7 @@ export class PathMap {
     this.redraw();
   }
 
-  /** Turn the map with the robot, or no longer. Returns whether it does. */
+  /** Switch whether the map turns with the robot. Returns whether it does from now on. */
   turn() {
     this.#turns = !this.#turns;
     this.redraw();
@@ -128,7 +129,7 @@ export class PathMap {
     if (!width) return;
     const look = colours();
     const angle = this.#angle;
-    // The middle of the part between the buttons and the words of the pose.
+    // The middle of the area between the buttons and the text with the pose.
     const tools = this.#canvas.nextElementSibling;
     const middle = (tools.offsetTop + tools.offsetHeight + height - WORDS) / 2;
     const at = (x, y) => {
@@ -182,7 +183,7 @@ function rotated(x, y, angle) {
   return [x * cos - y * sin, x * sin + y * cos];
 }
 
-/** Draw a bar of `metres`, which is `wide` px, at the left, above the words of the pose. */
+/** Draw a scale bar at the left, above the text with the pose: `metres` m are `wide` px long. */
 function scale(paper, low, metres, wide, colour) {
   paper.strokeStyle = paper.fillStyle = colour;
   paper.lineWidth = 2;
@@ -231,7 +232,7 @@ export function sized(canvas) {
   return [paper, width, height];
 }
 
-/** Return a function that reads the page's present colours, light or dark. */
+/** Return a function that maps the name of a color to the page's present color, light or dark. */
 export function colours() {
   const style = getComputedStyle(document.documentElement);
   return (name) => style.getPropertyValue(name).trim();

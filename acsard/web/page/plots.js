@@ -1,5 +1,5 @@
-// The plots of the last minute: lines over time, the scale at the left, the present at the right, and below them
-// a legend with the present values. They begin with the data that the page's server has kept, and the page says
+// The plots of the last minute: lines over time, the scale at the left, the present at the right, and below each plot
+// a legend with the present values. The plots begin with the data that the page's server has kept, and the page says
 // which part is missing.
 
 import { colours, sized } from "./map.js";
@@ -31,7 +31,7 @@ export class Minute {
     this.volts = plot("volts", VOLTS, { span: 1 });
   }
 
-  /** Add the server's data: a column for each line, as long as `age` (ms before `now`). */
+  /** Add the data `kept` of the page's server: one column per line, and the column `age` with the age at `now`, ms. */
   begin(now, kept) {
     const times = kept.age.map((age) => now - age);
     this.speed.begin(times, kept.linear, kept.wished_linear);
@@ -63,7 +63,7 @@ export class Minute {
   }
 }
 
-/** Return the upper and the lower end of a scale, and its marks as pairs of value and label. */
+/** Return [top, bottom, marks]: the upper and the lower end of a scale, and its marks as pairs [value, label]. */
 function scaled(floor, values) {
   if (floor.span) {
     const [least, most] = values.length ? [Math.min(...values), Math.max(...values)] : [0, 0];
@@ -82,8 +82,8 @@ class Plot {
   #lines;
   #floor;
 
-  /** `lines`: [{name, colour}], one for each value of `add`; `floor`: the smallest range of the scale, or
-   *  its smallest span around the values, for values that are far from zero. */
+  /** `lines` has an entry {name, colour} for each value of `add`. `floor` is the smallest range of the scale, {low,
+   *  high}, or for values that are far from zero its smallest span around the values, {span}. */
   constructor(canvas, lines, floor) {
     this.#canvas = canvas;
     this.#lines = lines.map((line) => ({ ...line, points: [], sample: made("canvas"), said: made("span") }));
@@ -103,8 +103,8 @@ class Plot {
     });
   }
 
-  /** Insert earlier values and replace the points of the same time span: times in ms, and a column for each
-   *  line with null where a value is unknown. */
+  /** Insert earlier values, which replace the points of the same time span. `times` are in ms. There is a column for
+   *  each line, with null where a value is unknown. */
   begin(times, ...columns) {
     if (!times.length) return;
     columns.forEach((column, n) => {

@@ -65,7 +65,7 @@ export class Recordings {
   }
 }
 
-/** Request the progress of a report; the first request starts the drawing. */
+/** Request the progress of the report of a recording. The first request starts the drawing. */
 async function ask(name) {
   try {
     const way = `api/recordings/${encodeURIComponent(name)}/report`;

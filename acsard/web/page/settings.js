@@ -41,8 +41,8 @@ export class Settings {
   }
 }
 
-/** Convert the typed text to the type of the present value. Text that does not fit is returned as it is, and
- *  the daemon rejects it. */
+/** Convert the typed text to the type of the present value `before`. A text that does not fit is returned unchanged,
+ *  and the daemon rejects it. */
 export function read(typed, before) {
   if (Array.isArray(before)) return typed.split(",").map(one);
   return typeof before === "number" ? one(typed) : typed;

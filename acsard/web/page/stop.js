@@ -1,14 +1,17 @@
-// STOP, before everything else. The page's server puts this classic script into index.html, so STOP arrives with the
-// page, and paints STOP red when it runs. It posts the stop until the robot has answered. `main.js` later gives it the WebSocket, which is faster.
+// The STOP button. The page's server puts this classic script into index.html, so STOP works before the other scripts
+// are loaded. The button is red while this script runs. The script posts the stop until the robot has answered. Later,
+// `main.js` gives it the WebSocket, which is faster.
 //
-// A stop is repeated because a dead link is not noticed at once. It is not repeated for long: later another person
-// may have released the stop and be driving.
+// A stop is repeated because a dead link is noticed late. It is repeated only for `URGENT`, because after that time
+// another person may have released the stop and be driving.
 
 "use strict";
 
-const URGENT = 30000; // ms after the press, by the clock that gets there first: one may be set, the other may sleep
+// Longest time for which a stop is repeated, ms. The first of two clocks to reach it counts, because the wall clock may
+// be set, and performance.now() may stand still while the device sleeps.
+const URGENT = 30000;
 const PAUSE = 300; // ms between two attempts
-const SLOW = 10000; // ms after which a page that is not complete says so
+const SLOW = 10000; // ms after which a page whose modules do not run says so
 const BARRED = [401, 403]; // HTTP statuses of a page without a valid invitation
 const NOT_HERE = "STOP needs an invitation to this page: use the robot's own switch";
 const UNSURE = "STOP was not confirmed: look at the robot, and press STOP again";
@@ -18,15 +21,15 @@ class Stopping {
   #tell;
   #press = 0;
   #given = 0; // number of the last press that was given up
-  #unconfirmed = false; // the robot has not answered the last STOP, which may be given up
+  #unconfirmed = false; // the robot has not answered the last STOP; stays true if that STOP is given up
   #whole = false; // the modules of the page run
   /** Called at each press before the stop is sent. */
   before = () => {};
   /** Called with the answer that confirms a stop. */
   after = () => {};
 
-  /** `send()` sends one request and resolves to {ok, text}. Only its answer confirms a stop: a robot that reports that it
-   *  is stopped may have been stopped by another person, who will release it. `tell(words)` shows a message to the
+  /** `send()` sends one request and resolves to {ok, text}. Only its answer confirms a stop: a robot that reports that
+   *  it is stopped may have been stopped by another person, who will release it. `tell(words)` shows a message to the
    *  operator. */
   constructor(send, tell) {
     this.send = send;
@@ -55,15 +58,15 @@ class Stopping {
   }
 
   /** Give up the pending STOP, because the operator releases it or leaves the page. The message stays until the robot
-   *  answers a STOP, which may be the one that was given up, or `released` is called. Returns the number that `released`
-   *  takes: two calls for one STOP return the same number. */
+   *  answers a STOP (this one or a later one) or until `released` is called. Returns the number of the press, which is
+   *  the argument of `released`. */
   over() {
     if (this.#unconfirmed) this.#tell(UNSURE);
     return (this.#given = this.#press);
   }
 
-  /** Note that the robot has confirmed a release of STOP for which `over` returned `press`. Unless STOP was pressed
-   *  again since, it then needs no confirmation. */
+  /** Note that the robot has confirmed the release of the STOP for which `over` returned `press`. This STOP then needs
+   *  no confirmation. If STOP was pressed again since, the call has no effect. */
   released(press) {
     if (press === this.#press) this.#settle("");
   }
@@ -74,7 +77,7 @@ class Stopping {
     if (!this.#unconfirmed) this.#tell("");
   }
 
-  /** Say that a part of the page is missing, unless the modules run. */
+  /** Show that a part of the page is missing, unless the modules run. */
   lacks() {
     if (this.#whole) return;
     const mode = document.getElementById("mode");
@@ -82,7 +85,7 @@ class Stopping {
     if (!this.#unconfirmed) this.#tell(RELOAD);
   }
 
-  /** Grey STOP, because the robot has refused this browser. A press is still sent. */
+  /** Show STOP in gray, because the robot has refused this browser. A press is still sent. */
   uninvited() {
     document.documentElement.classList.remove("stops");
   }
@@ -106,14 +109,14 @@ class Stopping {
   }
 }
 
-/** Return a signal that ends a request after so many ms. Browsers before 2022 have no AbortSignal.timeout. */
+/** Return a signal that aborts a request after `ms`. Browsers before 2022 have no AbortSignal.timeout. */
 function expiring(ms) {
   const controller = new AbortController();
   setTimeout(() => controller.abort(), ms);
   return controller.signal;
 }
 
-/** Send STOP by HTTP, without the WebSocket: the server may have refused it, or it may not be open yet. */
+/** Send STOP by HTTP, because the WebSocket may be refused or may not be open yet. */
 async function posted() {
   try {
     const body = JSON.stringify({ robot: new URLSearchParams(location.search).get("robot") ?? undefined });
@@ -125,8 +128,8 @@ async function posted() {
   }
 }
 
-/** Show a message about STOP in every view until `words` is "". `main.js` shows the messages of other buttons elsewhere, so
- *  that none of them hides this one. */
+/** Show a message about STOP in every view until `words` is "". The messages of other buttons have another place
+ *  (`main.js`), so that they do not hide this one. */
 function alarm(words) {
   const place = document.getElementById("alarm");
   if (!place) return;
@@ -136,7 +139,7 @@ function alarm(words) {
 
 window.stopping = new Stopping(posted, alarm);
 
-// The listeners are the document's, because this script runs before the button exists.
+// The listeners are on the window, because this script runs before the button exists.
 const onStop = (event) => event.target.closest?.("#stop");
 addEventListener("pointerdown", (event) => onStop(event) && window.stopping.press());
 addEventListener("click", (event) => onStop(event) && event.detail === 0 && window.stopping.press()); // Enter or Space key
@@ -147,6 +150,6 @@ addEventListener("keydown", (event) => {
 }, true);
 addEventListener("keyup", (event) => event.code === "Space" && event.preventDefault(), true);
 addEventListener("pagehide", () => window.stopping.over());
-addEventListener("error", () => window.stopping.lacks(), true); // also of a file that the browser could not load
+addEventListener("error", () => window.stopping.lacks(), true); // also if the browser could not load a file
 setTimeout(() => window.stopping.lacks(), SLOW);
 document.documentElement.classList.add("stops");

@@ -49,7 +49,7 @@ export function counters(list, state) {
   );
 }
 
-/** Return the events with equal neighbours made one, which has the time of the first, and their number as `equal`. */
+/** Return the events, with each sequence of equal events merged into its first one. `equal` is their number. */
 export function folded(events) {
   const rows = [];
   for (const event of events) {
@@ -69,9 +69,9 @@ export function happened(list, told, elsewhere) {
   list.replaceChildren(...rows);
 }
 
-/** Show a card with a link for each robot. Existing cards are updated in place, because a replaced card
- *  cannot be pressed. `own` is the id of the page's own robot, `here` the id of the robot that this page can
- *  clear. */
+/** Show a card with a link for each robot. Existing cards are updated in place, because a card that is replaced during
+ *  a click cannot be clicked. `own` is the id of the page's own robot. `here` is the id of the robot whose stop or
+ *  fault this page can release. */
 export function cards(list, robots, own, here) {
   const before = new Map([...list.children].map((card) => [card.dataset.robot, card]));
   const shown = robots.map((one) => {
@@ -106,8 +106,8 @@ function empty(robot, own) {
   return card;
 }
 
-/** Show the mode, the reason and any warnings. `locked` is true for a client that may not release a stop. `own` is
- *  the public name of this page. */
+/** Show the mode, its reason and the warnings. `locked` is true for a client that may not release a stop. `own` is the
+ *  public name of this page. */
 export function banner(state, locked, elsewhere, own) {
   const alone = !boarded(state);
   const words = state.mode.toUpperCase();
@@ -135,7 +135,7 @@ function pressed(bumpers) {
   return numbers.length ? `bumper${numbers.length > 1 ? "s" : ""} ${numbers.join(" and ")} pressed` : "";
 }
 
-/** Show the state of charge, or else the voltage, with an icon that is filled as far as it is known. */
+/** Show the state of charge or, if it is unknown, the voltage. The icon is filled by the state of charge. */
 function powered(battery) {
   const shown = document.getElementById("battery");
   shown.hidden = !battery;
@@ -153,16 +153,15 @@ function doubted(words) {
   text("doubt", words);
 }
 
-/** Show in every view why a button failed, until `words` is "". A repeated message is set again, because a screen reader
- *  announces it only if the text changes. */
+/** Show in every view why a button failed, until `words` is "". A repeated message is set again, because a screen
+ *  reader announces it only if the text changes. */
 export function complain(words) {
   document.getElementById("complaint").hidden = !words;
   text("complaint", "");
   text("complaint", words);
 }
 
-/** Show a mode in the banner and in the title, which a background tab shows. STOP and its
- *  release follow the mode. */
+/** Show a mode in the banner and in the title, which a background tab shows. Adapt STOP and the release button. */
 function mode(name, words) {
   document.body.dataset.mode = name;
   text("mode", words);
@@ -195,8 +194,8 @@ export function lost(why) {
   for (const name of ["speed", "turn", "who"]) text(name, "–");
 }
 
-/** Show the age of the data (`old`, ms; stale above `fresh`) and the round trip (`way`, ms). `none` is shown
- *  while there is no data; `seen` means that older data is still on the page, and `alone` that the board is missing. */
+/** Show the age of the data (`old`, ms; stale above `fresh`) and the round trip (`way`, ms). `none` is the text while
+ *  there is no data. `seen` means that older data is still on the page, and `alone` that the board is missing. */
 export function freshness(old, fresh, way, none, seen, alone) {
   const stale = old > fresh;
   document.body.classList.toggle("stale", stale && seen);

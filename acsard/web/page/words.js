@@ -1,6 +1,6 @@
 // Formats numbers and times for people. This module is pure.
 
-/** The button that ends a mode, by mode. */
+/** Maps a mode to the text of the button that ends it. */
 export const RELEASE = { stopped: "Release STOP", fault: "Release fault", inactive: "Switch on" };
 
 const NAMELESS = "a program without a name";
@@ -53,7 +53,7 @@ export function age(ms) {
   return ms < 1000 ? `${Math.round(ms)} ms` : `${(ms / 1000).toFixed(1)} s`;
 }
 
-/** Format a pose in odom: m and rad as m and degrees. */
+/** Format a pose in the odom frame. `x` and `y` are in m, `yaw` is in rad and shown in degrees. */
 export function spot(x, y, yaw) {
   return `x ${signed(x, 2)} m · y ${signed(y, 2)} m · ${signed((yaw * 180) / Math.PI, 0)}°`;
 }
@@ -63,8 +63,8 @@ export function yaw(q) {
   return 2 * Math.atan2(q.z, q.w);
 }
 
-/** Return a sender's public name, "NAME/DIGITS [CERTIFICATE]" or "session DIGITS [CERTIFICATE]", in a person's
- *  words. `own` is the public name of this page, "" if it is not known. */
+/** Return a short name for people for a sender's public name, "NAME/DIGITS [CERTIFICATE]" or "session DIGITS
+ *  [CERTIFICATE]". `own` is the public name of this page, "" if it is not known. */
 export function person(sender, own = "") {
   const [, name, certificate] = sender.match(/^(?:(.*)\/|session )?[0-9a-f]{16}(?: \[(.*)\])?$/) ?? [null, sender];
   if (own && sender === own) return "you";
@@ -74,7 +74,7 @@ export function person(sender, own = "") {
   return name || certificate || NAMELESS;
 }
 
-/** Return the reason without the mode, which the banner shows above it. */
+/** Return the reason of the mode without the name of the mode, which the banner shows above the reason. */
 export function reason(state, elsewhere) {
   if (state.mode === "ready" && state.reason.startsWith("waiting for a command")) return "Nobody drives.";
   const before = `${state.mode}: `;
@@ -82,7 +82,7 @@ export function reason(state, elsewhere) {
   return words.replace("press Release", `press ${RELEASE[state.mode] ?? "Release"}`);
 }
 
-/** Return a sentence with senders in a person's words. */
+/** Return a sentence in which the technical names of senders are replaced by names for people. */
 export function named(text) {
   return text
     .replace(/\/[0-9a-f]{16}\b/g, "")
@@ -92,13 +92,13 @@ export function named(text) {
     .replaceAll("here@page", "a page on the robot itself");
 }
 
-/** Return a sentence of the log, with four digits of each sender: they tell two of one name apart. */
+/** Return a sentence of the log with each sender id cut to four digits, which distinguish senders of the same name. */
 export function logged(text) {
   return text.replace(/\b([0-9a-f]{4})[0-9a-f]{12}\b/g, "$1");
 }
 
-/** Replace service names by button names, of this page or of the own page of the robot `elsewhere`, and times in UTC
- *  by local ones. */
+/** Replace the names of services by those of buttons, and times in UTC by local times. The buttons are those of this
+ *  page or, if `elsewhere` is the id of another robot, those of that robot's own page. */
 export function said(text, elsewhere = "", now = new Date()) {
   const there = `on the own page of ${elsewhere}`;
   const buttons = elsewhere

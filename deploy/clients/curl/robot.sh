@@ -19,7 +19,7 @@ stop)
     ask --request POST "$robot/api/srv/stop"
     ;;
 clear)
-    # The number says which stop you have seen. The robot keeps a later one.
+    # The number `latch` tells the robot which stop you have seen. The robot does not release a later stop.
     state=$(ask "$robot/api/state")
     latch=$(echo "$state" | sed -n 's/.*"latch": *\([0-9]*\).*/\1/p')
     ask --json "{\"latch\": ${latch:-0}}" "$robot/api/srv/clear"

@@ -11,7 +11,7 @@ import java.util.regex.Pattern;
 public class Drive implements WebSocket.Listener {
     private static final int PERIOD_MS = 50;
 
-    // Java has no JSON. A program that reads more than this wants a library for it.
+    // Java has no JSON parser. A program that reads more than these numbers should use a JSON library.
     private static final String NUMBER = "(-?[0-9.eE+-]+)";
     private static final Pattern ODOMETRY = Pattern.compile(
         "\"key\":\"odom\".*?\"position\":\\{\"x\":" + NUMBER + ",\"y\":" + NUMBER

@@ -1,4 +1,4 @@
-"""Prints where the robot is: `python follow.py [ENDPOINT [ID]]`; needs eclipse-zenoh alone."""
+"""Prints where the robot is: `python follow.py [ENDPOINT [ID]]`; needs only eclipse-zenoh."""
 
 import json
 import sys

@@ -106,15 +106,19 @@ def test_without_a_screen_no_word_and_no_figure_is_broken_at_the_edge(width: int
 
 def test_the_last_word_says_whether_the_robot_stands_and_where() -> None:
     still = {"linear": 0.0, "angular": 0.0, "wheels": [0.0] * 4}
-    assert told(parting(of(**still), 80)).startswith("left: the robot stands; driving: commanded")
+    assert told(parting(of(**still), 80)).startswith(
+        "drive ended: the robot stands; driving: commanded"
+    )
     for moving in (of(), of(**still | {"wheels": [0.0, 0.1, 0.0, 0.0]})):
-        assert told(parting(moving, 80)).startswith("left: the robot still moves; driving: ")
+        assert told(parting(moving, 80)).startswith("drive ended: the robot still moves; driving: ")
     unknown = of(**still | {"linear": None, "angular": None, "wheels": []})
-    assert told(parting(unknown, 80)).startswith("left: the robot reports no speed; driving: ")
+    assert told(parting(unknown, 80)).startswith(
+        "drive ended: the robot reports no speed; driving: "
+    )
     assert "forward - m/s" in told(parting(unknown, 80))
     assert "yaw +57.3°" in told(parting(of(**still), 40))
     assert told(parting(replace(SEEN, age=7.0, silent=True), 80)).startswith(
-        "left: nothing received from the daemon"
+        "drive ended: nothing received from the daemon"
     )
 
 

@@ -76,7 +76,7 @@ def test_the_last_report_waits_until_the_robot_no_longer_follows_the_drive(
     still = replace(moving, linear=0.0, angular=0.0, wheels=[0.0] * 4)
     ready = replace(still, mode="ready", reason="waiting for a command", source="")
     part(cast(Ride, Ended(moving, moving, still, still, ready)))
-    assert "left: the robot stands; ready: waiting for a command" in capsys.readouterr().out
+    assert "drive ended: the robot stands; ready: waiting for a command" in capsys.readouterr().out
     other = replace(still, reason="driving: commanded by nav", source="nav")
     part(cast(Ride, Ended(still, still, other, ready)))
-    assert "left: the robot stands; driving: commanded by nav" in capsys.readouterr().out
+    assert "drive ended: the robot stands; driving: commanded by nav" in capsys.readouterr().out

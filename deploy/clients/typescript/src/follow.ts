@@ -3,7 +3,7 @@
 import { Config, Sample, Session } from "@eclipse-zenoh/zenoh-ts";
 import WebSocket from "ws";
 
-// A browser has it, and Node from version 22 on.
+// Browsers and Node 22 or later have a global WebSocket.
 globalThis.WebSocket ??= WebSocket as unknown as typeof globalThis.WebSocket;
 
 interface Odometry {
