@@ -281,8 +281,10 @@ class JsonPrompt:
             if self._readable(LISTEN_S):
                 read = os.read(self._input, 4096)
                 *whole, held = (held + read).split(b"\n")
-                if not read or len(held) > LINE_BYTES:
+                if not read:
                     return "the program that shows the questions to the operator has ended"
+                if len(held) > LINE_BYTES:
+                    return f"a line on standard input has more than {LINE_BYTES} bytes"
                 for line in whole:
                     self._take(line)
                 heard_s = time.monotonic()

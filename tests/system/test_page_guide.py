@@ -267,6 +267,8 @@ def test_the_simulator_is_calibrated_from_the_first_question_to_the_written_line
     drives(person, bus)
     assert commands(server)
     person.asked("from its mark", RIDES_S)
+    assert "leave this empty" in browser.text("guide-words")
+    assert "any key or the button stops the robot" in browser.text("guide-story")
     where = bus.get("sim/pose")["pose"]["position"]
     person.types("far")
     person.shows("guide-wrong", "a number in m")

@@ -246,8 +246,8 @@ export function worded(words) {
     .replace('then type "lifted".', "then tick this.")
     .replace(" q or Ctrl-C quits at any time:", " Stop and quit ends the check at any time:")
     .replace("Press SPACE", "Press NOW")
-    .replace("Enter alone:", "Left empty:")
-    .replace("any key stops it", "any key or the button stops it");
+    .replace("press only Enter", "leave this empty")
+    .replace("any key stops the robot", "any key or the button stops the robot");
 }
 
 /** Return the typed number, or null for an empty answer to a question with the default `usual`. A text that is not a

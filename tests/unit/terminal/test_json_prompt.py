@@ -187,7 +187,7 @@ def test_what_is_nested_too_deep_leaves_the_question_open(program: Program) -> N
         assert person.ask("lifted?", ("lifted",)) == "lifted"
 
 
-def test_a_line_without_an_end_ends_it(program: Program) -> None:
+def test_a_line_without_an_end_ends_it(program: Program, capfd: pytest.CaptureFixture[str]) -> None:
     with program.hears(JsonPrompt()) as person:
 
         def flood(number: int) -> None:
@@ -196,6 +196,7 @@ def test_a_line_without_an_end_ends_it(program: Program) -> None:
 
         program.answers = [flood]
         interrupted(program, lambda: person.ask("lifted?", ("lifted",)))
+    assert "a line on standard input has more than 65536 bytes" in capfd.readouterr().err
 
 
 def test_silence_ends_what_moves_and_signs_of_life_do_not(
