@@ -18,7 +18,7 @@ class MinimumDelay:
     """The delay of the last event in excess of the minimum, in the caller's unit of time."""
 
     def __init__(self, drift: float = DRIFT, most: float = math.inf) -> None:
-        """Start.
+        """Start without an event.
 
         `drift` is the largest relative drift between the two clocks. A delay that exceeds the
         minimum by more than `most` is treated as if it exceeded the minimum by `most`.
@@ -29,9 +29,9 @@ class MinimumDelay:
     def add(self, ours: float, theirs: float) -> float:
         """Process an event, and return its delay in excess of the minimum so far.
 
-        If the result is negative, this event is the new minimum. The allowed drift is not
-        subtracted from the result, unlike in `measure`. `ours` is the time since the last event by
-        this computer's clock, and `theirs` by the other clock.
+        If the result is negative, this event sets a new minimum. Unlike `measure`, this method does
+        not subtract the allowed drift from the result. `ours` is the time since the last event by
+        this computer's clock, and `theirs` is the same time by the other clock.
         """
         later = self.late + ours - theirs
         self.measure(ours, theirs)
