@@ -51,17 +51,16 @@ speed and the host's time give. It applies if the speeds alone prove nothing, as
 It also helps to decide whether the counts of a line include those of the missing line before it."""
 
 WIDE, WIDE_S = 0.6, 0.005
-"""The host's time between two samples is wrong by at most `WIDE` times this time plus `WIDE_S`
-s."""
+"""Largest error of the host's time between two samples: the share `WIDE` of it, plus `WIDE_S` s."""
 
 KEPT = 0.95
 """Largest share of the error of the host's time that is carried to the next line. If the whole
 error were carried and the two clocks differed by 0.5 %, the carried time would grow forever."""
 
 REPEATED = 0.65
-"""A line with unchanged speeds may only repeat the previous line if it follows sooner than this
-share of the time over which the firmware last counted. Firmware that is asked again so soon has no
-new counts."""
+"""A line with unchanged speeds can be a repetition of the previous line only if it follows sooner
+than this share of the time over which the firmware last counted. Firmware that is asked again so
+soon has no new counts."""
 
 SOON, OFF = 0.45, 0.25
 """A line with unchanged speeds is a repetition of the previous line if it follows sooner than the
@@ -100,15 +99,14 @@ class WholeCounts:
         self.covers_gap = False
         """Whether the counts of the last line include those of the missing line before it."""
         self._cover = 0.0
-        """Filtered share of the lines after a missing line whose counts include those of the
-        missing line. Lines whose speeds do not show whether they do are left out."""
+        """Among the lines that follow a missing line, the filtered share of those whose counts
+        include the counts of the missing line. A line whose speeds do not show this is left out."""
         self._doubt = self._unsure = 0.0
         """`_doubt` is the filtered share of the lines whose speeds are not whole counts. `_unsure`
         is the filtered error of the host's time, in counts of the fastest wheel."""
 
     def pause(self) -> None:
-        """Reset the carried time, because it is unknown over what time the firmware last
-        counted."""
+        """Reset the carried time, because the firmware's time of the last line is unknown."""
         self._apart, self._run = 0.0, 0
 
     @property
