@@ -93,7 +93,8 @@ class EchoDetector:
         """The last `LINES` sent lines, and the line before them. A run that ends with that line may
         continue with the others."""
         self._runs: deque[_Run | None] = deque(maxlen=LINES + 1)
-        """For each line in `_sent` the run that ends with it, or None if it did not come back."""
+        """For each line in `_sent`, the run of lines that came back and that ends with this line.
+        None if this line did not come back."""
         self._reports = 0
         self._last: deque[_Wheels] = deque(maxlen=OTHERS + 1)
         """Wheel speeds in the last reports, rad/s."""
@@ -132,8 +133,8 @@ class EchoDetector:
     def _continued(self, run: _Run | None, wheels: _Wheels) -> _Run:
         """Return `run` with one more line, which has the speeds `wheels`.
 
-        Return a new run with only this line if `run` is None, or if the reports between its last
-        line and this line show that it is not an echo.
+        Return a new run with only this line if `run` is None, or if the reports since the last line
+        of `run` show that this line is not an echo.
         """
         others = OTHERS + 1 if run is None else self._reports - run.report - 1
         if run is None or others > OTHERS:

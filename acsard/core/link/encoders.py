@@ -51,7 +51,7 @@ class Encoders:
     """Converts each reading of the encoders to the angles turned since the previous reading."""
 
     def __init__(self, counts: int, wheel_speed: float, quiet_ns: int) -> None:
-        """Start without a reading.
+        """Start before the first reading of the encoders.
 
         The delay of a reading is its arrival time minus the time of the board's clock. A restart
         sets this clock to 0. The clock counts modulo 65536 ms, so it then seems to have jumped
@@ -71,7 +71,7 @@ class Encoders:
         """Measures by how much the delay of a reading exceeds the least delay so far, ms."""
 
     def forget(self) -> None:
-        """Forget the last reading, in a new session or after a line without a reading."""
+        """Forget the last reading, because a new session begins or a line has no reading."""
         self._last = None
 
     def turned(self, reading: Reading, at_ns: int) -> Turned | Unknown:

@@ -111,7 +111,7 @@ class ReplyStyle:
     """
 
     def __init__(self, speaks: bool) -> None:
-        """Start without a read of the port.
+        """Start before the first read of the port.
 
         `speaks` is true if `mcu.reply_period` is set, so that the board is known to report by its
         own clock.
@@ -168,7 +168,7 @@ class Timeline:
     def __init__(
         self, mcu: McuConfig, codec: Codec, wheel_speed: float, quiet_ns: int, rate_hz: float
     ) -> None:
-        """Start without a line.
+        """Start before the first line.
 
         `wheel_speed` is the highest speed that a wheel can have, rad/s. `quiet_ns` is the duration
         of silence after which the link is stale, ns. `rate_hz` is the daemon's control rate.

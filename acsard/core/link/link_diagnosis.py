@@ -143,7 +143,7 @@ class Heard(Struct):
     statuses: int = 0
     """Number of the board's status lines."""
     last: bytes = b""
-    """The last bad line. Before the end of the first line, the last received bytes instead."""
+    """The last bad line, or the last received bytes if no line has ended yet."""
     late_s: float = 0.0
     """Longest time in the interval in which this computer did not run and received nothing, s."""
 
@@ -249,7 +249,7 @@ class UnansweredLines:
     def __init__(self, reply_period: float) -> None:
         """Start without a warning. `reply_period` is `mcu.reply_period`, s.
 
-        If it is not 0, the board reports by its own clock, so this object never warns.
+        If `reply_period` is not 0, the board reports by its own clock, so there is no warning.
         """
         self._own_clock = reply_period > 0.0
         self._since: tuple[int, int] | None = None

@@ -18,7 +18,7 @@ class MinimumDelay:
     """The delay of the last event in excess of the minimum, in the caller's unit of time."""
 
     def __init__(self, drift: float = DRIFT, most: float = math.inf) -> None:
-        """Start without an event.
+        """Start before the first event.
 
         `drift` is the largest relative drift between the two clocks. A delay that exceeds the
         minimum by more than `most` is treated as if it exceeded the minimum by `most`.

@@ -122,7 +122,7 @@ class CountRecovery:
     """Adds the counted angles and the quantization steps to each good line of one port."""
 
     def __init__(self, counts: int = 0) -> None:
-        """Start without a line.
+        """Start before the first line.
 
         `counts` is the configured number of encoder counts per wheel turn, 0 if unknown.
         """

@@ -103,8 +103,8 @@ EARLY = 0.25
 its clock as wrong."""
 
 LOSSY_READS = 0.45
-"""If more than this share of the reads in two windows follow missing lines, the period of the clock
-is wrong."""
+"""If more than this share of the reads in two successive windows follow missing lines, the period
+of the clock is wrong."""
 
 
 class FreeRunningTimes:
@@ -225,9 +225,9 @@ class FreeRunningTimes:
     def _missing(self, ahead: float, since: float, lines: int, drained: bool) -> int:
         """Return the number of missing lines that this read proves.
 
-        Return -1 if the lines come too early for the clock, or too late without a missing line.
-        `ahead` is the lateness x of the read's last line, and `since` is the time since the last
-        read, both in slots. `drained` is as in `read`.
+        Return -1 if the read shows that the clock is wrong, or that an earlier read counted a slot
+        too many as missing. `ahead` is the lateness x of the read's last line, and `since` is the
+        time since the last read, both in slots. `drained` is as in `read`.
         """
         lag = min(self._lag, 0.5)
         if ahead < -0.5 + 0.6 * lag:
@@ -450,7 +450,7 @@ class PromptedTimes:
     """
 
     def __init__(self, soonest_ns: int) -> None:
-        """Start without a command.
+        """Start before the first command.
 
         `soonest_ns` is the time that a line and its reply take on the wire together, ns.
         """

@@ -83,7 +83,10 @@ class WholeCounts:
     """Recovery of whole encoder counts from the speeds of four wheels, line by line."""
 
     def __init__(self, counts: int) -> None:
-        """Start without a line. `counts` is the number of counts per wheel turn, 0 if unknown."""
+        """Start before the first line.
+
+        `counts` is the number of encoder counts per wheel turn, 0 if unknown.
+        """
         self.angle = math.tau / counts if counts else 0.0
         """Angle of one encoder count, rad, 0 if unknown."""
         self.forget()
@@ -94,7 +97,7 @@ class WholeCounts:
         """`_apart` is the time in s by which the board took the last sample earlier than the host
         believed. `_period` is the time in s by which the firmware divided its last counts."""
         self._run = 0
-        """Number of lines with recovered counts since the last line without them."""
+        """Number of lines with recovered counts since the last line without recovered counts."""
         self._before: Motors = (0.0, 0.0, 0.0, 0.0)
         self.covers_gap = False
         """Whether the counts of the last line include those of the missing line before it."""
@@ -106,7 +109,10 @@ class WholeCounts:
         is the filtered error of the host's time, in counts of the fastest wheel."""
 
     def pause(self) -> None:
-        """Reset the carried time, because the firmware's time of the last line is unknown."""
+        """Forget the error of the host's time, which would be carried to the next line.
+
+        The reason is that the last line does not show over what time the firmware counted.
+        """
         self._apart, self._run = 0.0, 0
 
     @property

@@ -177,7 +177,7 @@ class Channel(Struct, frozen=True):
 
     @property
     def schema(self) -> str:
-        """The message definition, with the definitions of all nested types, in MCAP's `ros2msg`."""
+        """The message definition and those of all nested types, in MCAP's `ros2msg` format."""
         return schema_text(self.schema_name)
 
     def encode(self, message: Any) -> bytes:
