@@ -29,7 +29,7 @@ from msgspec.structs import astuple
 from acsard.core.link.codec import FrameError
 
 STATUS = b"!status"
-"""First bytes of every status line. No other line begins with them: a reply begins with a letter,
+"""First bytes of every status line. No other line begins like this: a reply begins with a letter,
 and the line in which a board identifies itself begins with `!acsard-mcu`."""
 
 _LINE = re.compile(STATUS + rb"((?: [a-z]+=[^ *]+)+)(?:\*([0-9A-F]{4}))?")

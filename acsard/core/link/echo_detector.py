@@ -1,6 +1,6 @@
 """Detects echoes: lines that the daemon wrote to the serial port and then receives from it.
 
-They come back if TX and RX are connected to each other, or if a device at the far end sends all
+Lines come back if TX and RX are connected to each other, or if a device at the far end sends all
 bytes back. Such a device may be the only one, or there may be a board behind it that also answers.
 This module detects the echo of plain lines, and of checked lines that ask for no sample.
 """
@@ -153,9 +153,9 @@ class EchoDetector:
 
 
 def _between(wheels: _Wheels, one: _Wheels, other: _Wheels) -> bool:
-    """Return whether each speed in `wheels` is between those of the wheel in `one` and `other`.
+    """Return whether each wheel's speed in `wheels` lies between its speeds in `one` and `other`.
 
-    A speed that equals one of the two is between them.
+    A speed that equals one of these two speeds counts as between them.
     """
     rows = zip(wheels, one, other, strict=True)
     return all(min(a, b) <= speed <= max(a, b) for speed, a, b in rows)

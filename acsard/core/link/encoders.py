@@ -22,7 +22,8 @@ from acsard.core.values import NS_PER_S
 
 SLACK_COUNTS = 4
 """Number of counts that a wheel may make between two readings in addition to the counts that its
-highest speed allows. It covers one count at each end of the interval, and play in the gears."""
+highest speed allows. This margin covers one count at each end of the interval, and play in the
+gears."""
 
 ROUNDING_MS = 2
 """Largest error of the time between two readings, ms. Each reading has an error of up to 1 ms."""

@@ -48,9 +48,10 @@ LATEST = 100.0
 """Longest time between two reads of the port that `ReplyStyle` evaluates, in reply periods."""
 
 CLEAR = 0.5
-"""`ReplyStyle` has two sums (of reply periods and of commands), and compares each with the number
-of received lines. It decides only if one sum is clearly nearer to that number: the two distances
-must differ by at least this share of the difference between the sums."""
+"""`ReplyStyle` compares two sums (of reply periods and of commands) with the number of received
+lines. It decides only if one sum is clearly nearer to this number than the other sum. The distances
+of the two sums from the number must differ by at least this share of the difference between the
+sums."""
 
 AFTER = 3
 """Number of further reads of the port that `ReplyStyle` evaluates after a read that reaches
@@ -161,8 +162,8 @@ class ReplyStyle:
 class Timeline:
     """Assigns a sample time to each good line, in order.
 
-    For each read of the port, call `read`. Then, for each of its lines in order, call `place` if
-    the line is good and `spoilt` if it is bad.
+    For each read of the port, call `read`. Then, for each line of the read in order, call `place`
+    if the line is good and `spoilt` if it is bad.
     """
 
     def __init__(
@@ -319,7 +320,9 @@ class Timeline:
         return Placed("reads", int(self._end_ns - self._share_ns * self._rest))
 
     def _since_last(self, placed: Placed) -> tuple[float, float]:
-        """Return a pair: the time since the last good line, and the part whose lines were lost, s.
+        """Return a pair: the time since the last good line, s, and the part of it to fill, s.
+
+        Lines were lost in the part to fill. It is 0 if no line was lost.
 
         If the times of this line and of the last good line come from different clocks, the time is
         the difference of their `due_ns`, corrected by the mean offset between the clocks. Without

@@ -135,7 +135,7 @@ class Heard(Struct):
     """A summary of the bytes and lines that were received in an interval without a link."""
 
     size: int = 0
-    """Number of received bytes, without those of the status lines."""
+    """Number of received bytes, without the bytes of status lines."""
     lines: int = 0
     """Number of received lines, good and bad, without the status lines."""
     good: int = 0

@@ -140,7 +140,10 @@ class Throttle:
         return True
 
     def undo(self) -> None:
-        """Forget the last event, because its line was not written. The next need not wait."""
+        """Forget the last event, because its line was not written.
+
+        The next event then need not wait.
+        """
         self.last_ns = self._before_ns
 
 

@@ -492,8 +492,8 @@ class PromptedTimes:
         link, ns, oldest first. An adapter that stalled may still deliver their replies."""
         self._at, self._alone, self._since = 0, False, 0
         self._base, self._batch, self._losses = 0.0, 2e7, 0.0
-        """For a batched link: the least reply delay and the usual time between two reads, both ns,
-        and the share of lost replies."""
+        """These values describe a batched link. `_base` is the least reply delay, ns. `_batch` is
+        the usual time between two reads, ns. `_losses` is the share of lost replies."""
         self._several = 0.0
         """Filtered share of the reads that have several lines."""
         self._thinking = 0.0
@@ -603,10 +603,10 @@ class PromptedTimes:
     def _shorten(self, line: int) -> None:
         """Correct the usual delay if a stall had delayed the first reply, on which it was measured.
 
-        In that case, the next reply comes much sooner than the usual delay after its line. `line`
-        is the time at which that line was written, ns. Without the correction, the usual delay
-        would fall by only 5 % of the difference per reply. Until then the delay would seem to vary
-        much, which would hide lost replies.
+        In that case, the delay of the second reply is much shorter than the usual delay. Without
+        the correction, the usual delay would fall by only 5 % of the difference per reply. Until
+        then the delay would seem to vary much, which would hide lost replies. `line` is the time at
+        which the command that the second reply answers was written, ns.
         """
         own = self._at - line
         self._first = own < (self._delay or 0) - self._apart / 2
@@ -655,8 +655,8 @@ class PromptedTimes:
     def _given_up_too_early(self, delay: float) -> bool:
         """Return whether the present reply answers the command that was given up last.
 
-        Before that, this method gives up the commands whose replies were lost. The present reply
-        must be the only one in its read. `delay` is the usual delay, ns.
+        Before this check, give up the commands whose replies were lost. The present reply must be
+        the only one in its read. `delay` is the usual delay, ns.
         """
         left, at, wide = self._left, self._at, 4 * self._spread
         lost, self._lost = self._lost, False

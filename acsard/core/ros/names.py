@@ -119,7 +119,7 @@ class Node(Struct, frozen=True):
 
     @property
     def token(self) -> str:
-        """Liveliness token of the node itself, which has the number 0 in its session."""
+        """Liveliness token of the node itself. The node has the number 0 in its session."""
         return f"{self._head}/0/NN/%/{_mangled('/' + self.namespace)}/{self.name}"
 
     def endpoint_token(self, number: int, kind: Kind, name: str, type_name: str, qos: Qos) -> str:

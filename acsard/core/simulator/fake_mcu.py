@@ -190,7 +190,7 @@ class FakeMcu(Faults):
     def reset(self, now_ns: int, deaf_ns: int = RESET_NS) -> None:
         """Reset the board, which stops its motors and ignores its input for `deaf_ns` ns.
 
-        Half of this time later, the board sends some noise, as a bootloader does.
+        After half of this time, the board sends some noise, as a bootloader does.
         """
         self._now_ns = now_ns
         self._events.clear()
@@ -361,7 +361,7 @@ class FakeMcu(Faults):
             self._send(now_ns, self._damaged(protocol.status(fields, self._checks)))
 
     def _tell_battery(self, now_ns: int) -> None:
-        """Drain the battery for the time since the last call, and report its state to the host."""
+        """Drain the battery for the time since the last call, and send a status line with its values."""
         seconds, self._drained_ns = (now_ns - self._drained_ns) / NS_PER_S, now_ns
         turning = sum(map(abs, self.vehicle.set_points))
         if not turning:

@@ -207,7 +207,7 @@ class Faults:
         return self._with(understand=protocol.plain_only)
 
     def no_sample(self) -> Fault:
-        """Make the board reply with a checksum, but never with its time and encoder counts."""
+        """Make the board reply with a checksum, but never with the board's time and counts."""
         return self._with(samples=False)
 
     def no_watchdog(self) -> Fault:

@@ -140,7 +140,7 @@ def identity(counts: int, watchdog_ms: int, sample: bool) -> bytes:
     """Return the line with which the firmware identifies itself.
 
     `counts` is the number of encoder counts per wheel revolution. `sample` says whether the
-    firmware can add its time and encoder counts to its replies.
+    firmware can add the board's time and encoder counts to replies.
     """
     text = f"!acsard-mcu 1 counts={counts} watchdog_ms={watchdog_ms} check=1 sample={int(sample)}"
     return text.encode() + b"\r\n"
