@@ -70,7 +70,10 @@ def merged(status: BoardStatus, newer: BoardStatus) -> BoardStatus:
 
 
 def shown(status: BoardStatus) -> dict[str, str]:
-    """Return the fields of `status` that are not None, as text by the name that users see."""
+    """Return a map of the names that users see to the values of `status` as text.
+
+    Fields of `status` that are None are left out.
+    """
     bumpers = status.bumpers
     values = {
         "emergency_stop": _word(status.estop, "pressed", "released"),

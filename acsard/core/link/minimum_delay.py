@@ -1,9 +1,9 @@
 """Measures the delay of events between two unrelated clocks, relative to the least delay so far.
 
-The arrival time by this computer's clock minus the departure time by the other clock is the
-delay plus an unknown offset between the clocks. The smallest such difference so far belongs to the
-event with the least delay. Subtracting it cancels the offset, so the result is the delay in excess
-of the minimum. The clocks drift, so the stored minimum slowly rises as time passes.
+The arrival time by this computer's clock minus the departure time by the other clock is the delay
+plus an unknown offset between the clocks. The smallest such difference so far belongs to the event
+with the least delay. Subtracting the smallest difference cancels the offset, so the result is the
+delay in excess of the minimum. The clocks drift, so the stored minimum slowly rises as time passes.
 """
 
 from __future__ import annotations

@@ -12,7 +12,8 @@ check answers in the same form. The states of the negotiation are:
 - plain: only with mcu.link_check = "auto". The board answers, but without the check. The daemon
   asks again after the next gap.
 - checked: the board has answered a question correctly. Now the daemon accepts only checked replies.
-- sampled: as checked, and the replies contain the encoder counts that the lines ask for.
+- sampled: as in checked. In addition, the replies contain the encoder counts that the lines ask
+  for.
 
 Once a board has answered with the check, the daemon accepts no plain replies until the port is
 reopened, because noise must not end the check.
@@ -288,7 +289,7 @@ class Negotiation:
         return self.trouble == "echo"
 
     def repeated(self, line: bytes, speeds: WheelSpeeds) -> bool:
-        """Process a reply without a sample, and return whether such replies are an echo.
+        """Process a reply without a sample, and return whether the received replies are an echo.
 
         `line` is the reply without its line end, and `speeds` are the speeds in it.
         """

@@ -133,7 +133,7 @@ class CountRecovery:
         self.forget()
 
     def forget(self) -> None:
-        """Forget all earlier lines, because the board has restarted or another one may be there."""
+        """Forget all earlier lines, because the board has restarted or was replaced."""
         self._whole.forget()
         self._coarseness = Coarseness()
         self._wheels = tuple(Steps() for _ in NOTHING)

@@ -1,6 +1,6 @@
-"""Estimates when the board read its encoders, with one class for each of two kinds of boards.
+"""Estimates when the board read its encoders (the sample time), for two kinds of boards.
 
-The host reads a line later than the board read its encoders for it, because an adapter, the
+The time at which the host reads a line is later than its sample time, because an adapter, the
 scheduler or a stall of the host may have held the line back. `FreeRunningTimes` finds the period of
 a board that reports by its own clock. For a board that answers each command, `PromptedTimes` uses
 the times at which the commands were written. Each class serves as a clock: after every read of the
@@ -110,10 +110,10 @@ of the clock is wrong."""
 class FreeRunningTimes:
     """The sample times of a free-running board, from the times at which its lines were read.
 
-    The board makes one line in each period T of its clock, here called a slot. The time of a read
-    alone does not show to which slot a line belongs: an adapter holds lines back, and during a host
-    stall they wait in the kernel. Let a be the time of a read, k the number of the slot of its last
-    line, and c the time of slot 0. Then the lateness of this line in slots is
+    The board makes one line in each period T of its clock. Such a period is called a slot. The time
+    of a read alone does not show to which slot a line belongs: an adapter holds lines back, and
+    during a host stall they wait in the kernel. Let a be the time of a read, k the number of the
+    slot of its last line, and c the time of slot 0. Then the lateness of this line in slots is
 
         (1)  x = (a - c) / T - k
 
@@ -589,7 +589,7 @@ class PromptedTimes:
             self._passed = self._left.popleft()
 
     def _begin(self) -> None:
-        """Assign the first reply to the newest command that it can answer, and set the delay."""
+        """Assign the first reply to the newest command it can answer, and set the usual delay."""
         left = self._left
         while len(left) > 1 and left[1] + self._soonest <= self._at:
             self._passed = left.popleft()

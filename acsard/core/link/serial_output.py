@@ -66,8 +66,8 @@ class SerialOutput:
 
         A line is dropped if the kernel still has bytes to send, or if the previous line was still
         on the wire when `line` was made. A line that is not a stop is also dropped if it is older
-        than a period, because the process did not run meanwhile. After the port was opened, a plain
-        stop replaces the first line.
+        than a period, which happens if the process did not run meanwhile. After the port was
+        opened, a plain stop replaces the first line.
 
         Args:
             line: The line with its line end.

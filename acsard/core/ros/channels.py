@@ -128,7 +128,7 @@ def schema_text(name: str) -> str:
 
 
 def nested(name: str) -> tuple[str, ...]:
-    """Return all message types that the type `name` contains at any depth, by their first use."""
+    """Return all types nested in the type `name` at any depth, in the order of their first use."""
     return tuple(dict.fromkeys(_nested(name)))
 
 

@@ -361,7 +361,7 @@ class FakeMcu(Faults):
             self._send(now_ns, self._damaged(protocol.status(fields, self._checks)))
 
     def _tell_battery(self, now_ns: int) -> None:
-        """Drain the battery for the time since the last call, and send a status line with its values."""
+        """Drain the battery for the time since the last call, and report it in a status line."""
         seconds, self._drained_ns = (now_ns - self._drained_ns) / NS_PER_S, now_ns
         turning = sum(map(abs, self.vehicle.set_points))
         if not turning:
