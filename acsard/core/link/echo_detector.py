@@ -90,8 +90,8 @@ class EchoDetector:
     def forget(self) -> None:
         """Forget all lines and reports, because the port has been opened."""
         self._sent: deque[bytes] = deque(maxlen=LINES + 1)
-        """The last `LINES` sent lines, and the line before them. A run that ends with that line may
-        continue with the others."""
+        """The last `LINES` sent lines, and one older line, so that a run that ends with the older
+        line can continue."""
         self._runs: deque[_Run | None] = deque(maxlen=LINES + 1)
         """For each line in `_sent`, the run of lines that came back and that ends with this line.
         None if this line did not come back."""

@@ -78,8 +78,8 @@ class Feedback(Struct, frozen=True, gc=False):
     gap: float = 0.0
     turned: Motors | None = None
     bridged: float = 0.0
-    """Length of the first part of `dt`, whose lines were lost, s. The odometry fills this part with
-    the speeds of the line before it and of the line after it."""
+    """Time at the beginning of `dt` for which the lines were lost, s. The odometry fills this time
+    with the speeds of the line before it and of the line after it."""
     asked_ns: int | None = None
     """Monotonic time at which the daemon wrote the command that this line answers, ns. None if
     unknown."""

@@ -150,7 +150,7 @@ class FreeRunningTimes:
         self._lag = self._batch = self._gain = self._share = 0.0
         """`_lag` is the usual lateness x of a read, and `_batch` the usual time between two reads,
         both in slots. `_gain` is the gain g. `_share` is the share of the reads in the last window
-        before which lines were missing."""
+        that follow missing lines."""
         self._batched: bool = False
         self._alone: bool = False
         self._least: float
@@ -483,8 +483,8 @@ class PromptedTimes:
         """Time at which the last answered command was written, ns. If the board replied to that
         command later or sooner than usual, the time is shifted by the difference."""
         self._passed = self._line = 0
-        """`_line` is the time, ns, at which the last answered line was written. `_passed` is that
-        time for the last line that was answered or given up."""
+        """`_line` is the time at which the last answered line was written, ns. `_passed` is the
+        same for the last line that was answered or given up, whichever is newer."""
         self._lost = False
         """Whether the last read with a single reply showed that an earlier reply was lost."""
         self._given: list[int] = []

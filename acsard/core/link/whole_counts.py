@@ -38,7 +38,7 @@ ROUNDING = 0.0052
 
 MOST_TRIES = 16
 """Largest number of different values of n, the counts of the fastest wheel, that are tried for a
-line. It bounds the time of a control step."""
+line. This limit bounds the time of a control step."""
 
 BY_CHANCE = 0.05
 """Largest accepted probability that random speeds look like whole counts. The probability grows

@@ -206,8 +206,8 @@ CMD_VEL_IN = Channel(f"cmd_vel_in/{SOURCE}", f"cmd/{SOURCE}", TWIST_STAMPED, Twi
 time at which the command arrived."""
 
 BY_KEY: dict[str, Channel] = {**_published(), STATE.native: STATE}
-"""Maps a native Zenoh key to its channel. It contains the keys of all messages that `Report`
-(`messages/report.py`) builds."""
+"""Maps each native Zenoh key to its channel, for all messages that `Report` (`messages/report.py`)
+builds."""
 
 CHANNELS: tuple[Channel, ...] = (*BY_KEY.values(), CMD_VEL_IN, LOG)
 
