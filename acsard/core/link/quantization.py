@@ -128,8 +128,8 @@ class CountRecovery:
         """
         self._configured, self._whole = counts, WholeCounts(counts)
         self.coarse_lines = 0
-        """Number of lines whose speeds jump as with coarse encoders. Such lines are counted only if
-        the counts per turn are not configured."""
+        """Number of lines for which `Coarseness` found the examined encoder coarse. Such lines are
+        counted only if the counts per turn are not configured."""
         self.forget()
 
     def forget(self) -> None:
