@@ -1,1 +1,4 @@
-"""The serial protocol of the board: lines, checksums, sample times and link state. Does no I/O."""
+"""The serial protocol of the board: lines, checksums, sample times and link state.
+
+This package does no I/O itself.
+"""

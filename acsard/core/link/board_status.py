@@ -1,5 +1,7 @@
 """Decodes the board's status line: emergency stop, bumpers, motor driver, battery, temperature.
 
+An example of a status line is:
+
     !status estop=ok bumpers=..X. driver=ok volts=24.31 amps=-1.20 charge=87% temp=41.5*HHHH
 
 Every field is optional. The fields may come in any order, and each at most once. The board sends
@@ -7,8 +9,8 @@ the line in addition to its replies, never instead of one. The line contains no 
 does not count as a reply. One invalid field makes the whole line invalid. The format of the values
 makes damage detectable:
 
-- The two words of an input, such as `pressed` and `ok`, differ in many bits, so a few flipped bits
-  cannot turn one word into the other.
+- An input has two words, such as `pressed` and `ok`. They differ in many bits, so a few flipped
+  bits cannot turn one word into the other.
 - Each number has a fixed number of decimals or ends with `%`, so a truncated number is refused.
 
 After `*` comes the CRC-16/XMODEM of everything before it. It may be omitted, except on a checked
@@ -27,7 +29,7 @@ from msgspec.structs import astuple
 from acsard.core.link.codec import FrameError
 
 STATUS = b"!status"
-"""First bytes of every status line. No other line begins with them: a reply begins with a letter,
+"""First bytes of every status line. No other line begins like this: a reply begins with a letter,
 and the line in which a board identifies itself begins with `!acsard-mcu`."""
 
 _LINE = re.compile(STATUS + rb"((?: [a-z]+=[^ *]+)+)(?:\*([0-9A-F]{4}))?")
@@ -49,7 +51,7 @@ class BoardStatus(Struct, frozen=True):
     estop: bool | None = None
     """Whether the emergency stop is pressed."""
     bumpers: tuple[bool, ...] | None = None
-    """Whether each bumper is pressed, in the order of the board, 1 to 4 values."""
+    """For each bumper whether it is pressed, 1 to 4 values in the order of the board."""
     driver_fault: bool | None = None
     volts: float | None = None
     """Battery voltage, V."""
@@ -68,7 +70,10 @@ def merged(status: BoardStatus, newer: BoardStatus) -> BoardStatus:
 
 
 def shown(status: BoardStatus) -> dict[str, str]:
-    """Return the fields of `status` as text, by name, except those that are None."""
+    """Return a map of the names that users see to the values of `status` as text.
+
+    Fields of `status` that are None are left out.
+    """
     bumpers = status.bumpers
     values = {
         "emergency_stop": _word(status.estop, "pressed", "released"),
@@ -87,8 +92,8 @@ def shown(status: BoardStatus) -> dict[str, str]:
 def decode_status(line: bytes, check: bool) -> BoardStatus:
     """Return the fields of a status line. Raises `FrameError` if the line is not valid.
 
-    `line` begins with `STATUS` and has no line end. With `check`, a line without a checksum is
-    refused. A wrong checksum is always refused.
+    `line` begins with `STATUS` and has no line end. If `check` is true, a line without a checksum
+    is not valid. A line with a wrong checksum is never valid.
     """
     match = _LINE.fullmatch(line)
     if match is None:

@@ -26,16 +26,16 @@ ASK_SAMPLE = b"S"
 """The request letter that asks for the sample fields."""
 
 ASK_NOTHING = b"H"
-"""A request letter that the board ignores. It only marks the line: replies contain no request
-letters, so a received line with this letter is an echo of the daemon's own line."""
+"""A request letter that the board ignores. It only marks the daemon's lines: replies contain no
+request letters, so a received line with this letter is an echo of a line of the daemon."""
 
-# The pattern also restricts the characters of the plain part, because zero bytes in front of a line
-# do not change an XMODEM CRC.
+# The pattern also restricts the characters of the plain part, because the CRC does not detect zero
+# bytes in front of a line.
 _REPLY = re.compile(rb"([a-dnp0-9., ]*)#([0-9A-F]{2})(?:@([0-9A-F]{20}))?\*([0-9A-F]{4})")
 
 
 class Reading(Struct, frozen=True):
-    """The sample fields of a reply, with the values at the time when the board read its encoders.
+    """The sample fields of a reply. The board took all five numbers when it read its encoders.
 
     `mcu_ms` is the board's clock in ms. `counts` are the encoder counts of the motors a to d. A
     count rises when its motor turns in the `p` direction. All five numbers are modulo 65536.
@@ -46,7 +46,10 @@ class Reading(Struct, frozen=True):
 
 
 class Checked(Struct, frozen=True):
-    """A reply with a correct CRC. `sequence` is the number of the command that it answers."""
+    """A reply with a correct CRC. `sequence` is the number of the command that was answered.
+
+    `plain` is the part before `#`. `reading` is None if the reply has no sample fields.
+    """
 
     plain: bytes
     sequence: int
@@ -54,13 +57,19 @@ class Checked(Struct, frozen=True):
 
 
 def seal(line: bytes, sequence: int, letters: bytes = b"") -> bytes:
-    """Return a plain command in its checked form, with CR LF. `sequence` is 0 to 255."""
+    """Return the plain command `line` in its checked form, with CR LF at its end.
+
+    `sequence` is 0 to 255. `letters` are the request letters, b"" for none.
+    """
     body = b"%b#%02X%b" % (line.removesuffix(b"\r\n"), sequence, letters)
     return b"%b*%04X\r\n" % (body, binascii.crc_hqx(body, 0))
 
 
 def unseal(line: bytes) -> Checked:
-    """Return the parts of a checked reply without its line end, or raise `FrameError`."""
+    """Return the parts of the checked reply `line`, which has no line end.
+
+    Raises `FrameError` if the line is not a valid checked reply.
+    """
     match = _REPLY.fullmatch(line)
     if match is None:
         has_suffix = b"#" in line or b"*" in line

@@ -23,7 +23,7 @@ LETTERS = "abcd"
 Motors = tuple[float, float, float, float]
 
 MAX_SPEED = 99.99
-"""Largest speed in a line, rad/s. A speed is written with two integer digits and two decimals."""
+"""Largest speed that a line can contain, rad/s: it has two integer digits and two decimals."""
 
 Reason = Literal[
     "malformed", "duplicate_wheel", "over_range", "without_crc", "crc_error", "stale_sequence",
@@ -37,7 +37,7 @@ _LINE = re.compile(TOKENS + rb"(?:, *)?")
 
 
 class FrameError(AcsardError):
-    """The error for an invalid line. `reason` is the name of the counter that counts the line."""
+    """The error for an invalid line. `reason` is the name of the counter of such lines."""
 
     def __init__(self, reason: Reason, line: bytes) -> None:
         super().__init__(reason, line)
@@ -86,7 +86,7 @@ class Codec:
         return ",".join(tokens).encode() + self._end
 
     def wheels(self, motors: Motors) -> Motors:
-        """Convert values of the motors a to d to `WHEELS` order. There, positive means forward."""
+        """Return values of the motors a to d in the order `WHEELS`, positive for forward motion."""
         wheel = [0.0] * 4
         for motor, (_, index, sign) in zip(motors, self._wiring, strict=True):
             wheel[index] = motor * sign
@@ -94,7 +94,10 @@ class Codec:
         return front_right, front_left, rear_left, rear_right
 
     def decode(self, line: bytes) -> WheelSpeeds:
-        """Return the wheel speeds in a line without its line end, or raise `FrameError`."""
+        """Return the wheel speeds in `line`, which has no line end.
+
+        Raises `FrameError` if the line is not valid.
+        """
         words = _words(line)
         if words is None:
             raise FrameError("malformed", line)
@@ -123,8 +126,8 @@ def _words(line: bytes) -> tuple[tuple[bytes, float], ...] | None:
 
 
 def _token(letter: str, speed: float) -> str:
-    # Round in whole hundredths first: 9.999 must become 10.00 and never 010.00, and a speed that
-    # rounds to zero becomes p00.00 and never n00.00.
+    # Round to whole hundredths before formatting: 9.999 must become 10.00 and not 010.00, and a
+    # negative speed that rounds to zero must become p00.00 and not n00.00.
     if not math.isfinite(speed):
         raise ValueError(f"wheel speed {speed} is not finite")
     hundredths = int(min(abs(speed), MAX_SPEED) * 100 + 0.5)

@@ -1,6 +1,8 @@
-"""Detects echoes of plain lines: the daemon's own lines come back from the serial port.
+"""Detects echoes: lines that the daemon wrote to the serial port and then receives from it.
 
-TX and RX are connected, or the far end echoes, alone or beside the replies of a board.
+Lines come back if TX and RX are connected to each other, or if a device at the far end sends all
+bytes back. Such a device may be the only one, or there may be a board behind it that also answers.
+This module detects the echo of plain lines, and of checked lines that ask for no sample.
 """
 
 from __future__ import annotations
@@ -16,19 +18,20 @@ REPORTS = 20
 100 Hz."""
 
 OTHERS = 2
-"""Largest number of other reports between two echoes in a run. They are the replies of a board
-behind an adapter that echoes. A board that reports by its own clock may send two in a row."""
+"""Largest number of other reports between two successive echoes. These reports are the replies of a
+board behind an adapter that echoes. A board that reports by its own clock may send two in a row."""
 
 CHANGE = 2.0
-"""A run counts as an echo only if its speed changes add up to at least this, rad/s. The change from
-one line to the next is that of the wheel with the largest change. With coarse encoders, a smaller
-sum may be a coincidence."""
+"""A run is a series of successive sent lines that came back. It counts as an echo only if its speed
+changes from line to line add up to at least this sum, rad/s. For each line, only the change of the
+wheel that changes most is added. With coarse encoders, a smaller sum may be a coincidence."""
 
 CORNER = 0.025
-"""A run counts as an echo only if a speed change in it differs by more than this from the change
-before it, rad/s. Speeds in lines are rounded to 0.01 rad/s, so on a straight ramp two changes
-differ by up to 0.02 rad/s. Therefore an echo may stay undetected while all ramps are gentler than
-0.025 rad/s per line, which is 0.125 m/s2 with wheels of 0.05 m at 100 Hz."""
+"""A run is a series of successive sent lines that came back. It counts as an echo only if a speed
+change from one line to the next differs by more than this, rad/s, from the speed change before it.
+Speeds in lines are rounded to 0.01 rad/s, so on a straight ramp two speed changes differ by up to
+0.02 rad/s. Therefore an echo may stay undetected while all ramps are gentler than 0.025 rad/s per
+line, which is 0.125 m/s2 for a wheel radius of 0.05 m at 100 Hz."""
 
 LINES = 8
 """Number of the newest sent lines with which `EchoDetector` compares a report. At 100 Hz, this
@@ -40,20 +43,21 @@ STEADY: _Wheels = (0.0, 0.0, 0.0, 0.0)
 
 
 class _Run(Struct, gc=False):
-    """A run of successive sent lines that came back, up to one line."""
+    """A series of successive sent lines that came back."""
 
     report: int
-    """Number of the last report that equalled the line."""
+    """Number of the last report that equaled the last line of the run."""
     wheels: _Wheels
-    """Speeds in the line, rad/s."""
+    """Speeds in the last line, rad/s."""
     slope: _Wheels | None = None
-    """Difference between these speeds and those in the line before, rad/s. None in the first
-    line."""
+    """Speed changes from the last line but one to the last line, rad/s. None if the run has only
+    one line."""
     lines: int = 1
+    """Number of lines in the run."""
     change: float = 0.0
-    """Sum of the speed changes, rad/s."""
+    """Sum of the speed changes from line to line, rad/s. See `CHANGE`."""
     corner: float = 0.0
-    """Largest difference between two successive speed changes, rad/s."""
+    """Largest difference between two successive speed changes, rad/s. See `CORNER`."""
 
 
 class EchoDetector:
@@ -63,15 +67,17 @@ class EchoDetector:
     board that reports exactly the commanded speeds. The rule is:
 
     - At least `REPORTS` successive sent lines came back in order, byte for byte.
-    - At most `OTHERS` other reports came between two of them, and none of these lies between the
-      speeds of the two lines, as a report of a motor on its way from one to the other does.
-    - The speed changes in these lines add up to at least `CHANGE`, and at a corner of more than
-      `CORNER` the change itself changed. A motor that lags by a whole number of lines repeats a
-      steady ramp exactly, but it rounds off the start and the end of the ramp.
+    - Between two successive lines that came back, at most `OTHERS` other reports came. The speeds
+      of these reports do not lie between the speeds of the two lines. A motor on its way from one
+      speed to the other would report speeds between them.
+    - The speed changes from line to line add up to at least `CHANGE`, and one of them differs by
+      more than `CORNER` from the speed change before it. A motor that lags by a whole number of
+      lines repeats a steady ramp exactly, but it rounds off the start and the end of the ramp.
 
-    At rest every board looks like an echo, so a run without changes proves nothing. A far end that
-    echoes and also answers is detected as soon as one that only echoes, unless all ramps are gentle
-    (see `CORNER`). An example is an adapter for RS-485 with a board behind it.
+    At rest every board looks like an echo, so lines without speed changes prove nothing. A device
+    that echoes and also passes on replies, such as an RS-485 adapter with a board behind it, is
+    detected as soon as a device that only echoes. While all ramps are gentle (see `CORNER`), no
+    echo is detected.
 
     A board that reports its set points looks exactly like an echo, and so may a simulator whose
     wheels have no lag. The daemon then does not drive until the port is opened again, and reports
@@ -84,12 +90,14 @@ class EchoDetector:
     def forget(self) -> None:
         """Forget all lines and reports, because the port has been opened."""
         self._sent: deque[bytes] = deque(maxlen=LINES + 1)
-        """The last sent lines, and the one before them, whose run the oldest of them continues."""
+        """The last `LINES` sent lines, and one older line, so that a run that ends with the older
+        line can continue."""
         self._runs: deque[_Run | None] = deque(maxlen=LINES + 1)
-        """For each line in `_sent` the run up to it. None if the line did not come back."""
+        """For each line in `_sent`, the run of lines that came back and that ends with this line.
+        None if this line did not come back."""
         self._reports = 0
         self._last: deque[_Wheels] = deque(maxlen=OTHERS + 1)
-        """Speeds in the last reports."""
+        """Wheel speeds in the last reports, rad/s."""
 
     def left(self, line: bytes) -> None:
         """Record that `line`, with its line end, was written to the port."""
@@ -97,14 +105,17 @@ class EchoDetector:
         self._runs.append(None)
 
     def report(self, line: bytes, speeds: WheelSpeeds) -> bool:
-        """Process a report without its line end. Return whether the last reports are an echo."""
+        """Process a report, and return whether the last reports are an echo.
+
+        `line` is the report without its line end, and `speeds` are the speeds in it.
+        """
         self._reports += 1
         wheels = speeds.as_tuple()
         self._last.append(wheels)
         if line not in self._sent:
             return False
         found, sent, runs = False, self._sent, self._runs
-        # The newest line is first, so that one report continues each run by one line only.
+        # The newest line is first, so that a report makes each run longer by at most one line.
         for place in range(len(sent) - 1, max(0, len(sent) - LINES) - 1, -1):
             if sent[place] != line:
                 continue
@@ -112,14 +123,19 @@ class EchoDetector:
             if known is None or known.lines < run.lines:
                 runs[place] = known = run
             elif known.slope == STEADY:
-                # Reports repeat a steady speed. A line on a ramp comes back once.
+                # At a steady speed all lines are equal, so several reports equal the same line.
+                # On a ramp only one report equals it.
                 known.report = self._reports
             enough = known.lines >= REPORTS and known.change >= CHANGE
             found = found or (enough and known.corner > CORNER)
         return found
 
     def _continued(self, run: _Run | None, wheels: _Wheels) -> _Run:
-        """Return the run that has the line with these speeds behind the lines of `run`."""
+        """Return `run` with one more line, which has the speeds `wheels`.
+
+        Return a new run with only this line if `run` is None, or if the reports since the last line
+        of `run` show that this line is not an echo.
+        """
         others = OTHERS + 1 if run is None else self._reports - run.report - 1
         if run is None or others > OTHERS:
             return _Run(self._reports, wheels)
@@ -137,7 +153,10 @@ class EchoDetector:
 
 
 def _between(wheels: _Wheels, one: _Wheels, other: _Wheels) -> bool:
-    """Return whether these speeds of all wheels lie between two other speeds or equal one."""
+    """Return whether each wheel's speed in `wheels` lies between its speeds in `one` and `other`.
+
+    A speed that equals one of these two speeds counts as between them.
+    """
     rows = zip(wheels, one, other, strict=True)
     return all(min(a, b) <= speed <= max(a, b) for speed, a, b in rows)
 

@@ -1,10 +1,10 @@
 """Converts encoder counts into the angle that each motor turned since the previous reading.
 
-The counts are cumulative, so a lost line loses no distance. The board sends the time of its own
-clock with the counts, so the time between two readings does not depend on when the host read the
-lines. Counts and milliseconds are modulo 65536. A difference of counts is used only if the count
-cannot have wrapped, and if the motors can have turned that far. Otherwise the caller computes the
-angle as speed times time. The module also detects a probable restart of the board.
+The counts are cumulative, so no distance is missing after a lost line. The board sends the time of
+its own clock with the counts, so the time between two readings does not depend on when the host
+read the lines. Counts and milliseconds are modulo 65536. A difference of counts is used only if the
+count cannot have wrapped, and if the motors can have turned that far. Otherwise the caller computes
+the angle as speed times time. The module also detects a probable restart of the board.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ from acsard.core.link.minimum_delay import MinimumDelay
 from acsard.core.values import NS_PER_S
 
 SLACK_COUNTS = 4
-"""Number of counts by which a wheel may exceed the counts of its highest speed between two
-readings. It covers one count at each end of the interval, and play in the gears."""
+"""Number of counts that a wheel may make between two readings in addition to the counts that its
+highest speed allows. This margin covers one count at each end of the interval, and play in the
+gears."""
 
 ROUNDING_MS = 2
 """Largest error of the time between two readings, ms. Each reading has an error of up to 1 ms."""
@@ -51,12 +52,12 @@ class Encoders:
     """Converts each reading of the encoders to the angles turned since the previous reading."""
 
     def __init__(self, counts: int, wheel_speed: float, quiet_ns: int) -> None:
-        """Start.
+        """Start before the first reading of the encoders.
 
-        A restart sets the board's clock, which counts modulo 65536 ms, to 0. It then seems to have
-        jumped ahead, so the delay of the next reading (arrival minus board time) seems too small.
-        The board is taken to have restarted if a delay is below the least delay so far by more than
-        `quiet_ns`.
+        The delay of a reading is its arrival time minus the time of the board's clock. A restart
+        sets this clock to 0. The clock counts modulo 65536 ms, so it then seems to have jumped
+        ahead, and the delay of the next reading seems too small. If a delay is below the least
+        delay so far by more than `quiet_ns`, the board has probably restarted.
 
         Args:
             counts: Encoder counts per turn, 0 if unknown.
@@ -71,13 +72,14 @@ class Encoders:
         """Measures by how much the delay of a reading exceeds the least delay so far, ms."""
 
     def forget(self) -> None:
-        """Forget the last reading, in a new session or after a line without a reading."""
+        """Forget the last reading, because a new session begins or a line has no reading."""
         self._last = None
 
     def turned(self, reading: Reading, at_ns: int) -> Turned | Unknown:
         """Return how far the motors turned since the last reading, or why that is unknown.
 
-        `at_ns`, the monotonic time of arrival, serves only to detect a restart or a wrap.
+        `at_ns` is the monotonic time at which the reading arrived, ns. It serves only to detect
+        that the board has restarted, or that a count may have wrapped.
         """
         last, self._last = self._last, (reading, at_ns)
         if last is None:

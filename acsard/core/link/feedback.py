@@ -1,7 +1,7 @@
-"""Turns a good line into feedback: its sample time and the motion since the last line.
+"""Adds to each good line its sample time and the motion since the last line.
 
 The sample time is the time at which the board read its encoders. The time between two samples comes
-from the best clock that is available:
+from the best of these clocks that is available:
 
 - the board's own clock, if the board sends it with its counts;
 - the times at which the commands were written, if the board answers each line (`PromptedTimes`);
@@ -26,17 +26,19 @@ from acsard.core.link.sample_time import BRIDGED_S, FreeRunningTimes, Placed, Pr
 from acsard.core.values import NS_PER_S, Instant, WheelSpeeds
 
 APART_NS = 1000
-"""Least time between the stamps of two lines, ns, because equal stamps would look like one line."""
+"""Least time between the stamps of two lines, ns. Equal stamps would look like a single line."""
 
 LATER = 0.05
-"""Gain of the filter for the mean offset between `PromptedTimes` and `FreeRunningTimes`."""
+"""Gain of the filter for the mean difference between the times that `PromptedTimes` and
+`FreeRunningTimes` give to a line."""
 
 FULL_READ = 1024
 """Number of bytes in a full read of the port, after which the kernel may still hold more data."""
 
 DIFFERS = 1.5
-"""`ReplyStyle` evaluates a read of the port if the number of reply periods since the last read
-differs by at least this from the number of commands. Scheduling alone causes less."""
+"""`ReplyStyle` evaluates a read of the port if two numbers differ by at least this: the number of
+reply periods since the last read, and the number of commands written since the last read.
+Scheduling alone causes a smaller difference."""
 
 TELLING = 2.5
 """`ReplyStyle` decides only if its two sums (of reply periods and of commands) differ by at least
@@ -46,12 +48,13 @@ LATEST = 100.0
 """Longest time between two reads of the port that `ReplyStyle` evaluates, in reply periods."""
 
 CLEAR = 0.5
-"""`ReplyStyle` has two sums (of reply periods and of commands), and compares each with the number
-of received lines. It decides only if one sum is clearly nearer to that number: the two distances
-must differ by at least this share of the difference between the sums."""
+"""`ReplyStyle` compares two sums (of reply periods and of commands) with the number of received
+lines. It decides only if one sum is clearly nearer to this number than the other sum. The distances
+of the two sums from the number must differ by at least this share of the difference between the
+sums."""
 
 AFTER = 3
-"""Number of further reads of the port that `ReplyStyle` evaluates after one that reaches
+"""Number of further reads of the port that `ReplyStyle` evaluates after a read that reaches
 `DIFFERS`."""
 
 NEAR = 0.35
@@ -63,8 +66,9 @@ lines, or 1.5 lines if that is more. The share is not 0, because some lines get 
 class Feedback(Struct, frozen=True, gc=False):
     """A good line. The board read its encoders at `at`, `dt` s after the previous sample.
 
-    After a gap of `gap` s, `dt` is 0, because the motion during the gap is unknown. `turned` is the
-    angle of each wheel since the previous line, rad, in `WHEELS` order. It comes from the encoder
+    If the motion since the previous sample is unknown, `dt` is 0, and `gap` is the time since the
+    previous line, s. Otherwise, and in the first line, `gap` is 0. `turned` is the angle by which
+    each wheel turned since the previous line, rad, in `WHEELS` order. It comes from the encoder
     counts in the lines, is valid even after a gap, and is None if unknown.
     """
 
@@ -74,8 +78,8 @@ class Feedback(Struct, frozen=True, gc=False):
     gap: float = 0.0
     turned: Motors | None = None
     bridged: float = 0.0
-    """First part of `dt`, in which lines were lost, s. The odometry fills this part with the speeds
-    of the line before it and of the line after it."""
+    """Time at the beginning of `dt` for which the lines were lost, s. The odometry fills this time
+    with the speeds of the line before it and of the line after it."""
     asked_ns: int | None = None
     """Monotonic time at which the daemon wrote the command that this line answers, ns. None if
     unknown."""
@@ -96,18 +100,23 @@ class Feedback(Struct, frozen=True, gc=False):
 
 
 class ReplyStyle:
-    """Detector of the kind of board: it reports by its own clock, or it answers the daemon's lines.
+    """Detector of whether the board reports by its own clock or answers the daemon's lines.
 
     While the daemon sends one line per period, both kinds of boards look alike. Sometimes the
-    daemon sends more or fewer lines, because the host did not run or because a new command was sent
-    at once. Then the number of received lines equals either the number of periods or the number of
-    commands. The class adds up both numbers over the reads in which they differ and over the next
+    daemon sends more or fewer lines, because the host did not run or because a new command did not
+    wait for the next period. Then a board that reports by its own clock sends as many lines as
+    periods have passed, and a board that answers sends as many lines as it received commands. The
+    class adds up both numbers over the reads of the port in which they differ, and over the next
     few reads, which deliver the lines that a USB adapter still held. The sum that is nearer to the
     number of received lines shows the kind of the board.
     """
 
     def __init__(self, speaks: bool) -> None:
-        """Start. `speaks`: `mcu.reply_period` is set, so the board reports by its own clock."""
+        """Start before the first read of the port.
+
+        `speaks` is true if `mcu.reply_period` is set, so that the board is known to report by its
+        own clock.
+        """
         self.speaks: bool | None = speaks or None
         """True if the board reports by its own clock, False if it answers each command, None while
         unknown."""
@@ -120,7 +129,10 @@ class ReplyStyle:
         self._left += 1
 
     def read(self, lines: int, periods: float) -> None:
-        """Process a read of `lines` lines, `periods` reply periods after the last read."""
+        """Process a read of the port that completed `lines` lines.
+
+        `periods` is the time since the last such read, in reply periods of the board.
+        """
         left, self._left = self._left, 0
         if self._known or periods > LATEST:
             return
@@ -150,17 +162,17 @@ class ReplyStyle:
 class Timeline:
     """Assigns a sample time to each good line, in order.
 
-    For each read of the port, call `read`. Then, for each of its lines in order, call `place` if
-    the line is good and `spoilt` if it is bad.
+    For each read of the port, call `read`. Then, for each line of the read in order, call `place`
+    if the line is good and `spoilt` if it is bad.
     """
 
     def __init__(
         self, mcu: McuConfig, codec: Codec, wheel_speed: float, quiet_ns: int, rate_hz: float
     ) -> None:
-        """Start.
+        """Start before the first line.
 
-        `wheel_speed` is the highest speed that a wheel can have, rad/s. After a silence of
-        `quiet_ns`, the link is stale.
+        `wheel_speed` is the highest speed that a wheel can have, rad/s. `quiet_ns` is the duration
+        of silence after which the link is stale, ns. `rate_hz` is the daemon's control rate.
         """
         self._codec, self._baud_rate, self._quiet_ns = codec, mcu.baud_rate, quiet_ns
         self._encoders = Encoders(mcu.encoder_counts, wheel_speed, quiet_ns)
@@ -178,15 +190,16 @@ class Timeline:
         self._spoilt = False
         """Whether a bad or ignored line came since the last good line."""
         self._later = 0.0
-        """Mean time by which `PromptedTimes` places a line later than `FreeRunningTimes`, ns."""
+        """Mean time by which a line is later according to `PromptedTimes` than according to
+        `FreeRunningTimes`, ns."""
         self.leaps = 0
-        """Number of lines with impossible encoder counts. The motion of such a line is computed as
-        speed times time."""
+        """Number of lines with impossible encoder counts. For such a line, the angle that a wheel
+        turned is computed as speed times time."""
         self.restarted = False
         """Whether the board's clock in the last line shows that the board has restarted."""
 
     def forget(self) -> None:
-        """Start a new session: the motion between the last line and the next one is unknown."""
+        """Start a new session, so the motion between the last line and the next one is unknown."""
         self._encoders.forget()
         self._slots.forget()
         self._prompts.forget()
@@ -198,9 +211,10 @@ class Timeline:
         self._style.left()
 
     def read(self, at: Instant, size: int, lines: int, following: int) -> None:
-        """Process a read of the port that completes at least one line.
+        """Process a read of the port at the time `at` that completes `lines` lines, at least one.
 
-        The read contains `size` bytes, and `following` of them come after the end of its last line.
+        The read contains `size` bytes. `following` is how many of them come after the end of the
+        last of these lines.
         """
         before, end_ns = self._end_ns, at.mono_ns
         if following:
@@ -216,7 +230,7 @@ class Timeline:
         if style.speaks is False:
             slots.forget()
             if spoke and self._last_placed.clock != "prompts":
-                # No reply was assigned to a line while the board seemed to report by itself.
+                # While the board seemed to report by itself, no reply was assigned to a command.
                 self._prompts.restart()
         self._prompts.read(end_ns, lines, following > 0)
 
@@ -246,7 +260,7 @@ class Timeline:
             reading: The sample fields of a checked reply, None if it has none.
             following: The number of bytes in the read after the end of the line.
             length: The number of bytes of the line with its line end.
-            silent: Whether a silence made the link stale, or a session begins with the line.
+            silent: Whether the line ends a silence that made the link stale, or begins a session.
             asked_ns: Monotonic time at which the answered command was written, ns, or None.
         """
         self._rest -= 1
@@ -261,8 +275,8 @@ class Timeline:
         self._spoilt = False
         first = self._last is None
         turned, wheels = self._turned(reading, came_ns), None
-        # A board that answers lines sends nothing by itself, so no line is missing after a silence
-        # of the host.
+        # A board that answers lines sends nothing by itself, so no line is missing after a time in
+        # which the host sent nothing.
         clocked = placed.clock != "reads" or self._prompts.lossy
         known = clocked or not silent or dt * NS_PER_S <= self._quiet_ns
         if turned is not None:
@@ -306,7 +320,9 @@ class Timeline:
         return Placed("reads", int(self._end_ns - self._share_ns * self._rest))
 
     def _since_last(self, placed: Placed) -> tuple[float, float]:
-        """Return the time since the last good line, and the part of it whose lines were lost, s.
+        """Return a pair: the time since the last good line, s, and the part of it to fill, s.
+
+        Lines were lost in the part to fill. It is 0 if no line was lost.
 
         If the times of this line and of the last good line come from different clocks, the time is
         the difference of their `due_ns`, corrected by the mean offset between the clocks. Without
@@ -324,7 +340,8 @@ class Timeline:
             return dt, placed.bridged
         period = self._usual_ns / NS_PER_S
         # A prompted board only answers commands, so a long time alone does not show that lines
-        # are missing. But a bad or ignored reply has covered a part of this time.
+        # are missing. But if a reply was bad or ignored, the speeds for a part of this time are
+        # missing.
         missing = dt > 1.5 * period and (self._style.speaks is not False or self._spoilt)
         return dt, dt - period if missing else 0.0
 
@@ -335,7 +352,10 @@ class Timeline:
         self._later += LATER * (later_ns - self._later)
 
     def _late_ns(self, clock: str) -> float:
-        """Return by how much `clock` gives later times than `FreeRunningTimes` on average, ns."""
+        """Return how much later the times of `clock` are than those of `FreeRunningTimes`, ns.
+
+        The result is a mean over many lines.
+        """
         if clock == "reads":
             return self._slots.late_ns
         return self._later if clock == "prompts" else 0.0
@@ -345,7 +365,11 @@ class Timeline:
         return self._slots.usual or self._period_ns
 
     def _sampled(self, came_ns: int, placed: Placed, length: int) -> Instant:
-        """Return the sample time of a line of `length` bytes: when the board began to send it."""
+        """Return the time at which the board began to send a line, which is its sample time.
+
+        `length` is the number of bytes of the line with its line end. `came_ns` is the monotonic
+        time at which the whole line had arrived, ns.
+        """
         mono_ns = min(came_ns, placed.due_ns) - wire_ns(length, self._baud_rate)
         last, read = self._last, self._at
         wall_ns = read.wall_ns - read.mono_ns + mono_ns

@@ -1,15 +1,15 @@
 """Splits the bytes from the serial port into lines, with bounded memory.
 
-Lines end with LF or CR LF, and the module does not interpret them. After noise, a new line begins
-after the next LF. Empty lines are dropped silently: the daemon starts every session with a bare
-line end, and a board that echoes may send it back.
+Lines end with LF or CR LF. This module does not interpret their content. After noise, the next LF
+ends the damaged line, and a new line begins. Empty lines are dropped silently: the daemon starts
+every session with a bare line end, and a board that echoes may send it back.
 """
 
 from __future__ import annotations
 
 MAX_LINE = 128
-"""Largest number of bytes in a line with its line end. A reply has about 62 bytes, and a status
-line with all fields about 100."""
+"""Largest number of bytes in a line, including its line end. A reply has about 62 bytes, and a
+status line with all fields about 100."""
 
 
 class LineReader:
@@ -26,10 +26,10 @@ class LineReader:
         self._discarding = False
 
     def feed(self, data: bytes) -> list[tuple[bytes, int]]:
-        """Return the lines that `data` completes, in order and without their line ends.
+        """Return the lines that `data` completes, in order, as pairs.
 
-        Each line is paired with the number of bytes of `data` after it. This number shows how long
-        before the read the line was complete.
+        A pair is a line without its line end, and the number of bytes that follow it in `data`.
+        From this number, the caller computes how long before the read the line was complete.
         """
         lines = []
         ends = data.split(b"\n")

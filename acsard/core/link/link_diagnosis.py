@@ -1,4 +1,4 @@
-"""Explains to the operator why the link is not up or loses lines, and what to do.
+"""Explains to the operator why the link is not up or why lines are lost, and what to do.
 
 The sentences appear in `state.reason`, in the log and on the web page. `acsard mcu check` uses the
 same diagnosis. The diagnosis does not change the state of the link, which `link_state.py` decides.
@@ -19,8 +19,8 @@ from acsard.core.link.negotiation import MENDS, Negotiation
 from acsard.core.values import NS_PER_S, Event
 
 SHARE = 0.5
-"""A link is stale after a silence of `Link.quiet_ns`. If the time between two control steps reaches
-this share of `Link.quiet_ns`, this computer caused the silence and not the board."""
+"""The link is stale after a silence of `Link.quiet_ns`. If the time between two control steps
+reaches this share of `Link.quiet_ns`, the cause of the silence is this computer, not the board."""
 
 BUSY = (
     "the Linux command `top` shows which other program uses the processor; acsard has priority if "
@@ -31,8 +31,8 @@ HOST = "this computer did not run for"
 SIMULATOR = "the built-in simulator, which is a part of this program, is late"
 
 PATIENCE_NS = 3 * NS_PER_S
-"""Time without a link before the first diagnosis, ns. A board that was booting has answered by
-then."""
+"""Time without a link until the first diagnosis, ns. A board that is only booting answers within
+this time."""
 
 SHOWN = 64
 """Largest number of bytes that a diagnosis shows: a whole line and some noise."""
@@ -73,31 +73,41 @@ WINDOW = 1000
 """Number of sent lines after which `UnansweredLines` counts the answers: 10 s at 100 Hz."""
 
 LOST = 0.02
-"""Share of unanswered lines above which `UnansweredLines` warns. A sound link loses no answer."""
+"""Share of unanswered lines above which `UnansweredLines` warns. A good link loses no answer."""
 
 
 def is_ours(words: str) -> bool:
-    """Return whether `words`, a result of `Lateness.words`, blames this computer."""
+    """Return whether `words` names this computer as the cause of a silence.
+
+    `words` is a result of `Lateness.words`.
+    """
     return HOST in words or SIMULATOR in words
 
 
 class Lateness:
-    """Detector of late control steps, in which this computer and not the board causes a silence."""
+    """Detector of late control steps.
+
+    If a step is late, the cause of the silence before it is this computer, not the board.
+    """
 
     def __init__(self, simulated: bool, quiet_ns: int) -> None:
-        """Start. `quiet_ns` is the duration of silence after which the link is stale, ns."""
+        """Start before the first step.
+
+        `simulated` is true if the built-in simulator takes the place of the board. `quiet_ns` is
+        the duration of silence after which the link is stale, ns.
+        """
         self._simulated, self._least_ns = simulated, SHARE * quiet_ns
         self._looked_ns: int | None = None
         self.late_s = 0.0
-        """Longest time between two steps since the last good line, s. 0 if no step was late."""
+        """Longest time between two steps since the last good line, s, or 0 if no step was late."""
         self.step_s = 0.0
-        """Time between the last two steps, s, if it was too long. Otherwise 0."""
+        """Time between the last two steps, s, if the last step was late. Otherwise 0."""
 
     def look(self, now_ns: int, good: bool) -> bool:
         """Record a step, and return whether a good line ends a silence that this computer caused.
 
-        `good` says whether the step received a good line. The simulator runs on this computer, so
-        with the simulator the result is True for every good line.
+        `good` says whether the step received a good line. The simulator runs on this computer. With
+        the simulator, the result is therefore True for every good line.
         """
         before_ns, self._looked_ns = self._looked_ns, now_ns
         passed_ns = 0 if before_ns is None else now_ns - before_ns
@@ -107,7 +117,10 @@ class Lateness:
         return good and (late_s > 0.0 or self._simulated)
 
     def words(self, link: LinkState) -> str:
-        """Return a sentence about the link, or about this computer if it caused the silence."""
+        """Return a sentence about the state of the link.
+
+        If this computer caused a silence, the sentence is about this computer instead.
+        """
         if link == "stale" and self.late_s:
             return (
                 f"{HOST} {self.late_s:.2f} s, so it received nothing from the microcontroller: "
@@ -119,22 +132,23 @@ class Lateness:
 
 
 class Heard(Struct):
-    """The bytes and lines received in an interval.
-
-    `last` is the last bad line, or the last bytes while no line has ended.
-    """
+    """A summary of the bytes and lines that were received in an interval without a link."""
 
     size: int = 0
+    """Number of received bytes, without the bytes of status lines."""
     lines: int = 0
+    """Number of received lines, good and bad, without the status lines."""
     good: int = 0
+    """Number of good lines."""
     statuses: int = 0
-    """Number of the board's status lines, which are not counted in `lines`."""
+    """Number of the board's status lines."""
     last: bytes = b""
+    """The last bad line, or the last received bytes if no line has ended yet."""
     late_s: float = 0.0
     """Longest time in the interval in which this computer did not run and received nothing, s."""
 
     def take(self, data: bytes) -> None:
-        """Add received bytes. Call this before `line` adds the lines in them."""
+        """Add received bytes. Call this method before `line` adds the lines in these bytes."""
         self.size += len(data)
         if not self.lines:
             self.last = (self.last + data)[-SHOWN:]
@@ -148,7 +162,7 @@ class Heard(Struct):
 
     @property
     def looks(self) -> Look:
-        """The class of the received bytes, as `Look` lists them."""
+        """The class of the received bytes. `Look` explains the classes."""
         if self.statuses and not self.lines:
             return "statuses"
         if not self.size:
@@ -182,7 +196,7 @@ class Heard(Struct):
 
     @property
     def words(self) -> str:
-        """The whole diagnosis as a sentence for `state`."""
+        """The whole diagnosis as a sentence for the message `state`."""
         if self.looks == "sparse" and self.late_s:
             return f"{HOST} {self.late_s:.2f} s, so it received too little for a link: {BUSY}"
         mend = f"{LOOK_MENDS[self.looks]} `acsard mcu check` finds out more"
@@ -190,22 +204,29 @@ class Heard(Struct):
 
 
 class SilenceDiagnosis:
-    """Diagnosis of why the link is not up, made anew every 3 s (`PATIENCE_NS`)."""
+    """The diagnosis of why the link is not up, renewed every 3 s (`PATIENCE_NS`)."""
 
     def __init__(self) -> None:
         self.heard: Heard | None = None
-        """The bytes and lines of the last complete interval, if any. None while the link is up."""
+        """The bytes and lines of the last complete interval. None while there is no diagnosis."""
         self.now = Heard()
-        """The bytes and lines of the present interval."""
+        """The bytes and lines received in the present interval so far."""
         self._since_ns: int | None = None
 
     def forget(self) -> None:
-        """Discard the diagnosis: the link is up, the output is blocked, or the port was opened."""
+        """Discard the diagnosis, and start with a new interval at the next call of `judge`.
+
+        The reason is that the link is up, the output is blocked, or the port was opened or closed.
+        """
         if self._since_ns is not None:
             self.heard, self.now, self._since_ns = None, Heard(), None
 
     def judge(self, now_ns: int) -> bool:
-        """Process a step without a link. Return True if an interval ends with a new diagnosis."""
+        """Process a step without a link.
+
+        Return True if this step ends the first interval, or an interval whose class of received
+        bytes (`Look`) differs from that of the interval before.
+        """
         if self._since_ns is None:
             self._since_ns = now_ns
         if now_ns - self._since_ns < PATIENCE_NS:
@@ -216,18 +237,19 @@ class SilenceDiagnosis:
 
 
 class UnansweredLines:
-    """Warning that the board does not answer all lines while the link is up.
+    """The warning that the board does not answer all lines while the link is up.
 
-    After every `WINDOW` sent lines, the number of sent lines is compared with that of good lines.
-    The warning is given once. It is given again only after a window without loss, or after the link
-    was lost. A sound board that reports by its own clock also causes the warning if it sends fewer
-    lines than the daemon and `mcu.reply_period` is not set.
+    After every `WINDOW` sent lines, the class compares the number of sent lines with the number of
+    good lines received. It warns once. It can warn again only after the board has answered enough
+    lines of a later window, or after the link was lost. A healthy board that reports by its own
+    clock also causes the warning if it sends fewer lines than the daemon and `mcu.reply_period` is
+    not set.
     """
 
     def __init__(self, reply_period: float) -> None:
-        """Start. `reply_period` is `mcu.reply_period`, s.
+        """Start without a warning. `reply_period` is `mcu.reply_period`, s.
 
-        If it is not 0, the board reports by its own clock, so no warning is ever given.
+        If `reply_period` is not 0, the board reports by its own clock, so there is no warning.
         """
         self._own_clock = reply_period > 0.0
         self._since: tuple[int, int] | None = None
@@ -272,9 +294,9 @@ def words(
     lateness: Lateness,
     longest_reply: float,
 ) -> str:
-    """Return a sentence about the link on an open port.
+    """Return a sentence for the operator about the state of the link while the port is open.
 
-    `longest_reply` is the highest value that `mcu.reply_period` may have, s.
+    `longest_reply` is the highest value that the setting `mcu.reply_period` may have, s.
     """
     if link.state in ("booting", "stale"):
         heard = hearing.heard
@@ -306,7 +328,7 @@ def _sparse(sparse_s: float, longest_reply: float) -> str:
 
 
 def check_event(check: Negotiation, wants_samples: bool) -> Event:
-    """Return the event for the newly agreed form of the lines, plain or checked.
+    """Return the event that reports a new form of the lines, plain or checked.
 
     The event is a warning if the board does not support the check, or if `wants_samples` is true
     and the board does not send its encoder counts.

@@ -59,25 +59,29 @@ BAD_LINES = 5
 """Number of bad lines in a row on a checked link after which the daemon renegotiates the check."""
 
 SPARSE = 2
-"""Number of silences in a row, each ended by one good line, after which the board's lines count as
-too sparse. A single silence only means that the link was lost for a moment."""
+"""Number of silences in a row, with a single good line after each, from which the board's lines
+count as too sparse. One silence only means that the link was lost for a moment."""
 
 
 class Link:
     """The state of the link and its counts of good and bad lines. Only `sign` changes the state."""
 
     def __init__(self, quiet_ns: int) -> None:
-        """Start. After `quiet_ns` ns without a good line the link is stale."""
+        """Start with the port closed. `quiet_ns` is the silence after which a link is stale, ns."""
         self.quiet_ns = quiet_ns
         self.state: State = "down"
         self.sparse_s = 0.0
-        """Time between the last two good lines, s, after `SPARSE` silences in a row; else 0."""
+        """Time between the last two good lines, s, if there were `SPARSE` silences in a row. Else
+        0."""
         self._silences = 0
         self._good_in_row = self._bad_in_row = 0
         self._heard_ns: int | None = None
 
     def sign(self, sign: Sign) -> None:
-        """Change the state by `TABLE`. Every input but "trusted" resets the count of good lines."""
+        """Change the state as `TABLE` says for the input `sign`.
+
+        Every input except "trusted" resets the count of good lines in a row.
+        """
         self.state = TABLE.get((self.state, sign), self.state)
         if sign == "trusted":
             return
@@ -89,13 +93,14 @@ class Link:
             self.excuse()
 
     def silent(self, now_ns: int) -> bool:
-        """Return whether the last good line is older than `quiet_ns`, or there was none yet."""
+        """Return whether the last good line is older than `quiet_ns`, or no good line came yet."""
         return self._heard_ns is None or now_ns - self._heard_ns > self.quiet_ns
 
     def good(self, at_ns: int) -> int | None:
-        """Count a good line.
+        """Count a good line, which came at `at_ns` on the monotonic clock.
 
-        Return the time since the previous good line of the session, ns, or None for the first one.
+        Return the time since the previous good line, ns, or None for the first good line after the
+        port was opened or the board has restarted.
         """
         since_ns = None if self._heard_ns is None else at_ns - self._heard_ns
         if not self.silent(at_ns):
@@ -111,30 +116,38 @@ class Link:
         return since_ns
 
     def excuse(self) -> None:
-        """Reset the count of silences: a line was in time, or the board was not the cause."""
+        """Reset the count of silences in a row.
+
+        The caller does this if a line came in time, or if the board did not cause the silence.
+        """
         self._silences, self.sparse_s = 0, 0.0
 
     def missed(self) -> None:
-        """Reset the count of good lines after a bad line or a silence, unless the link is up."""
+        """Reset the count of good lines in a row, after a bad line or a silence.
+
+        While the link is up, the count does not change.
+        """
         if self.state != "up":
             self._good_in_row = 0
 
     def bad(self) -> bool:
-        """Count a bad line. Return whether the caller must renegotiate the check of a checked
-        link."""
+        """Count a bad line. Return True for the last of `BAD_LINES` bad lines in a row.
+
+        On a checked link, the caller must then renegotiate the check.
+        """
         self.missed()
         self._bad_in_row += 1
         return self._bad_in_row == BAD_LINES
 
     @property
     def damaged(self) -> bool:
-        """Whether the last BAD_LINES lines were bad."""
+        """Whether at least the last `BAD_LINES` lines were bad."""
         return self._bad_in_row >= BAD_LINES
 
     def judge(self, now_ns: int, may_rise: bool) -> None:
-        """Change the state to stale after a silence, or to up after `GOOD_LINES` good lines.
+        """Change the state to "stale" after a silence, or to "up" after `GOOD_LINES` good lines.
 
-        The state changes to up only if `may_rise` is true.
+        The state changes to "up" only if `may_rise` is true.
         """
         silent = self.silent(now_ns)
         if self.state == "up":

@@ -1,9 +1,9 @@
 """Measures the delay of events between two unrelated clocks, relative to the least delay so far.
 
-The arrival time by this computer's clock minus the departure time by the other clock is the
-delay plus an unknown offset between the clocks. The smallest such difference so far belongs to the
-event with the least delay. Subtracting it cancels the offset, so the result is the delay in excess
-of the minimum. The clocks drift, so the stored minimum slowly rises as time passes.
+The arrival time by this computer's clock minus the departure time by the other clock is the delay
+plus an unknown offset between the clocks. The smallest such difference so far belongs to the event
+with the least delay. Subtracting the smallest difference cancels the offset, so the result is the
+delay in excess of the minimum. The clocks drift, so the stored minimum slowly rises as time passes.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ class MinimumDelay:
     """The delay of the last event in excess of the minimum, in the caller's unit of time."""
 
     def __init__(self, drift: float = DRIFT, most: float = math.inf) -> None:
-        """Start.
+        """Start before the first event.
 
         `drift` is the largest relative drift between the two clocks. A delay that exceeds the
         minimum by more than `most` is treated as if it exceeded the minimum by `most`.
@@ -29,9 +29,9 @@ class MinimumDelay:
     def add(self, ours: float, theirs: float) -> float:
         """Process an event, and return its delay in excess of the minimum so far.
 
-        If the result is negative, this event is the new minimum. The allowed drift is not
-        subtracted from the result, unlike in `measure`. `ours` is the time since the last event by
-        this computer's clock, and `theirs` by the other clock.
+        If the result is negative, this event sets a new minimum. Unlike `measure`, this method does
+        not subtract the allowed drift from the result. `ours` is the time since the last event by
+        this computer's clock, and `theirs` is the same time by the other clock.
         """
         later = self.late + ours - theirs
         self.measure(ours, theirs)

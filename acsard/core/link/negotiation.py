@@ -1,8 +1,8 @@
 """Negotiates with the board whether lines have a check: a sequence number and a CRC.
 
-The negotiation runs when the port is opened, and again after a gap in the lines. A question is a
-stop line with the check (`checked_line.py`). A board that knows the check answers in the same form.
-The states of the negotiation are:
+The negotiation runs when the port is opened, and again after a gap in the lines. The daemon asks
+with a question, which is a stop line with the check (`checked_line.py`). A board that knows the
+check answers in the same form. The states of the negotiation are:
 
 - off: mcu.link_check is "off". Lines are plain, and the daemon does not ask for the check.
 - waking: the daemon sends only stops. The board has not answered yet, so its silence proves
@@ -12,14 +12,16 @@ The states of the negotiation are:
 - plain: only with mcu.link_check = "auto". The board answers, but without the check. The daemon
   asks again after the next gap.
 - checked: the board has answered a question correctly. Now the daemon accepts only checked replies.
-- sampled: as checked, and the replies contain the encoder counts that the lines ask for.
+- sampled: as in checked. In addition, the replies contain the encoder counts that the lines ask
+  for.
 
 Once a board has answered with the check, the daemon accepts no plain replies until the port is
 reopened, because noise must not end the check.
 
-The module also detects echoes of the daemon's own lines: TX and RX are connected, or the far end
-echoes. A question that comes back is detected at once, because no reply has request letters.
-`echo_detector.py` detects the echo of plain lines, and of checked lines that ask for no sample.
+The module also detects echoes, which are lines of the daemon that come back because TX and RX are
+connected or the far end echoes. If a question with request letters comes back, it is recognized
+immediately, because no reply has request letters. `echo_detector.py` detects the echo of plain
+lines, and of checked lines that ask for no sample.
 """
 
 from __future__ import annotations
@@ -40,7 +42,7 @@ Sign = Literal["gap", "heard", "answer", "sample", "refusal", "samples_end"]
 """The inputs of the state machine.
 
 - gap: the negotiation starts again, because the port was opened or lines were missing or damaged
-- heard: a plain line came while the daemon asks for the check
+- heard: a plain line came while the daemon was asking for the check
 - answer: the board answered a question correctly, without a sample
 - sample: the board answered a question correctly, with a sample
 - refusal: the board answered none of the questions
@@ -73,11 +75,11 @@ IN_FORCE: dict[State, str] = {
 }
 
 Trouble = Literal["", "echo", "forgotten", "unknown"]
-"""The reason why the negotiation does not end, so that the robot cannot drive. "" means that the
-negotiation can end.
+"""The reason why the daemon accepts none of the received replies, so that the robot cannot drive.
+"" means that there is no such reason.
 
 - echo: the lines that the daemon sends come back
-- forgotten: the board answered with the check before and does not now
+- forgotten: the board has answered with the check since the port was opened, but no longer does
 - unknown: the board does not know the check, and the configuration requires it
 """
 
@@ -96,20 +98,21 @@ MENDS: dict[Trouble, str] = {
 
 TRIES = 3
 """Number of unanswered questions of one kind after which the daemon concludes that the board does
-not know this kind. A question is a stop line with a sequence number and a checksum. One kind asks
-for a sample, and the other has no request letters."""
+not know this kind. A question is a stop line with a sequence number and a checksum. Questions of
+the first kind ask for a sample, and those of the second kind have no request letters. If the daemon
+wants no samples, a single question with `ASK_NOTHING` takes the place of the first kind."""
 
 WINDOW = 64
 """Largest number of written lines whose answers the daemon waits for. It is far below the number of
 sequence numbers (256), so a reply cannot match the wrong line."""
 
 LATE_NS = round(WATCHDOG_S * NS_PER_S)
-"""Longest time after a line was written in which its answer is accepted, ns. After this time
-without a line, the board's watchdog has stopped the motors."""
+"""An answer is accepted only if it comes within this time after its line was written, ns. If the
+board receives no line for this time, its watchdog stops the motors."""
 
 BLIND_PERIOD_NS = NS_PER_S // 10
-"""Least time between two stop lines while the board sends nothing, ns. 10 Hz is enough to wake the
-board, and few lines pile up in buffers."""
+"""Least time between two stop lines while the board sends nothing, ns. A rate of 10 Hz is enough to
+wake the board, and only few lines then accumulate in buffers."""
 
 THINKING_NS = 30_000_000
 """Time that the board and the drivers may take to answer, in addition to the wire time, ns."""
@@ -120,29 +123,42 @@ samples."""
 
 
 class Throttle:
-    """A rate limiter. After an event has passed, the next one must wait for a given time."""
+    """A rate limiter. After an event was allowed, the next one must wait for a given time."""
 
     def __init__(self) -> None:
         self.last_ns: int | None = None
         self._before_ns: int | None = None
 
     def lets(self, now_ns: int, wait_ns: int) -> bool:
-        """Return whether the last event was at least `wait_ns` ago. If so, record a new event."""
+        """Return whether an event is allowed at `now_ns`, and record the event if it is.
+
+        The event is allowed if the last one was at least `wait_ns` ns earlier, or if there was
+        none.
+        """
         if self.last_ns is not None and now_ns - self.last_ns < wait_ns:
             return False
         self._before_ns, self.last_ns = self.last_ns, now_ns
         return True
 
     def undo(self) -> None:
-        """Forget the last event, because its line was not written. The next one need not wait."""
+        """Forget the last event, because its line was not written.
+
+        The next event then need not wait.
+        """
         self.last_ns = self._before_ns
 
 
 class Negotiation:
-    """Negotiates the check with the board, adds it to lines, and matches replies with lines."""
+    """The negotiation of the check with the board.
+
+    The class also adds the check to lines, and finds the line that a reply answers.
+    """
 
     def __init__(self, mcu: McuConfig, stop: bytes) -> None:
-        """Start. `stop` is the plain stop line."""
+        """Start before the first question to the board.
+
+        `stop` is the plain line that commands speed zero for all wheels.
+        """
         self._stop, self._wanted = stop, mcu.link_check
         self.state: State = "off" if mcu.link_check == "off" else "waking"
         self.trouble: Trouble = ""
@@ -157,11 +173,11 @@ class Negotiation:
         self._answer_ns = THINKING_NS + 4 * wire_ns(longest, mcu.baud_rate)
         self._sequence = 0
         self._made: tuple[int, int] | None = None
-        """Sequence number of the last checked line, and the monotonic time at which it was made,
-        ns. None after `settle`."""
+        """A pair: the sequence number of the last checked line, and the monotonic time at which it
+        was made, ns. None once `settle` has recorded whether the line was written."""
         self._pending: deque[tuple[int, int]] = deque(maxlen=WINDOW)
-        """Sequence numbers of the written checked lines that are not answered yet, each with the
-        time at which the line was written, ns."""
+        """The written checked lines that are not answered yet, oldest first. Each is a pair of its
+        sequence number and the monotonic time at which it was written, ns."""
         self._knows = False
         self._without = 0
         self._echo = EchoDetector()
@@ -179,11 +195,15 @@ class Negotiation:
 
     @property
     def in_force(self) -> str:
-        """The present form of the lines, in words."""
+        """The present form of the lines, in words, such as "checked"."""
         return IN_FORCE[self.state]
 
     def begin(self, fresh: bool = False) -> None:
-        """Start the negotiation again. With `fresh`, also forget what is known about the board."""
+        """Start the negotiation again.
+
+        If `fresh` is true, also forget everything that is known about the board, because another
+        board may be connected now.
+        """
         self._sign("gap")
         self._begin(fresh)
         if fresh:
@@ -195,7 +215,8 @@ class Negotiation:
         self._made = None
         self._asked, self._just_asked = Throttle(), False
         self._unanswered, self._open = 0, False
-        # The port replaces the first line after an opening with a plain stop.
+        # The port replaces the first line after an opening with a plain stop, so the first line is
+        # a plain stop here too.
         self._plain_turn = 0 if fresh else 1
 
     def _sign(self, sign: Sign) -> None:
@@ -210,8 +231,10 @@ class Negotiation:
         return self._sealed(line, ASK_SAMPLE if self.state == "sampled" else b"", now_ns)
 
     def question(self, now_ns: int) -> bytes | None:
-        """Return the stop line to send while the daemon asks for the check, or None if none is
-        due."""
+        """Return the next question or plain stop to send, or None if it is not due yet.
+
+        The caller calls this method instead of `seal` while the daemon asks for the check.
+        """
         waking = self.state == "waking"
         wait_ns = max(BLIND_PERIOD_NS, self._answer_ns) if waking else self._answer_ns
         if not self._asked.lets(now_ns, wait_ns):
@@ -230,7 +253,10 @@ class Negotiation:
         self._echo.left(line)
 
     def settle(self, went: bool, late_ns: int = 0) -> None:
-        """Record whether the port wrote the last line, `late_ns` ns after the line was made."""
+        """Record whether the port wrote the last line.
+
+        If `went` is true, the port wrote the line `late_ns` ns after it was made.
+        """
         if self._made is not None and went:
             sequence, made_ns = self._made
             self._pending.append((sequence, made_ns + late_ns))
@@ -248,9 +274,10 @@ class Negotiation:
     # Lines from the board.
 
     def echoed(self, line: bytes) -> bool:
-        """Return whether `line` or an earlier line is an echo. `line` has no line end.
+        """Return whether the received line, or a line before it, is an echo of the daemon's lines.
 
-        After an echo, every received line is rejected until the port is reopened.
+        `line` has no line end. After an echo, the caller rejects every received line until the port
+        is reopened.
         """
         if self._question and line == self._question:
             self.trouble = "echo"
@@ -258,27 +285,31 @@ class Negotiation:
 
     @property
     def echoes(self) -> bool:
-        """Whether every received line is treated as an echo, until the port is reopened."""
+        """Whether an echo was detected. Then every line is rejected until the port is reopened."""
         return self.trouble == "echo"
 
     def repeated(self, line: bytes, speeds: WheelSpeeds) -> bool:
-        """Process a report without a sample, and return whether the last reports are an echo."""
+        """Process a reply without a sample, and return whether the received replies are an echo.
+
+        `line` is the reply without its line end, and `speeds` are the speeds in it.
+        """
         if self._echo.report(line, speeds):
             self.trouble = "echo"
         return self.echoes
 
     def heard_plain(self) -> None:
-        """Record that a valid plain line came while the daemon asks for the check.
+        """Record that a valid plain line came while the daemon was asking for the check.
 
         The board is awake then, so unanswered questions are counted from now on.
         """
         self._sign("heard")
 
     def answered(self, reply: Checked, at_ns: int) -> int:
-        """Process a correct reply. Return the monotonic time at which its command was written, ns.
+        """Process a correct checked reply, which was read at `at_ns` on the monotonic clock.
 
-        `at_ns` is the monotonic time at which the reply was read. Raises `FrameError` unless the
-        reply answers a line that was written within `LATE_NS` and is not answered yet.
+        Return the monotonic time at which the line that it answers was written, ns. Raises
+        `FrameError` if this line was written more than `LATE_NS` before `at_ns`, or if the sequence
+        number belongs to no line that waits for an answer.
         """
         while self._pending and at_ns - self._pending[0][1] > LATE_NS:
             self._pending.popleft()
@@ -308,7 +339,7 @@ class Negotiation:
         if self.state != "asking" or not self._open or asked_ns is None:
             return
         if self.echoes:
-            self._unanswered = 0  # keep asking, so that the robot cannot drive
+            self._unanswered = 0  # the daemon keeps asking, so that the robot cannot drive
             return
         if now_ns - asked_ns < self._answer_ns:
             return

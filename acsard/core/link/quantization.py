@@ -1,11 +1,10 @@
-"""Measures how coarsely encoders quantize the reported speeds, and adds the counted angles to
-lines.
+"""Adds the counted angles of the wheels, and the quantization steps of their speeds, to good lines.
 
-If the counts per turn are configured, `whole_counts.py` recovers the counts from the speeds.
-Otherwise the pose uses speed times time. The module does not derive the counts per turn from the
-speeds. This would be possible only if the firmware divided its counts by a fixed period. But then
-the time between the lines is known, so speed times time is wrong only by the rounding of the
-speeds.
+A coarse encoder quantizes the reported speed of its wheel. If the counts per turn are configured,
+`whole_counts.py` recovers the counts from the speeds. Otherwise the pose uses speed times time. The
+module does not derive the counts per turn from the speeds. This would be possible only if the
+firmware divided its counts by a fixed period. But then the time between the lines is known, so
+speed times time is wrong only by the rounding of the speeds.
 """
 
 from __future__ import annotations
@@ -35,13 +34,13 @@ RECUR = 3
 steps."""
 
 ALIKE = 3.0
-"""Bound on the quantization step of a wheel, as a multiple of the second largest step of the four
-wheels. The bound is needed because random jumps of a speed look like quantization too."""
+"""Upper bound on the quantization step of a wheel, as a multiple of the second largest step among
+the four wheels. The bound is needed because random jumps of a speed look like quantization too."""
 
 COARSE, JUMP_GAIN = 0.015, 0.06
-"""`COARSE` is the mean jump of a wheel (`Coarseness`), rad per line, above which its encoder is
-treated as coarse. An encoder with about 200 counts a turn reaches it. `JUMP_GAIN` is the gain of
-the filter for the mean jump."""
+"""An encoder is treated as coarse if the mean jump of its wheel exceeds `COARSE`, rad per line.
+`Coarseness` defines a jump. An encoder with about 200 counts a turn reaches this value. `JUMP_GAIN`
+is the gain of the filter for the mean jump."""
 
 LONGEST_LINE = 0.03
 """Longest time between two lines whose speeds `Coarseness` compares, s. Over a longer time, the
@@ -55,10 +54,10 @@ class Steps:
 
     One count more or less in a period T changes the reported speed by 2 pi / (counts per turn x T).
     This is 31 rad/s at 20 counts per turn and 100 Hz. Such a step is not an acceleration. The size
-    is learned from the reported speeds, so it is right whether the firmware divides counts by its
-    nominal period, divides them by the measured time, or filters the speeds.
+    is learned from the reported speeds. So it is right for firmware that divides counts by its
+    nominal period, that divides them by the measured time, or that filters the speeds.
 
-    `size` is in rad/s. It is `math.inf` until `FIRST` steps were found.
+    `size` is in rad/s. It is `math.inf` until `FIRST` steps have occurred.
     """
 
     def __init__(self) -> None:
@@ -92,24 +91,27 @@ class Steps:
 class Coarseness:
     """Detector of wheel speeds that jump back and forth from line to line, as with coarse encoders.
 
-    The jump of a line is half the second difference of the speed, times the time that the line
-    covers. A change of the acceleration causes a jump too, but only in one line.
+    The jump of a wheel in a line is half the second difference of its speed over the last three
+    lines, times the time since the previous line. A change of the acceleration causes a jump too,
+    but only in one line.
     """
 
     def __init__(self) -> None:
         self._rows = NOTHING, NOTHING
         self._jumps, self._wheel = [0.0] * 4, 0
-        """Filtered jump of each wheel, rad per line, and the wheel examined in the last line."""
+        """`_jumps` is the mean jump of each wheel, rad per line. `_wheel` is the index of the wheel
+        that was examined in the last line."""
 
     def add(self, speeds: Motors, own: float) -> bool:
-        """Take in the speeds of a line, rad/s. Return whether an encoder is coarse.
+        """Process the speeds of a line, rad/s. Return whether the examined encoder is coarse.
 
-        `own` is the time since the line before, s.
+        Each call examines one of the four wheels in turn. `own` is the time since the previous
+        line, s.
         """
         (older, before), self._rows = self._rows, (self._rows[1], speeds)
         if speeds == NOTHING == before or own > LONGEST_LINE:
             return False
-        # Only one wheel is examined per line, which keeps every control step short.
+        # Only one wheel is examined per line, to keep every control step short.
         wheel = self._wheel = (self._wheel + 1) % 4
         mean, jump = self._jumps[wheel], abs(older[wheel] - 2 * before[wheel] + speeds[wheel])
         self._jumps[wheel] = mean = mean + JUMP_GAIN * (own / 2 * jump - mean)
@@ -120,15 +122,18 @@ class CountRecovery:
     """Adds the counted angles and the quantization steps to each good line of one port."""
 
     def __init__(self, counts: int = 0) -> None:
-        """Start. `counts` is the configured number of counts per wheel turn, 0 if unknown."""
+        """Start before the first line.
+
+        `counts` is the configured number of encoder counts per wheel turn, 0 if unknown.
+        """
         self._configured, self._whole = counts, WholeCounts(counts)
         self.coarse_lines = 0
-        """Number of lines whose speeds jump as with coarse encoders. They are counted only if the
-        counts per turn are not configured."""
+        """Number of lines for which `Coarseness` found the examined encoder coarse. Such lines are
+        counted only if the counts per turn are not configured."""
         self.forget()
 
     def forget(self) -> None:
-        """Forget all earlier lines: the board has restarted, or may be another one."""
+        """Forget all earlier lines, because the board has restarted or was replaced."""
         self._whole.forget()
         self._coarseness = Coarseness()
         self._wheels = tuple(Steps() for _ in NOTHING)
@@ -138,14 +143,17 @@ class CountRecovery:
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """Configured counts per turn of each wheel. 0 if unknown or contradicted by the speeds."""
+        """Configured encoder counts per turn of each wheel.
+
+        They are 0 if no counts are configured, or if the reported speeds contradict them.
+        """
         return (self._configured if self._whole.believed else 0,) * 4
 
     def look(self, line: Feedback) -> Feedback:
         """Return the line with the counted angle and the quantization step of each wheel added.
 
-        The counted angles are None if they are unknown. If they include the angles of a missing
-        line, `bridged` becomes 0.
+        `counted` is None if the angles are unknown. If the angles include those of a missing line,
+        `bridged` becomes 0.
         """
         own, speeds, counted = line.dt - line.bridged, line.speeds.as_tuple(), None
         if self._whole.angle:

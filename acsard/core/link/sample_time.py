@@ -1,11 +1,11 @@
-"""Estimates when the board read its encoders. There is one class for each of two kinds of boards.
+"""Estimates when the board read its encoders (the sample time), for two kinds of boards.
 
-The time at which the host reads a line is not the time of its sample: an adapter, the scheduler or
-a stall of the host may have held the line back. `FreeRunningTimes` finds the period of a board that
-reports by its own clock. For a board that answers each command, `PromptedTimes` uses the times at
-which the commands were written. Each class is a clock. For each read of the port, call `read` on
-both classes. Then `place` returns the time of each line of the read. `feedback.py` chooses the
-better clock for each line.
+The time at which the host reads a line is later than its sample time, because an adapter, the
+scheduler or a stall of the host may have held the line back. `FreeRunningTimes` finds the period of
+a board that reports by its own clock. For a board that answers each command, `PromptedTimes` uses
+the times at which the commands were written. Each class serves as a clock: after every read of the
+port, call `read` on both objects, and then `place` to get the time of each line of the read.
+`feedback.py` chooses the better clock for each line.
 """
 
 from __future__ import annotations
@@ -41,20 +41,20 @@ class Placed(Struct, frozen=True, gc=False):
     clock: Literal["slots", "prompts", "reads"]
     due_ns: int
     dt: float | None = None
-    """Time since the previous line with this clock, s. None for the first line and for "reads"."""
+    """Time since the previous line by this clock, s. None for its first line and for "reads"."""
     bridged: float = 0.0
     """The part of `dt` in which lines were lost, s."""
     early: bool = False
     """Whether the line came before the clock expected it. If so, `due_ns` is the time at which the
-    line arrived, and the `dt` of the next line is not valid. The difference of the `due_ns` of the
-    next line and of this line replaces that `dt`."""
+    line arrived, and the `dt` of the next line is not valid. The caller replaces that `dt` with the
+    difference between the `due_ns` of the two lines."""
 
 
 # A free-running board. A slot is one period of its clock, in which the board sends one line.
 
 WINDOW_NS, WINDOW_READS = NS_PER_S // 2, 12
-"""Least duration of a window, ns, and least number of reads of the port in it. From the reads of
-one window, `FreeRunningTimes` finds or corrects the clock of the board."""
+"""A window is a series of reads of the port from which `FreeRunningTimes` finds or corrects the
+clock of the board. It lasts at least `WINDOW_NS` ns and has at least `WINDOW_READS` reads."""
 
 LOOP_GAIN = 0.2
 """Final value of the gain g with which `FreeRunningTimes` corrects its clock. The gain starts at 1
@@ -85,49 +85,49 @@ than this time."""
 
 EARLY_ALONE, ALONE = 0.55, 12
 """`FreeRunningTimes` refuses a clock that too few reads confirm. A read confirms the clock if it
-comes at most `EARLY_ALONE` periods after its slot. The earliest read always does. Besides that
-read, more than one in `ALONE` reads must confirm the clock. Otherwise the few early reads probably
-answer commands that were sent between two periods, and the clock is too early for all other
-lines."""
+comes at most `EARLY_ALONE` periods after its slot. The earliest read always confirms it. Besides
+that read, more than one in `ALONE` reads must confirm the clock. Otherwise the few early reads
+probably contain answers to commands that were sent between two periods, and the clock is too early
+for all other lines."""
 
 JUMP = 1.4
 """If two reads with a single line each are less than this number of periods apart, no line is
 missing between them."""
 
 SURE = 0.15
-"""Margin in periods. An adapter can delay a line only up to a limit. If a line is later than this
-limit by more than one period and the margin, a line before it is missing."""
+"""Margin, in periods. An adapter delays a line only up to a limit. If a line exceeds this limit by
+more than one period plus the margin, a line before it is missing."""
 
 EARLY = 0.25
 """If a line comes before its slot by more than this number of periods, `FreeRunningTimes` gives up
 its clock as wrong."""
 
 LOSSY_READS = 0.45
-"""If lines are missing before more than this share of the reads in two windows, the period of the
-clock is wrong."""
+"""If more than this share of the reads in two successive windows follow missing lines, the period
+of the clock is wrong."""
 
 
 class FreeRunningTimes:
     """The sample times of a free-running board, from the times at which its lines were read.
 
-    The board makes one line in each period T of its clock, here called a slot. The time of a read
-    alone does not show to which slot a line belongs: an adapter holds lines back, and during a host
-    stall they wait in the kernel. Let a be the time of a read, k the number of the slot of its last
-    line, and c the time of slot 0. Then the lateness of this line in slots is
+    The board makes one line in each period T of its clock. Such a period is called a slot. The time
+    of a read alone does not show to which slot a line belongs: an adapter holds lines back, and
+    during a host stall they wait in the kernel. Let a be the time of a read, k the number of the
+    slot of its last line, and c the time of slot 0. Then the lateness of this line in slots is
 
         (1)  x = (a - c) / T - k
 
     Each missing line adds 1 to x. There are two cases:
 
-    - Lines are read one by one. Then x is about 0, and each line shows at once how many lines are
-      missing before it.
+    - Lines are read one by one. Then x is about 0, and each line shows immediately how many lines
+      are missing before it.
     - An adapter batches lines. Then x lies between 0 and 1. If no more than the usual time has
       passed since the previous read, a read shows even a single missing line. Any other read shows
       a missing line only if x exceeds the greatest possible lateness.
 
     The missing slots are spread over the lines of the read. If a line comes before its slot, too
-    many slots were counted as missing, so one is taken back. Twice a second the least x corrects c
-    and T in a second-order loop with the gain g:
+    many slots were counted as missing, so one of them is taken back. Twice a second, c and T are
+    corrected by the least x since the last correction, in a second-order loop with the gain g:
 
         (2)  c += g x T                 (3)  T += g^2 / 2 x T / slots
 
@@ -136,21 +136,21 @@ class FreeRunningTimes:
     """
 
     def __init__(self, known: tuple[float, ...]) -> None:
-        """Start. `known` contains the periods that the configuration suggests, s."""
+        """Start without a clock. `known` are the periods that the configuration suggests, s."""
         self._known = known
         self.usual = 0.0
         """The last measured period T of the board, ns. 0 until a clock has been found."""
         self._stretch = 1.0
-        """Slots per line of the last read: 1, or more if lines are missing before it."""
+        """Number of slots per line of the last read: 1, or more if lines before it are missing."""
         self._before = 0
         self._first, self._slot = 0.0, 0
         """The time c of slot 0, ns, and the number k of the slot of the last line."""
         self._given = 0
-        """Number of slots that were recently counted as missing lines. They may be taken back."""
+        """Number of slots that were recently counted as missing lines and may be taken back."""
         self._lag = self._batch = self._gain = self._share = 0.0
         """`_lag` is the usual lateness x of a read, and `_batch` the usual time between two reads,
         both in slots. `_gain` is the gain g. `_share` is the share of the reads in the last window
-        before which lines were missing."""
+        that follow missing lines."""
         self._batched: bool = False
         self._alone: bool = False
         self._least: float
@@ -166,11 +166,11 @@ class FreeRunningTimes:
         """Slot of the last line that the present clock has placed. None before the first one."""
 
     def read(self, at_ns: int, lines: int, drained: bool) -> int:
-        """Process a read of the port, and return the number of lines lost before its last line.
+        """Process a read of `lines` lines, and return how many lines before its last one are lost.
 
-        The result is -1 if earlier reads counted one slot too many as missing. `at_ns` is the
-        monotonic time at which the last line of the read was complete. `drained` says whether the
-        read took all data that the kernel held.
+        The result is -1 if one slot too many was counted as missing in earlier reads. `at_ns` is
+        the monotonic time at which the last line of the read was complete. `drained` says whether
+        the read took all data that the kernel held.
         """
         self._stretch = 1.0
         since, self._before = at_ns - self._before, at_ns
@@ -181,7 +181,7 @@ class FreeRunningTimes:
         ahead = (at_ns - self._first) / self.usual - self._slot
         lost = self._missing(ahead, since / self.usual, lines, drained)
         if lost < 0 and (self._given <= 0 or ahead > 0):
-            self.forget()  # the lines come too early or ever later: the clock is wrong
+            self.forget()  # the lines come too early, or later and later: the clock is wrong
             return 0
         self._slot += lost
         # If the missing lines cover more time than may be filled, place them all before the read.
@@ -207,7 +207,7 @@ class FreeRunningTimes:
         return self._lag * self.usual
 
     def place(self, behind: int) -> Placed | None:
-        """Return the time of a line of the last read, or None without a clock.
+        """Return the time of a line of the last read, or None if no clock has been found.
 
         `behind` is the number of lines that follow the line in the read.
         """
@@ -223,10 +223,11 @@ class FreeRunningTimes:
         return Placed("slots", due_ns, passed * period, missing * period)
 
     def _missing(self, ahead: float, since: float, lines: int, drained: bool) -> int:
-        """Return the number of missing lines that this read proves, or -1 if it refutes the clock.
+        """Return the number of missing lines that this read proves.
 
-        `ahead` is the lateness x of the read's last line, and `since` is the time since the last
-        read, both in slots. `drained` is as in `read`.
+        Return -1 if the read shows that the clock is wrong, or that an earlier read counted a slot
+        too many as missing. `ahead` is the lateness x of the read's last line, and `since` is the
+        time since the last read, both in slots. `drained` is as in `read`.
         """
         lag = min(self._lag, 0.5)
         if ahead < -0.5 + 0.6 * lag:
@@ -236,7 +237,7 @@ class FreeRunningTimes:
         alone, self._alone = self._alone, lines == 1
         if self._batched:
             prompt = since < 1.1 * self._batch and lines - 1 < since
-            held = self._batch + 1.0  # an adapter also holds back the last line of a backlog
+            held = self._batch + 1.0  # 1.0: an adapter also holds back the last line of a backlog
         else:
             held, prompt = 0.0, lines == 1
             if prompt and alone and since < JUMP:
@@ -273,14 +274,14 @@ class FreeRunningTimes:
     ) -> Iterator[tuple[list[int], float, float]]:
         """Yield candidate clocks, the likelier ones first.
 
-        A candidate consists of the slot of each read's last line, the largest allowed lateness in
+        A candidate is a triple: the slot of each read's last line, the largest allowed lateness in
         slots, and the period in ns. `gaps` are the times between the reads, ns.
 
-        - Configured periods come first. For jittery lines they are more reliable than half a second
-          of data.
-        - Configured periods that assume no missing lines come before measured periods that assume
-          missing lines. Lines that are read one by one may still come from an adapter that batches
-          lines, because they may fill its packets one by one.
+        - Configured periods come before the measured period. For jittery lines, they are more
+          reliable than half a second of data.
+        - Even if the lines are read one by one, each configured period is also tried with the rules
+          for an adapter that batches lines. Such lines may fill the packets of an adapter one by
+          one.
         - If an adapter batches the lines, a measured period is left out if a configured period is
           within `DRIFT` of it. Half a second of data cannot distinguish these two periods.
         """
@@ -302,7 +303,7 @@ class FreeRunningTimes:
             yield own, LATE_BATCHED, slope
 
     def _begin(self, at_ns: int) -> None:
-        """Start a window. `_lossy` counts the reads of the window that follow missing lines."""
+        """Start a new window. `_lossy` counts its reads that follow missing lines."""
         self._window_ns: int = at_ns
         self._least = math.inf
         self._count: int = 0
@@ -310,7 +311,7 @@ class FreeRunningTimes:
         self._lossy: int = 0
 
     def _follow(self, at_ns: int) -> None:
-        """Correct the clock by the equations (2) and (3) after a window, or give it up as wrong."""
+        """Correct the clock after a window by equations (2) and (3), or give it up as wrong."""
         least, slots = self._least, self._passed
         lossy, self._share = self._share, self._lossy / self._count
         if (lossy + self._share) / 2 > LOSSY_READS or least < -EARLY or least == math.inf:
@@ -329,8 +330,8 @@ class FreeRunningTimes:
     def _nominal(self) -> float:
         """Return the nominal period of the firmware, s.
 
-        It is a configured period if one is close to the measured period, else a whole number of ms
-        if one is close. Otherwise it is the measured period.
+        The result is the first of these that applies: a configured period that is close to the
+        measured period, a whole number of ms that is close to it, or the measured period itself.
         """
         seconds = self.usual / NS_PER_S
         for known in self._known:
@@ -343,7 +344,7 @@ class FreeRunningTimes:
 def _slots(reads: list[Read], period: float = math.inf) -> list[int]:
     """Return the slot of each read's last line.
 
-    If `period`, ns, is finite, slots whose lines are missing are counted too.
+    The first read has slot 0. If `period`, ns, is finite, missing lines have slots too.
     """
     slots = [0]
     for (before, _), (at, lines) in pairwise(reads):
@@ -362,9 +363,9 @@ def _slope(reads: list[Read], slots: list[int]) -> float:
 
 
 def _latest(reads: list[Read], slots: list[int], period: float) -> tuple[float, list[float]]:
-    """Return the latest time of slot 0, ns, at which no read comes before its slot.
+    """Return a pair: a time of slot 0, ns, and the resulting lateness of each read, in slots.
 
-    Also return the resulting lateness of each read, in slots. `period` is in ns.
+    The time is the latest one for which no read comes before its slot. `period` is in ns.
     """
     offsets = [at - slot * period for (at, _), slot in zip(reads, slots, strict=True)]
     first = min(offsets)
@@ -374,32 +375,32 @@ def _latest(reads: list[Read], slots: list[int], period: float) -> tuple[float, 
 # A prompted board.
 
 MEMORY = 64
-"""Largest number of commands that are remembered because their replies may still come."""
+"""Largest number of commands that `PromptedTimes` remembers because replies may still come."""
 
 FAST = 0.05
-"""Gain of the filters for the usual reply delay and its spread, the usual time between commands,
-the usual time between batches, and the share of batches among the reads."""
+"""Gain of several filters: for the usual reply delay and its spread, for the usual time between
+commands, for the usual time between batches, and for the share of batches among the reads."""
 
 SLOW = 0.0125
 """Gain per read of the filter that decides whether the board itself varies the reply delay."""
 
 LEAST = 0.002
-"""Gain per reply with which the least reply delay rises towards the usual delay, so that an
-outdated least delay is forgotten after about 500 replies."""
+"""Gain per reply with which the long-term least delay rises toward the usual delay. So an outdated
+least delay is forgotten after about 500 replies."""
 
 CREEP, CREEPS_FOR = 0.05, 3
-"""The least delay of the last replies rises by the share `CREEP` of the time since the last read,
-so that older replies are forgotten. This time is limited to between 1 and `CREEPS_FOR` times the
-usual time between two commands. The upper limit is for a board that stalls and then answers all
-lines."""
+"""With each read, the least delay of the last replies rises by the share `CREEP` of the time since
+the last read, so that older replies are forgotten. In this rule, the time since the last read is
+limited to between 1 and `CREEPS_FOR` times the usual time between two commands. The upper limit is
+for a board that stalls and then answers all lines."""
 
 LATE = 1.25
 """If the least delay of the last replies exceeds the long-term least delay by more than this,
-replies were lost. The unit is the usual time between two commands. A limit of 1 is too low, because
+replies were lost. The unit is the usual time between two commands. A value of 1 is too low, because
 the delay may permanently rise by almost that much."""
 
 RARE = 0.002
-"""Share of lost replies, below which a late reply after a host stall does not prove a loss. After a
+"""Share of lost replies below which a late reply after a host stall does not prove a loss. After a
 host stall, two commands are written close together, so the reply to the first one is late even if
 no reply was lost."""
 
@@ -415,14 +416,15 @@ RISE_NS = 20_000
 forgotten. A link is batched if an adapter holds replies back, so that one read contains several."""
 
 LOSING = 0.005
-"""Gain of the filter for the share of lost replies. With 1/20, two losses would reach `LOSSY`."""
+"""Gain of the filter for the share of lost replies. At a gain of 1/20, two losses would reach
+`LOSSY`."""
 
 LOSSY = 0.03
 """Share of lost replies above which a batched link counts as lossy, so that any line may lack its
 reply."""
 
 SEVERAL = 0.15
-"""If more than this share of the reads of the port have several lines, an adapter batches lines.
+"""If more than this share of the reads of the port contain several lines, an adapter batches lines.
 Host stalls alone cause fewer such reads."""
 
 THINKS = 0.6
@@ -436,33 +438,36 @@ BATCH_NS = 2_000_000
 class PromptedTimes:
     """The sample times of a prompted board, from the commands that its replies answer.
 
-    In this class, a line is a command that the daemon wrote. A plain reply does not say
-    which line it answers. However, a board that answers each line takes its sample when the line
-    arrives. So the sample times are the times at which the lines were written, plus a usual delay.
-    The time between two samples is the time between their lines, even if the host reads the replies
-    late.
+    In this class, a line is a command that the daemon wrote. A plain reply does not say which line
+    it answers. However, a board that answers each line takes its sample when the line arrives. So
+    the sample times are the times at which the lines were written, plus a usual delay. The time
+    between two samples is the time between the lines that they answer, even if the host reads the
+    replies late.
 
     Replies come in the order of the lines. If a reply seems to be later than usual by more than
-    half the time from its line to the next line, it answers the next line instead. The reply to the
+    half the time from its line to the next line, it answers the next line, and the reply to the
     earlier line was lost.
     """
 
     def __init__(self, soonest_ns: int) -> None:
-        """Start. `soonest_ns` is the time that a line and its reply take on the wire, ns."""
+        """Start before the first command.
+
+        `soonest_ns` is the time that a line and its reply take on the wire together, ns.
+        """
         self._soonest = soonest_ns
         self._left: deque[int] = deque(maxlen=MEMORY)
         self.forget()
 
     def forget(self) -> None:
-        """Forget all commands, because they are answered or will never be answered."""
+        """Forget all commands, because no more replies to them will come."""
         self._left.clear()
         self.restart()
 
     def restart(self) -> None:
         """Forget which command was answered last, and the usual delay of the replies.
 
-        The next reply is then assigned to the newest line that it can answer. The lines are kept,
-        because replies to the last ones may still come.
+        The next reply is then assigned to the newest command that it can answer. The commands are
+        not forgotten, because replies to the last ones may still come.
         """
         self._delay: float | None = None
         self._first = False
@@ -478,17 +483,17 @@ class PromptedTimes:
         """Time at which the last answered command was written, ns. If the board replied to that
         command later or sooner than usual, the time is shifted by the difference."""
         self._passed = self._line = 0
-        """`_line` is the time, ns, at which the last answered line was written. `_passed` is that
-        time for the last line that was answered or given up."""
+        """`_line` is the time at which the last answered line was written, ns. `_passed` is the
+        same for the last line that was answered or given up, whichever is newer."""
         self._lost = False
         """Whether the last read with a single reply showed that an earlier reply was lost."""
         self._given: list[int] = []
-        """The commands that were given up at the last read of a batched link, as times in ns,
-        oldest first. An adapter that stalled may still deliver their replies."""
+        """Times at which the commands were written that were given up at the last read of a batched
+        link, ns, oldest first. An adapter that stalled may still deliver their replies."""
         self._at, self._alone, self._since = 0, False, 0
         self._base, self._batch, self._losses = 0.0, 2e7, 0.0
-        """For a batched link: the least reply delay and the usual time between two reads, both ns,
-        and the share of lost replies."""
+        """These values describe a batched link. `_base` is the least reply delay, ns. `_batch` is
+        the usual time between two reads, ns. `_losses` is the share of lost replies."""
         self._several = 0.0
         """Filtered share of the reads that have several lines."""
         self._thinking = 0.0
@@ -507,7 +512,7 @@ class PromptedTimes:
 
     @property
     def _batched(self) -> bool:
-        """Whether an adapter holds replies back, so that one read brings several."""
+        """Whether an adapter holds replies back, so that one read contains several."""
         return self._several > SEVERAL
 
     def left(self, at_ns: int) -> None:
@@ -519,9 +524,10 @@ class PromptedTimes:
         self._left.append(at_ns)
 
     def read(self, at_ns: int, lines: int, cut: bool = False) -> None:
-        """Process a read of `lines` replies. `cut` says whether a part of one more reply follows.
+        """Process a read of the port that contains `lines` whole replies.
 
-        The last of these replies was complete at the monotonic time `at_ns`.
+        The last whole reply was complete at the monotonic time `at_ns`. `cut` is true if the read
+        also contains the first part of one more reply.
         """
         alone, since = lines == 1, at_ns - self._at
         self._at, self._alone, self._since = at_ns, alone, since
@@ -539,8 +545,8 @@ class PromptedTimes:
     def place(self, asked_ns: int | None = None) -> Placed | None:
         """Return the time of the next reply, or None if no command waits for a reply.
 
-        `asked_ns` is the monotonic time at which the line that the reply answers was written, if it
-        is known.
+        `asked_ns` is the monotonic time at which the answered line was written, ns, or None if it
+        is unknown.
         """
         left = self._left
         if asked_ns is not None:
@@ -578,12 +584,12 @@ class PromptedTimes:
         return Placed("prompts", due_ns, dt / NS_PER_S, bridged / NS_PER_S)
 
     def skip(self) -> None:
-        """Remove the command that the next reply answers, because the reply was damaged."""
+        """Remove the command that the next reply answers, because this reply is damaged."""
         if self._left:
             self._passed = self._left.popleft()
 
     def _begin(self) -> None:
-        """Assign the first reply to the newest command that was sent early enough for it."""
+        """Assign the first reply to the newest command it can answer, and set the usual delay."""
         left = self._left
         while len(left) > 1 and left[1] + self._soonest <= self._at:
             self._passed = left.popleft()
@@ -597,9 +603,10 @@ class PromptedTimes:
     def _shorten(self, line: int) -> None:
         """Correct the usual delay if a stall had delayed the first reply, on which it was measured.
 
-        The second reply, which answers the line written at `line` ns, then comes much earlier than
-        usual. Without the correction, the usual delay would fall by only 5 % of the difference per
-        reply. Meanwhile the delay would seem to vary much, and this would hide lost replies.
+        In that case, the delay of the second reply is much shorter than the usual delay. Without
+        the correction, the usual delay would fall by only 5 % of the difference per reply. Until
+        then the delay would seem to vary much, which would hide lost replies. `line` is the time at
+        which the command that the second reply answers was written, ns.
         """
         own = self._at - line
         self._first = own < (self._delay or 0) - self._apart / 2
@@ -608,12 +615,12 @@ class PromptedTimes:
             self._spread = 0.0
 
     def _weigh(self, lines: int, since: int, cut: bool) -> None:
-        """Give up the commands whose replies a batched link has lost.
+        """Give up the commands whose replies were lost on a batched link.
 
-        The last reply of a batch shows the loss: it is too late for the line that it would answer.
-        If many replies are lost, the first reply of the batch decides instead, because the board
-        made it after the previous batch. `since` is the time since the previous read, ns. `cut`
-        says whether the read has a part of one more reply.
+        The last reply of a batch shows a loss: it comes too late for the line that it would answer
+        if no reply were lost. If many replies are lost, the first reply of the batch decides
+        instead, because the board made it after the previous batch. `lines` and `cut` are the
+        arguments of `read`. `since` is the time since the previous read, ns.
         """
         left, at, began = self._left, self._at, lines + cut
         judged, soonest = lines - 1, float(self._soonest)
@@ -622,10 +629,10 @@ class PromptedTimes:
         if since < 1.5 * self._batch:
             self._batch += FAST * (since - self._batch)
         given, self._given, again = self._given, [], False
-        # The part of a reply comes sooner than the whole one.
+        # The first part of a reply can come sooner than a whole reply.
         earliest = self._soonest // 2 if cut else self._soonest
         while given and (len(left) < began or at - left[began - 1] < earliest):
-            left.appendleft(given.pop())  # too soon: these replies answer lines that were given up
+            left.appendleft(given.pop())  # too soon: the replies answer lines that were given up
             again = True
         if len(left) < lines or self._delay is None:
             return
@@ -648,7 +655,7 @@ class PromptedTimes:
     def _given_up_too_early(self, delay: float) -> bool:
         """Return whether the present reply answers the command that was given up last.
 
-        This method first gives up the commands whose replies were lost. The present reply must be
+        Before this check, give up the commands whose replies were lost. The present reply must be
         the only one in its read. `delay` is the usual delay, ns.
         """
         left, at, wide = self._left, self._at, 4 * self._spread
@@ -663,15 +670,15 @@ class PromptedTimes:
             self._soon = min(self._soon + rise, at - left[0])
             if self._soon - soonest > LATE * self._apart:
                 # All of the last replies are late by more than the time between two lines. So
-                # replies were lost, but the large spread had hidden this.
+                # replies were lost, but the large spread of the delay had hidden the loss.
                 delay = self._delay = self._soon = soonest
                 wide = self._spread = 0.0
         while len(left) > 1:
             apart = left[1] - left[0]
             if at - left[0] - delay <= max(apart / 2, wide) or at - left[1] < soonest:
                 break
-            # After a host stall two lines are written at once and the reply to the first one is
-            # late, but not so late that the reply to the second one should have been read too.
+            # After a host stall, two lines are written in quick succession. The reply to the first
+            # one is late, but not so late that the reply to the second one should have come too.
             overdue = at - left[1] - delay > max(self._apart / 2, wide)
             close = apart < self._apart / 2 and not overdue
             if close and self._missing < RARE:

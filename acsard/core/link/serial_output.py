@@ -1,7 +1,7 @@
 """Decides whether a line may be written to the serial port now, and defines the port's interface.
 
 The real port (`daemon/serial/port.py`) and the virtual port of the tests use `SerialOutput`. A line
-is written at once or dropped. It is never queued.
+is written immediately or dropped. It is never queued.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ from acsard.core.config.wire_time import wire_ns
 from acsard.core.values import Instant, Received
 
 Offered = Literal["sent", "superseded", "down"]
-"""The result of `Port.offer`. "down" means that the port is closed. "superseded" means that the
-line was dropped or only partly written, so that a newer line must replace it."""
+"""The result of `Port.offer`. "sent" means that the whole line was written. "superseded" means that
+the line was dropped, replaced by a stop or only partly written, so a newer line must follow. "down"
+means that the port is closed."""
 
 
 class Port(Protocol):
@@ -32,24 +33,25 @@ class Port(Protocol):
     def take(self, late: Instant | None = None) -> tuple[Received, ...]:
         """Return the bytes received since the last call.
 
-        `late` is the time of the control step if the step is late, else None. For a late step, the
+        `late` is the time of the control step if the step is late, else None. In a late step, the
         port also reads the bytes that still wait in the kernel.
         """
 
     def offer(self, line: bytes, now: Instant) -> Offered:
-        """Write a line at once or drop it, and return the result.
+        """Write a line immediately or drop it, and return the result.
 
         `now` is the time at which the line was made.
         """
 
 
 class SerialOutput:
-    """The output of a serial port from its opening to its closing. It has no queue."""
+    """The output of a serial port without a queue, from the opening of the port to its closing."""
 
     def __init__(self, baud_rate: int, stop: bytes, period_ns: int) -> None:
-        """Start. `stop` is the plain stop line.
+        """Start for a port that was just opened.
 
-        A line that is older than `period_ns` ns is dropped, unless it is a stop.
+        `stop` is the plain line that commands speed zero for all wheels. `prepare` drops any other
+        line that is older than `period_ns` ns.
         """
         self._baud_rate, self._stop, self._period_ns = baud_rate, stop, period_ns
         self._still = stop.removesuffix(b"\r\n")
@@ -63,9 +65,9 @@ class SerialOutput:
         """Return the bytes to pass to the kernel for a line, or None if the line must be dropped.
 
         A line is dropped if the kernel still has bytes to send, or if the previous line was still
-        on the wire when the line was made. Unless it is a stop, it is also dropped if it is older
-        than a period because the process did not run. The first line after the port was opened is
-        replaced by a plain stop.
+        on the wire when `line` was made. A line that is not a stop is also dropped if it is older
+        than a period, which happens if the process did not run meanwhile. After the port was
+        opened, a plain stop replaces the first line.
 
         Args:
             line: The line with its line end.
@@ -85,8 +87,8 @@ class SerialOutput:
         """Record that the kernel accepted `taken` bytes of `handed`, and return the result.
 
         `handed` are the bytes that `prepare` returned for `line`. The result is "superseded" if the
-        kernel did not accept all bytes, or if `prepare` had replaced the line by a stop. The
-        remaining bytes are dropped.
+        kernel did not accept all of these bytes, or if `prepare` replaced the line with a stop.
+        Bytes that the kernel did not accept are dropped.
         """
         whole = taken == len(handed)
         if whole:

@@ -1,13 +1,13 @@
-"""Follows one serial port through openings, losses and silences.
+"""Exchanges lines with the board on one serial port, which may close, reopen and fall silent.
 
-The session turns received bytes into feedback, and speeds into lines for the board.
+The module turns received bytes into feedback, and wheel speeds into lines for the board.
 `negotiation.py` decides whether lines are plain or checked, and `link_state.py` decides whether the
-link may carry motion. The link does not come up while the session asks the board for checked lines.
+link may carry motion. The link does not come up while the daemon asks the board for checked lines.
 
-The status lines belong to the opening of the port in which they came, because another board may
-answer after the next opening. If a board does not report a field that the board before it has
-reported, the session forgets the field after `FORGET_NS`. A restart of the board without an opening
-forgets nothing: the same board has the same inputs, and its silence about one of them is a fault.
+When the port is opened again, another board may answer. If it does not report a field of the status
+line that the previous board reported, the field is forgotten after `FORGET_NS`. If a board restarts
+while the port stays open, no field is forgotten: the same board has the same inputs, so a field
+that it no longer reports is a fault.
 """
 
 from __future__ import annotations
@@ -36,18 +36,19 @@ NAMES: dict[LinkState, EventName] = {
 }
 
 LONG_GAP_NS = 1 * NS_PER_S
-"""Duration of a gap in the lines of either direction after which the MCU may have been reset, ns.
-Every sender must then send a zero before it can drive."""
+"""If no line was received, or none was written, for at least this time, ns, the MCU may have been
+reset meanwhile. After such a gap, every sender must send a zero before it can drive."""
 
 BLOCKED_NS = int(WATCHDOG_S * NS_PER_S)
-"""Time without a written line after which the output is reported as blocked, ns. By then the MCU
-has stopped the motors by itself."""
+"""Time without a written line after which the output is reported as blocked, ns. By then the
+watchdog of the MCU has stopped the motors."""
 
 FORGET_NS = 3 * NS_PER_S
-"""The fields of the status lines from before the last opening of the port are forgotten when the
-link has been up for this time, ns, without the steps in which this computer was late. A board
-reports each field at least once a second. Until then a field keeps its value, so a pressed
-emergency stop holds the latch of its stop while the cable is pulled and put back."""
+"""Time for which the link must be up after an opening of the port, ns, before the session forgets
+the fields of the status line that the board has not reported since that opening. Steps in which
+this computer was late do not count. A board reports each of its fields at least once a second.
+Until a field is forgotten, it keeps its value. So a pressed emergency stop remains latched while
+the cable is unplugged and plugged in again."""
 
 IDENTITY = b"!acsard-mcu "
 """First bytes of the line with which an MCU with acsard's firmware identifies itself after
@@ -55,7 +56,11 @@ booting."""
 
 
 class McuSession:
-    """The session with the MCU on one serial port, through openings, losses and silences."""
+    """The exchange of lines with the MCU on one serial port.
+
+    A new session with the MCU begins when the port is opened, when the MCU restarts, and when a gap
+    of at least `LONG_GAP_NS` in the lines ends. The object outlasts all of these sessions.
+    """
 
     def __init__(
         self,
@@ -64,28 +69,31 @@ class McuSession:
         wheel_speed: float = FeedbackConfig().wheel_speed,
         longest_reply: float = LONGEST_REPLY_S,
     ) -> None:
-        """Start without a port.
+        """Start with the port closed.
 
         `wheel_speed` is the highest speed that a wheel can have, rad/s. `longest_reply` is the
-        highest value that mcu.reply_period may have, s.
+        highest value that the setting `mcu.reply_period` may have, s.
         """
         self.codec = Codec(mcu.wheels, mcu.trailing_comma)
         self._lines = LineReader()
         self._needs_check = mcu.link_check == "require"
         self.statuses: list[tuple[int, BoardStatus]] = []
-        """The status lines of the last `update`, each with its monotonic time of arrival, ns."""
+        """The status lines that the last `update` received. Each is a pair of the monotonic time
+        of arrival, ns, and the decoded line."""
         self.status = BoardStatus()
         """The last received value of each field of the status lines, until it is forgotten."""
         self.status_ns: int | None = None
         """Monotonic time of arrival of the last status line that is not forgotten, ns."""
         self._reported: tuple[BoardStatus, int | None] = (BoardStatus(), None)
-        """`status` and `status_ns` as the lines since the last opening of the port make them."""
+        """The values that `status` and `status_ns` would have if only the status lines since the
+        last opening of the port counted."""
         self._awaiting, self._settled_ns, self._judged_ns = True, 0, 0
-        """Whether fields may have to be forgotten, for how long the link has been up without late
-        steps, and the monotonic time of the last update, ns."""
+        """`_awaiting` is true while fields from before the last opening of the port are not
+        forgotten yet. `_settled_ns` is the time for which the link has been up, ns, without the
+        late steps. `_judged_ns` is the monotonic time of the last update, ns."""
         self.reopened = self.forgot = False
-        """Whether the last `update` found the port opened again, and whether it forgot the fields
-        that the board has not reported since the opening."""
+        """`reopened` is true if the last `update` found that the port was opened. `forgot` is true
+        if it forgot the fields that the board has not reported since the opening of the port."""
         self.quiet_ns = int(NS_PER_S * max(0.1, 4 / rate_hz, 3 * mcu.reply_period))
         """Duration of silence after which the link is stale, ns."""
         self.negotiation = Negotiation(mcu, self.codec.stop)
@@ -102,8 +110,8 @@ class McuSession:
         self.good_lines = 0
         self._heard_ns: int | None = None
         self.restarted = False
-        """True if the last `update` began a new session with the MCU: the port was opened again,
-        the MCU has restarted, or a long gap has ended."""
+        """True if the last `update` began a new session with the MCU, because the port was opened,
+        the MCU has restarted, or a long gap in the lines has ended."""
         self.events: list[Event] = []
         """Events of the last `update`, for the log."""
         self._starting_over = False
@@ -112,8 +120,8 @@ class McuSession:
         self._opened = 0
         self._blind, self._just_blind = Throttle(), False
         self._made: tuple[bytes, int] | None = None
-        """The last line that `line()` returned, and the monotonic time at which it was made, ns.
-        None once it is known whether the port wrote the line."""
+        """A pair: the last line that `line()` returned, and the monotonic time at which it was
+        made, ns. None once it is known whether the port wrote the line."""
         self._left_ns = 0
         """Monotonic time at which the port last wrote a line or was opened, ns."""
         self._held_up = False
@@ -137,9 +145,9 @@ class McuSession:
     ) -> list[Feedback]:
         """Process the state of the port and the received bytes, and return the good lines in order.
 
-        A new session starts if `opened`, the number of openings of the port, has changed. `unsent`
-        is true if the port did not write the last line. `late_ns` is the time from making that line
-        to writing it, ns.
+        `opened` is how many times the port has been opened. If this number has changed, a new
+        session starts. `unsent` is true if the port did not write the last line that `line()`
+        returned. `late_ns` is the time from making that line to writing it, ns.
         """
         self.restarted, self._starting_over, self.events = False, False, []
         self.reopened = self.forgot = False
@@ -168,10 +176,11 @@ class McuSession:
         return feedback
 
     def line(self, now_ns: int, speeds: WheelSpeeds) -> bytes | None:
-        """Return the line with these speeds, plain or checked, or None if no line is due.
+        """Return the line that commands `speeds`, plain or checked, or None if no line is due.
 
-        While the MCU does not answer, and while the session asks for the check, every line is a
-        stop. The first stop is due at once, because the MCU may still obey the previous line.
+        While the MCU does not answer, and while the daemon asks it for checked lines, every line is
+        a stop, whatever `speeds` is. The first of these stops is due immediately, because the MCU
+        may still obey the line before it.
         """
         line = self._next_line(now_ns, speeds)
         self._made = None if line is None else (line, now_ns)
@@ -189,15 +198,24 @@ class McuSession:
         return self.negotiation.seal(line, now_ns)
 
     def silent(self, now_ns: int) -> bool:
-        """Return whether no good line came for `quiet_ns`, or none at all in this session."""
+        """Return whether the last good line of this session is older than `quiet_ns`.
+
+        Also return True if this session has no good line yet.
+        """
         return self._link.silent(now_ns)
 
     def feedback_age_s(self, now_ns: int) -> float | None:
-        """Return the seconds since the last good line of any session, None before the first."""
+        """Return the time since the last good line, s, even if an earlier session received it.
+
+        Return None if no good line has ever come.
+        """
         return None if self._heard_ns is None else (now_ns - self._heard_ns) / NS_PER_S
 
     def words(self, port_trouble: str = "") -> str:
-        """Return a sentence about the link. `port_trouble` says why the port is closed."""
+        """Return a sentence for the operator about the state of the link.
+
+        `port_trouble` is the reason why the port is closed, or "" if there is none.
+        """
         if self.link == "down" and port_trouble:
             return port_trouble
         if self.blocked:
@@ -208,14 +226,20 @@ class McuSession:
 
     @property
     def note(self) -> str:
-        """The form of the lines, to append to a mode's reason. "" if no check is configured."""
+        """The present form of the lines, in parentheses, to append to the reason of a mode.
+
+        It is "" if `mcu.link_check` is "off".
+        """
         check = self.negotiation
         return "" if check.state == "off" else f" (serial lines {check.in_force})"
 
     # sessions
 
     def _settle(self, went: bool, port_open: bool, late_ns: int) -> None:
-        """Record whether the port wrote the last line, `late_ns` ns after the line was made."""
+        """Record whether the port wrote the last line.
+
+        If `went` is true, the port wrote the line `late_ns` ns after it was made.
+        """
         made = self._made
         if made is None:
             return
@@ -247,7 +271,10 @@ class McuSession:
         self.negotiation.begin(fresh=True)
 
     def _restart(self, how: str) -> None:
-        """Start a new session, because the MCU has restarted and its motors stand still."""
+        """Start a new session, because the MCU has restarted and its motors stand still.
+
+        `how` completes the sentence "the microcontroller ..." in the log.
+        """
         if self.link == "up":
             self.events.append(Event("mcu_restarted", f"the microcontroller {how}", "warning"))
         self._link.sign("restarted")
@@ -261,7 +288,7 @@ class McuSession:
         if not self._held_up:
             self.blocked = False
         elif now_ns - self._left_ns > BLOCKED_NS and not self.lateness.step_s:
-            # In a late step, the last line is old too, but then this computer is the cause.
+            # In a late step, the last written line is old because this computer did not run.
             self.blocked = True
         if self.blocked:
             link.sign("blocked")
@@ -297,7 +324,7 @@ class McuSession:
     def _announce_rejects(self) -> None:
         """Add an event for each reason for which lines were rejected.
 
-        After noise, an event for each rejected line would take too much time.
+        After noise on the cable, an event for each rejected line would take too much time.
         """
         for reason, (count, line) in self._rejected.items():
             text = f"{line[:60]!r}" if line else ""

@@ -9,9 +9,9 @@ However, n is a whole number, so T can be found from the speeds:
 1. Each possible n of the fastest wheel implies a time T = n a / speed. The search starts at the n
    whose T is nearest to the host's estimate.
 2. The search ends at the first n with which the counts of the other wheels are whole numbers too.
-3. The error of the host's time is carried to the next line: if the board took a sample later than
-   the host believed, less time is left until the next sample. If n was wrong, the carried time
-   makes up for it in the next line.
+3. The difference between T and the host's time is carried to the next line: if the board took a
+   sample later than the host believed, less time is left until the next sample. If n was wrong, the
+   carried time corrects this in the next line.
 
 With fine encoders, the host's time is too inaccurate to find n. Then the angle of each wheel is its
 speed times the host's time. That time includes the time carried from earlier lines, so no time is
@@ -20,8 +20,8 @@ lost or counted twice.
 If the previous line is missing, there are two cases. If the board answered and its reply was lost,
 T covers only the time since that reply. If the command was lost, the board did not answer, and T
 covers the whole time since the last good line. Only one of these times makes the speeds whole
-counts. If a line does not show which one, the module assumes the case of most earlier lines. If
-more than one line is missing, it assumes the first case.
+counts. If a line does not show which case it is, the module assumes the case of most earlier lines.
+If more than one line is missing, it assumes the first case.
 
 Some firmware filters its speeds, or measures the time between two encoder edges. Its speeds are not
 whole counts. The module detects this, and the caller then uses speed times time.
@@ -38,41 +38,41 @@ ROUNDING = 0.0052
 
 MOST_TRIES = 16
 """Largest number of different values of n, the counts of the fastest wheel, that are tried for a
-line. It bounds the time of a control step."""
+line. This limit bounds the time of a control step."""
 
 BY_CHANCE = 0.05
 """Largest accepted probability that random speeds look like whole counts. The probability grows
-with each number of counts that is tried for a line. Above the limit, speeds that look like whole
-counts prove nothing."""
+with each number of counts that is tried for a line. If it exceeds the limit, speeds that look like
+whole counts prove nothing."""
 
 EXACT = 0.3
-"""Largest accepted difference, in counts, between a whole number of counts and speed times host
-time. It applies if the speeds alone prove nothing, as with fine encoders. It also helps to decide
-whether a line covers the missing line before it."""
+"""Largest accepted difference, in counts, between a whole number of counts and the number that the
+speed and the host's time give. It applies if the speeds alone prove nothing, as with fine encoders.
+It also helps to decide whether the counts of a line include those of the missing line before it."""
 
 WIDE, WIDE_S = 0.6, 0.005
-"""Largest error of the host's time between two samples: `WIDE` times this time plus `WIDE_S` s."""
+"""Largest error of the host's time between two samples: the share `WIDE` of it, plus `WIDE_S` s."""
 
 KEPT = 0.95
 """Largest share of the error of the host's time that is carried to the next line. If the whole
-error were carried and the clocks differed by 0.5 %, the carried error would grow for ever."""
+error were carried and the two clocks differed by 0.5 %, the carried time would grow forever."""
 
 REPEATED = 0.65
-"""Limit for a line with unchanged speeds, as a share of the time over which the firmware last
-counted. A line that follows sooner may be a repetition of the previous line, because firmware that
-is asked again too soon has no new counts."""
+"""A line with unchanged speeds can be a repetition of the previous line only if it follows sooner
+than this share of the time over which the firmware last counted. Firmware that is asked again so
+soon has no new counts."""
 
 SOON, OFF = 0.45, 0.25
-"""Limits for a line with unchanged speeds. `SOON` is a share of the time over which the firmware
-last counted. A line that follows sooner is a repetition of the previous line. A line between `SOON`
-and `REPEATED` is a repetition if its speeds are not whole counts, or if the host's time contradicts
-its counts by more than `OFF` counts of the fastest wheel."""
+"""A line with unchanged speeds is a repetition of the previous line if it follows sooner than the
+share `SOON` of the time over which the firmware last counted. If it follows later than that, but
+sooner than the share `REPEATED`, it is a repetition in two cases: its speeds are not whole counts,
+or the host's time contradicts its counts by more than `OFF` counts of the fastest wheel."""
 
 UNSURE, SLOW = 0.2, 0.025
-"""`UNSURE` is a mean error of the host's time, in counts of the fastest wheel. Above it, the
+"""If the mean error of the host's time exceeds `UNSURE`, in counts of the fastest wheel, the
 nearest whole number of counts is often wrong. A random time has a mean error of 0.25. An encoder
 with 96 counts a turn reaches `UNSURE` behind a USB adapter that batches lines for 16 ms. `SLOW` is
-the gain of the filter for this error."""
+the gain of the filter for the mean error."""
 
 GAIN, DOUBTFUL = 0.1, 0.3
 """`GAIN` is the gain of the filter for the share of lines whose speeds are not whole counts. If
@@ -83,7 +83,10 @@ class WholeCounts:
     """Recovery of whole encoder counts from the speeds of four wheels, line by line."""
 
     def __init__(self, counts: int) -> None:
-        """Start. `counts` is the number of encoder counts per wheel turn, 0 if unknown."""
+        """Start before the first line.
+
+        `counts` is the number of encoder counts per wheel turn, 0 if unknown.
+        """
         self.angle = math.tau / counts if counts else 0.0
         """Angle of one encoder count, rad, 0 if unknown."""
         self.forget()
@@ -94,19 +97,22 @@ class WholeCounts:
         """`_apart` is the time in s by which the board took the last sample earlier than the host
         believed. `_period` is the time in s by which the firmware divided its last counts."""
         self._run = 0
-        """Number of lines with recovered counts since the last line without them."""
+        """Number of lines with recovered counts since the last line without recovered counts."""
         self._before: Motors = (0.0, 0.0, 0.0, 0.0)
         self.covers_gap = False
         """Whether the counts of the last line include those of the missing line before it."""
         self._cover = 0.0
-        """Of the lines that follow a missing line, the filtered share whose counts include those of
-        the missing line. A line whose speeds do not show this is not used."""
+        """Among the lines that follow a missing line, the filtered share of those whose counts
+        include the counts of the missing line. A line whose speeds do not show this is left out."""
         self._doubt = self._unsure = 0.0
         """`_doubt` is the filtered share of the lines whose speeds are not whole counts. `_unsure`
         is the filtered error of the host's time, in counts of the fastest wheel."""
 
     def pause(self) -> None:
-        """Reset the carried time: the last line does not show for how long the firmware counted."""
+        """Forget the error of the host's time, which would be carried to the next line.
+
+        The reason is that the last line does not show over what time the firmware counted.
+        """
         self._apart, self._run = 0.0, 0
 
     @property
@@ -117,13 +123,13 @@ class WholeCounts:
     def turned(self, speeds: Motors, own: float, gap: float = 0.0) -> Motors | None:
         """Return the angle by which each wheel turned since the previous line, rad.
 
-        The angles are whole counts. If the line does not show the counts, they are speed times
-        time. Return None if the firmware does not report whole counts, or if the speeds are not all
-        0 but none exceeds its rounding error.
+        The angles are whole counts. If the line does not show the counts, the angles are speed
+        times time. Return None if the firmware does not report whole counts. Also return None if
+        the wheels turn, but no speed exceeds its rounding error.
 
         `own` is the host's estimate of the time since the previous line, s. If the line before this
         one is missing, `gap` is the time from the last good line to the missing line, s. Otherwise
-        it is 0.
+        `gap` is 0.
         """
         self.covers_gap = False
         before, self._before = self._before, speeds
@@ -193,11 +199,12 @@ class WholeCounts:
         return abs(number - want * fastest / self.angle) <= EXACT
 
     def _number(self, speeds: Motors, fastest: float, want: float) -> tuple[int, bool | None]:
-        """Return n, the counts of the fastest wheel, or 0 if the line does not show n.
+        """Return a pair: the number n of counts of the fastest wheel, and whether it is proved.
 
-        The second value is True if the speeds prove that they are whole counts, False if they prove
-        the opposite, and None if they prove nothing. `want` is the host's estimate of the time
-        between the samples, with the carried time, s.
+        n is 0 if the line does not show it. The second value is True if the speeds prove that they
+        are whole counts, False if they prove the opposite, and None if they prove neither.
+        `fastest` is the largest absolute speed, rad/s. `want` is the expected time between the two
+        samples, s: the host's estimate plus the time carried from the previous line.
         """
         count = fastest / self.angle
         exact = want * count  # counts if the host's time were right

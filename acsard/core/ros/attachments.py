@@ -1,7 +1,7 @@
 """Encodes and decodes the attachment of rmw_zenoh_cpp: sequence number, time and GID in 33 bytes.
 
-rmw_zenoh_cpp adds this attachment to every sample and request. Both rmw_zenoh_cpp and acsard drop a
-sample or a request without it.
+rmw_zenoh_cpp adds this attachment to every sample and request. Both rmw_zenoh_cpp and acsard drop
+samples and requests without it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ class Attachment(Struct, frozen=True):
     """Attachment of a sample or a request."""
 
     sequence: int
-    """Number of the sample or request. Each publisher or client counts from 1."""
+    """Number of the sample or request. Each publisher and each client counts its own from 1."""
     stamp_ns: int
     """Time of sending by the wall clock, ns since 1970."""
     gid: bytes
@@ -31,7 +31,7 @@ class Attachment(Struct, frozen=True):
 
 
 def unpack(data: bytes) -> Attachment:
-    """Return the attachment in these bytes. Raises `DecodeError` if it is missing or not valid."""
+    """Decode an attachment. Raises `DecodeError` if `data` is empty or not a valid attachment."""
     if not data:
         raise DecodeError(
             "no_attachment",

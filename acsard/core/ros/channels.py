@@ -2,10 +2,10 @@
 
 Each topic is encoded as CDR and comes with its message definition (`ros2msg` of MCAP), so Foxglove,
 Lichtblick and PlotJuggler can read it. No topic may have another encoding, because `ros2 bag play`
-refuses a file with one.
+refuses a file that contains such a topic.
 
 ROS has no type for `state`, so this topic has a type of the package `acsard` (`shapes.py`). `ros2
-bag play` skips this topic with a message, but the viewers show it. The names and types of the
+bag play` reports that it skips this topic, but the viewers show it. The names and types of the
 topics in ROS come from `transports.py`. The definitions are those of ROS 2 Jazzy and later.
 """
 
@@ -28,7 +28,7 @@ OURS = "acsard/msg/"
 """Prefix of the message types that ROS does not have."""
 
 Field = tuple[str, str]
-"""Type and name of a field of a message."""
+"""A pair: the type and the name of a field of a message."""
 
 _TEXT = """
 builtin_interfaces/msg/Time: int32 sec, uint32 nanosec
@@ -93,9 +93,9 @@ acsard/msg/RobotState: \
     string emergency_stop, bool[] bumpers, \
     string recording_error, string certificate_expiry, acsard/msg/Counter[] counters
 """
-"""Message definitions, one type in each line: its name, a colon, and a list separated by commas.
-The list contains constants as `type NAME=value`, and fields as `type name` or `type name default`.
-`[]` marks a sequence and `[n]` an array."""
+"""Message definitions. Each line defines one type: its name, a colon, and its constants and fields,
+separated by commas. A constant is written as `type NAME=value`, and a field as `type name` or `type
+name default`. `[]` after a type marks a sequence, and `[n]` an array of n items."""
 
 
 def _parsed(text: str) -> dict[str, tuple[tuple[str, str], ...]]:
@@ -108,13 +108,14 @@ def _parsed(text: str) -> dict[str, tuple[tuple[str, str], ...]]:
 
 
 _DECLARED = _parsed(_TEXT)
-"""The constants and fields of each type, in order: pairs of the type and the text after it."""
+"""The constants and fields of each message type, in order. Each is a pair of its own type and the
+text after this type."""
 
 DEFINITIONS: dict[str, tuple[Field, ...]] = {
     name: tuple((kind, rest.split()[0]) for kind, rest in declared if "=" not in rest)
     for name, declared in _DECLARED.items()
 }
-"""The fields of each type, in order, without the constants."""
+"""The fields of each message type, in order, without the constants."""
 
 RULE = "=" * 80
 
@@ -127,7 +128,7 @@ def schema_text(name: str) -> str:
 
 
 def nested(name: str) -> tuple[str, ...]:
-    """Return all types that a type contains, at any depth, in the order of their first use."""
+    """Return all types nested in the type `name` at any depth, in the order of their first use."""
     return tuple(dict.fromkeys(_nested(name)))
 
 
@@ -144,7 +145,7 @@ def _fields(name: str) -> str:
 
 
 def _short(kind: str) -> str:
-    """Return `pkg/msg/Type` as `pkg/Type`, the form in message definitions."""
+    """Return the short form of a type in message definitions: `pkg/Type` for `pkg/msg/Type`."""
     return re.sub("/msg/", "/", kind)
 
 
@@ -160,24 +161,27 @@ class Channel(Struct, frozen=True):
     name: str
     """Topic name relative to the namespace."""
     native: str
-    """Native Zenoh key of the same messages, below the robot's id."""
+    """Native Zenoh key of the same messages, without its beginning `acsard/<robot.id>/`."""
     schema_name: str
     """ROS type as `pkg/msg/Name`."""
     message: type[Struct]
-    """Type of the struct that is encoded. For `state` it is the type in `shapes.py`."""
+    """Struct type that `encode` encodes. For `state` it is `State` in `shapes.py`."""
     qos: Qos = Qos()
 
     def topic(self, namespace: str, source: str = "") -> str:
-        """Return the fully qualified name, with its leading slash."""
+        """Return the fully qualified name, with its leading slash.
+
+        `source` is the command source that replaces `<source>` in the name.
+        """
         return full_name(namespace, self.name.replace(SOURCE, source))
 
     @property
     def schema(self) -> str:
-        """The message definition, with the definitions of all nested types, in MCAP's `ros2msg`."""
+        """The message definition and those of all nested types, in MCAP's `ros2msg` format."""
         return schema_text(self.schema_name)
 
     def encode(self, message: Any) -> bytes:
-        """Return a message as CDR. A `RobotState` is first converted to the type in `shapes.py`."""
+        """Return a message as CDR. A `RobotState` is converted to `State` of `shapes.py` first."""
         return encode(state(message) if isinstance(message, RobotState) else message, "cdr")
 
 
@@ -198,11 +202,11 @@ LOG = Channel("log", "events", "rcl_interfaces/msg/Log", Log, Qos(1000))
 """The topic of the robot's events. Each event is one log message."""
 
 CMD_VEL_IN = Channel(f"cmd_vel_in/{SOURCE}", f"cmd/{SOURCE}", TWIST_STAMPED, TwistStamped)
-"""The topics of the commands, one for each source. The stamp of a message is the time at which the
-command arrived."""
+"""The topics of the commands that arrived, one topic for each source. The stamp of a message is the
+time at which the command arrived."""
 
 BY_KEY: dict[str, Channel] = {**_published(), STATE.native: STATE}
-"""Maps the native Zenoh key to the channel, for all messages that `Report` (`messages/report.py`)
+"""Maps each native Zenoh key to its channel, for all messages that `Report` (`messages/report.py`)
 builds."""
 
 CHANNELS: tuple[Channel, ...] = (*BY_KEY.values(), CMD_VEL_IN, LOG)

@@ -4,7 +4,7 @@ zenoh-bridge-ros2dds uses the name of a topic as its Zenoh key. The key of rmw_z
 contains the domain, the type and the hash of the type, so no message arrives if the hash is wrong.
 The robot's own topics are in `core/ros/transports.py`.
 
-A token announces an endpoint to ROS. Messages arrive without it, but `ros2 topic list` and
+A token announces an endpoint to ROS. Without its token, messages arrive, but `ros2 topic list` and
 `wait_for_service` do not find the endpoint. The formats of tokens, QoS strings and GIDs are those
 of rmw_zenoh_cpp (Jazzy 0.2.4 and later) and zenoh-plugin-ros2dds 1.10.
 """
@@ -57,7 +57,7 @@ TYPE_HASHES: dict[str, str] = {
 }
 # fmt: on
 """RIHS01 hashes of the ROS types in use, for Jazzy, Kilted and Lyrical. They are literals because
-they are part of the wire format. A test computes them again from the message definitions."""
+the hashes are part of the wire format. A test recomputes them from the message definitions."""
 
 
 def full_name(namespace: str, name: str) -> str:
@@ -76,13 +76,14 @@ def bridge_key(name: str) -> str:
 def rmw_key(domain: int, name: str, type_name: str) -> str:
     """Return the Zenoh key that rmw_zenoh_cpp uses for a topic or service.
 
-    `name` is fully qualified. `type_name` is the type as `pkg/msg/Name`.
+    `domain` is the ROS domain id. `name` is the fully qualified name. `type_name` is the type in
+    the form `pkg/msg/Name`.
     """
     return f"{domain}/{name.removeprefix('/')}/{dds_type(type_name)}/{TYPE_HASHES[type_name]}"
 
 
 def dds_type(type_name: str) -> str:
-    """Return `pkg/msg/Name` as `pkg::msg::dds_::Name_`, the form in DDS."""
+    """Return the DDS form of a type name, such as `pkg::msg::dds_::Name_` for `pkg/msg/Name`."""
     package, kind, name = type_name.split("/")
     return f"{package}::{kind}::dds_::{name}_"
 
@@ -97,12 +98,13 @@ class Qos(Struct, frozen=True):
     """QoS profile of a publisher or a subscription in ROS."""
 
     depth: int = 10
-    """Number of samples that are kept."""
+    """Number of samples that the publisher or the subscription keeps."""
     transient: bool = False
-    """Whether a subscriber that joins later receives the kept samples."""
+    """Durability: True is transient local, so that a subscriber that joins later also receives the
+    kept samples. False is volatile."""
     best_effort: bool = False
-    """Whether the endpoint is best effort, otherwise reliable. A best-effort subscription accepts
-    every publisher. A reliable subscription accepts only reliable publishers."""
+    """Reliability: True is best effort, False is reliable. A best-effort subscription accepts every
+    publisher. A reliable subscription accepts only reliable publishers."""
 
 
 class Node(Struct, frozen=True):
@@ -112,19 +114,19 @@ class Node(Struct, frozen=True):
     zid: str
     """Id of the Zenoh session."""
     namespace: str
-    """Namespace without slashes at its ends; "" is the root."""
+    """Namespace without slashes at its ends. "" is the root namespace."""
     name: str
 
     @property
     def token(self) -> str:
-        """Liveliness token of the node itself, which has the number 0 in its session."""
+        """Liveliness token of the node itself. The node has the number 0 in its session."""
         return f"{self._head}/0/NN/%/{_mangled('/' + self.namespace)}/{self.name}"
 
     def endpoint_token(self, number: int, kind: Kind, name: str, type_name: str, qos: Qos) -> str:
         """Return the liveliness token of an endpoint.
 
-        `number` identifies the endpoint in its session and starts at 1. `name` is fully qualified,
-        and `type_name` is the type as `pkg/msg/Name`.
+        `number` identifies the endpoint in its session. The numbers start at 1. `name` is the fully
+        qualified name, and `type_name` is the type in the form `pkg/msg/Name`.
         """
         return (
             f"{self._head}/{number}/{kind}/%/{_mangled('/' + self.namespace)}/{self.name}"
@@ -137,14 +139,14 @@ class Node(Struct, frozen=True):
 
 
 def rmw_qos(qos: Qos) -> str:
-    """Return a QoS profile as rmw_zenoh_cpp writes it in a token. Default values are left out."""
+    """Return a QoS profile as rmw_zenoh_cpp writes it in a token, which omits default values."""
     depth = "" if qos.depth == RMW_DEFAULT_DEPTH else qos.depth
     reliability = "2" if qos.best_effort else ""
     return f"{reliability}:{'1' if qos.transient else ''}:,{depth}:,:,:,,"
 
 
 def gid(token: str) -> bytes:
-    """Return the GID of an endpoint, 16 bytes: the XXH3-128 hash of its token, little endian."""
+    """Return the GID of an endpoint: the XXH3-128 hash of its token as 16 bytes, little endian."""
     return xxhash.xxh3_128_intdigest(token.encode()).to_bytes(16, "little")
 
 

@@ -1,9 +1,10 @@
 """Offers the configuration as ROS parameters, for `ros2 param` and `rqt_reconfigure`.
 
-A parameter has the name of its key in `acsard.toml`, with dots between table and key. Only the
-settings in `core/config/live.py` can be set. This module decodes a request to set parameters, and
-`core/robot.py` accepts or refuses it. The description and the range of a parameter come from the
-types in `core/config/settings.py`. The structs of this module are types of rcl_interfaces.
+A parameter has the name of its key in `acsard.toml`, with a dot between table and key. Only the
+settings in `core/config/live.py` can be set while the daemon runs. This module decodes a request to
+set parameters, and `core/robot.py` accepts or refuses the request. The description and the range of
+a parameter come from the types in `core/config/settings.py`. The structs of this module are types
+of rcl_interfaces.
 """
 
 from __future__ import annotations
@@ -92,7 +93,7 @@ def _described(name: str, type_of: int) -> ParameterDescriptor:
 def kind_of(name: str) -> inspect.Type:
     """Return the declared type of the setting with the dotted key `name`.
 
-    The key of a setting of a command source contains the name of the source, as in
+    For a setting of a command source, the key contains the name of the source, as in
     `commands.sources.app.timeout`. Raises `KeyError` for the key of a table.
     """
     cls: type[Struct] = Config
@@ -113,14 +114,14 @@ def kind_of(name: str) -> inspect.Type:
 
 T = TypeVar("T")
 Some = Annotated[list[T], Meta(max_length=128)]
-"""List with at most 128 items, for the parameters that a request sets. The robot has fewer
-parameters. To decode a longer list would take too much of the time of a control step."""
+"""List with at most 128 items, for the parameters that a request sets. The robot has fewer than 128
+parameters. Decoding a longer list would take too much of the time of a control step."""
 Many = Annotated[list[T], Meta(max_length=256)]
 """List with at most 256 items, for names of parameters. The limit is higher than that of `Some`,
 because a name is decoded faster than a parameter with its value."""
 
 MAX_REQUEST_BYTES = 16384
-"""Largest size of a request, bytes. A request that lists the names of all parameters fits."""
+"""Largest size of a request, bytes. A request with the names of all parameters is smaller."""
 
 NOT_SET, BOOL, INTEGER, DOUBLE, STRING = range(5)
 INTEGER_ARRAY, DOUBLE_ARRAY, STRING_ARRAY = 7, 8, 9
@@ -131,7 +132,7 @@ Q = TypeVar("Q")
 
 
 class ParameterValue(Struct, frozen=True):
-    """Value of a parameter. `type` says which field has the value."""
+    """Value of a parameter. `type` says which of the other fields contains the value."""
 
     type: Unsigned8 = NOT_SET
     bool_value: bool = False
@@ -165,18 +166,19 @@ class ListRequest(Struct, frozen=True):
     prefixes: Many[str]
     """Prefixes of the names to list. If there are none, all names are listed."""
     depth: Unsigned64
-    """Largest number of dot-separated parts that a name may have after its prefix; 0 = any."""
+    """Largest number of dot-separated parts that a listed name may have after its prefix. 0 means
+    any number."""
 
 
 class ListReply(Struct, frozen=True):
-    """Reply of `list_parameters`. A prefix is the part of a name before the last dot."""
+    """Reply of `list_parameters`. A prefix in it is the part of a name before the last dot."""
 
     names: list[str]
     prefixes: list[str]
 
 
 class Names(Struct, frozen=True):
-    """Request of the services that return values, types or descriptors of the named parameters."""
+    """Request of the services that return the values, types or descriptors of the parameters."""
 
     names: Many[str]
 
@@ -188,7 +190,7 @@ class Values(Struct, frozen=True):
 
 
 class Types(Struct, frozen=True):
-    """Reply of `get_parameter_types`: the number that ROS gives to the type of each parameter."""
+    """Reply of `get_parameter_types`, with the number that ROS gives to each parameter's type."""
 
     types: list[Unsigned8]
 
@@ -218,16 +220,15 @@ class SetAtomicallyReply(Struct, frozen=True):
 
 
 SETTING = ("set_parameters", "set_parameters_atomically")
-"""The services that set parameters. The class `Parameters` does not answer these services, because
-it answers only those that read parameters."""
+"""The services that set parameters. The class `Parameters` does not answer them, because it only
+reads."""
 
 
 def failure(service: str, why: str, request: bytes = b"") -> bytes:
-    """Return the reply to a request that is refused.
+    """Return the reply to a refused request. Without a reply, the client would wait forever.
 
-    Without a reply, the client would wait for ever. If the request sets parameters, the reply gives
-    the reason `why`. Other replies have no field for a reason, so they are
-    empty, as in rclcpp.
+    If the request sets parameters, the reply contains the reason `why`. The replies of the other
+    services have no field for a reason, so they are empty, as in rclcpp.
     """
     refused = SetParametersResult(False, why)
     if service in SETTING:
@@ -292,9 +293,9 @@ class Parameters:
 
 
 def wished(payload: bytes) -> dict[str, Plain]:
-    """Return the values that a request to set parameters contains, by parameter name.
+    """Return the values that the request `payload` wants to set, by the names of the parameters.
 
-    Raises `CdrError` if the request is not valid.
+    Raises `CdrError` if the request is not valid, or if it names a parameter twice.
     """
     asked = Cdr(SetRequest).decode(payload)
     wishes: dict[str, Plain] = {}
@@ -306,7 +307,7 @@ def wished(payload: bytes) -> dict[str, Plain]:
 
 
 def outcome(service: str, payload: bytes, successful: bool, reason: str) -> bytes:
-    """Return the reply to a request to set parameters.
+    """Return the reply to the request `payload` to set parameters, both in CDR.
 
     The robot sets all parameters of a request or none, so each parameter has the same result.
     Raises `CdrError` for a request to `set_parameters` that is not valid.

@@ -1,6 +1,6 @@
 """Converts events, commands and the native message `state` to ROS messages.
 
-CDR has no maps, so the counters become a list. Null becomes NaN (`cdr_types.py`).
+CDR has no maps, so the counters of `state` become a list. Null becomes NaN (`cdr_types.py`).
 """
 
 from __future__ import annotations
@@ -54,9 +54,9 @@ def log(event: Event | LogEvent, stamp: Time) -> Log:
 
 
 def how_often(text: str, count: int) -> str:
-    """Return the number of occurrences to append to an event's text, such as " (3 times)".
+    """Return the text to append to an event that occurred `count` times, such as " (3 times)".
 
-    Returns "" for a single occurrence, and for a text that already begins with the number.
+    Return "" for a single occurrence, and for a text that already begins with the number.
     """
     return "" if count == 1 or NUMBERED.match(text) else f" ({count} times)"
 
@@ -64,7 +64,7 @@ def how_often(text: str, count: int) -> str:
 def asked(twist: BodyTwist, arrived: Time, frame: str) -> TwistStamped:
     """Convert the command of a source to a message of the topic `cmd_vel_in/<source>`.
 
-    The header of the message contains the time `arrived` and the frame id `frame`.
+    The header of the message contains the time of arrival `arrived` and the frame id `frame`.
     """
     return TwistStamped(
         Header(arrived, frame), Twist(Vector3(x=twist.linear), Vector3(z=twist.angular))
@@ -82,7 +82,8 @@ class Source(Struct, frozen=True):
     """A command source.
 
     `age` is the time since the last accepted command of the source, s. It is None if no command was
-    accepted since the senders last had to return to neutral.
+    accepted since the senders last had to return to neutral. `waits_for` says in words what
+    the source waits for, "" if it waits for nothing.
     """
 
     name: str

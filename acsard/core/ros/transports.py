@@ -1,7 +1,7 @@
-"""The table of the robot's ROS topics and services, with the native key of each.
+"""The table of the robot's ROS topics and services, with the native key of each of them.
 
 A native key is acsard's own Zenoh key. A ROS key is the Zenoh key that a ROS transport uses for the
-same messages. There are two transports: zenoh-bridge-ros2dds ("bridge") and rmw_zenoh_cpp ("rmw").
+same messages. The two transports are zenoh-bridge-ros2dds ("bridge") and rmw_zenoh_cpp ("rmw").
 The bus declares its ROS endpoints from this table.
 """
 
@@ -63,16 +63,16 @@ class Endpoint(Struct, frozen=True):
     """Liveliness token that announces the endpoint, or "" if it is not announced. rmw_zenoh
     identifies the endpoint by its GID, which is a hash of this token."""
     latched: bool
-    """True if a new subscriber receives the last message at once."""
+    """True if a new subscriber immediately receives the last message."""
     type: str
-    """ROS type of the messages; the first type if a key of the bridge accepts two types."""
+    """ROS type of the messages. If a key of the bridge accepts two types, it is the first one."""
 
     @property
     def encoding(self) -> str:
-        """Zenoh Encoding to assume for an incoming sample, because samples of ROS have none.
+        """Zenoh Encoding to assume for an incoming sample, because samples from ROS have none.
 
-        For the bridge, the encoding does not name the type, because a key may accept two types. The
-        length of a sample shows whether it is a Twist or a TwistStamped.
+        For the bridge, the encoding does not name the ROS type, because a key may accept two types.
+        Then the length of a sample shows whether it is a Twist or a TwistStamped.
         """
         cdr = encoding_name("cdr")
         return f"{cdr};{self.type}" if self.transport == "rmw" else cdr
@@ -94,8 +94,8 @@ PARAMETER_SERVICES = {
 }
 
 PARAMETERS = "parameters/"
-"""Beginning of `RosName.native` for the ROS services that read and set parameters. No such native
-key exists; native clients read the same settings with the key `config`."""
+"""Beginning of `RosName.native` for the ROS services that read and set parameters. No native keys
+begin like this. Native clients read the same settings with the key `config`."""
 
 PUBLISHED = (
     RosName("odom", "odom", "out", "nav_msgs/msg/Odometry"),
@@ -115,18 +115,18 @@ SOURCES = {
     "cmd_vel_teleop": "teleop",
     "joint_commands": "ros2_control",
 }
-"""The command source of each ROS topic that commands the robot."""
+"""Maps each ROS topic that commands the robot to its command source."""
 
 URDF = RosName(DESCRIPTION, DESCRIPTION, "out", "std_msgs/msg/String", Qos(1, transient=True))
-"""The topic of the robot's URDF. It is not in `PUBLISHED`, because only the topics in `PUBLISHED`
-are recorded."""
+"""The topic of the robot's URDF. It is not in `PUBLISHED`, because all topics in `PUBLISHED` are
+recorded and this one is not."""
 
 SLOWER = RosName(SPEED_LIMIT, SPEED_LIMIT, "in", "nav2_msgs/msg/SpeedLimit")
 """Subscription to the speed limits of Nav2's speed filter."""
 
 GYRO = RosName("imu/data", IMU, "in", "sensor_msgs/msg/Imu", Qos(best_effort=True))
-"""Subscription to the samples of a gyro. It is best effort, so that it also accepts gyro drivers
-that publish with SensorDataQoS."""
+"""Subscription to the samples of a gyro. It is best effort, so that it also receives from gyro
+drivers that publish with SensorDataQoS."""
 
 
 def left_out(config: Config) -> frozenset[str]:
@@ -179,12 +179,15 @@ def ros_names(ros: RosConfig, silent: Container[str] = ()) -> tuple[RosName, ...
 
 
 def in_ros_words(text: str, ros: RosConfig) -> str:
-    """Return `text` with the ROS names of services: srv/clear becomes /acsard/clear."""
+    """Return `text` with the ROS names of services instead of their native keys.
+
+    For example, `srv/clear` becomes `/acsard/clear`.
+    """
     return _NAMED.sub(lambda found: full_name(ros.namespace, f"{ros.node}/{found[1]}"), text)
 
 
 def endpoints(ros: RosConfig, zid: str, silent: Container[str] = ()) -> tuple[Endpoint, ...]:
-    """Return the endpoints of all ROS transports that are switched on.
+    """Return the endpoints of all ROS transports that the configuration switches on.
 
     Args:
         ros: the table `[ros]` of the configuration.
@@ -221,9 +224,10 @@ def command_keys(ros: RosConfig) -> tuple[str, ...]:
 def claims(ros: RosConfig) -> tuple[str, ...]:
     """Return the tokens with which this daemon claims the ROS name `cmd_vel` for itself.
 
-    Two daemons with the same token would follow the same `cmd_vel`, so the second daemon does not
-    start. ROS tokens cannot serve for this: not every daemon announces itself to ROS, and
-    other ROS nodes may use the same names. So the keys of these tokens begin with `acsard/@ros/`.
+    Two daemons with the same token would obey the same `cmd_vel`, so the second daemon does not
+    start. ROS's own tokens cannot serve as claims, because not every daemon announces itself to
+    ROS, and other ROS nodes may use the same names. So the keys of claims begin with
+    `acsard/@ros/`.
     """
     name = full_name(ros.namespace, "cmd_vel")
     trees = (("bridge", ros.bridge), (f"rmw/{ros.domain}", ros.rmw))

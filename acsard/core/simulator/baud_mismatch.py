@@ -1,7 +1,7 @@
 """Computes the bytes that a receiver gets from a sender with another baud rate.
 
-The wire carries a start bit, eight data bits with the lowest first, and a stop bit. The receiver
-waits for an edge and then samples in the middle of each of its own bits.
+For each byte, the wire carries a start bit, eight data bits with the lowest first, and a stop bit.
+The receiver waits for a falling edge, and then samples the wire in the middle of each of its bits.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Simulates the board: its side of the serial protocol, with the time of each byte on the wire.
 
 The simulated board does not use the daemon's parser, so that an error in that parser makes the
-tests fail. A fault is on inside a `with` block, such as `with mcu.mute():` (`faults.py`). The
-faults that `[sim] faults` lists are always on.
+tests fail. A test switches a fault on for a `with` block, such as `with mcu.mute():` (`faults.py`).
+The faults that `[sim] faults` lists are always on.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ RESET_NS = 2 * NS_PER_S
 
 SHORTEST_WINDOW_NS = 4 * MS
 """Shortest time over which the board computes speeds from encoder counts, ns. If less time has
-passed since the last computation, a reply repeats the speeds of that computation."""
+passed since the last computation, a reply repeats the speeds that it gave."""
 
 OUTPUT_BYTES = 255
 """Size of the board's output buffer. The board drops a line that does not fit, as the firmware in
@@ -40,8 +40,8 @@ STATUS_NS = NS_PER_S // 10
 """Time between two status lines, ns."""
 
 EMPTY_VOLTS, CHARGED_VOLTS, RESISTANCE = 21.0, 4.2, 0.2
-"""Battery of six cells: voltage when empty, V; additional voltage when full, V; and internal
-resistance, ohm."""
+"""Properties of the simulated battery, which has six cells: its voltage when empty, V, the
+additional voltage when full, V, and its internal resistance, ohm."""
 
 REST_AMPS, AMPS_PER_SPEED = 0.5, 0.05
 """Battery current at rest, A, and additional current for each rad/s of each wheel, A."""
@@ -53,14 +53,15 @@ current lowers the battery voltage by 2 V."""
 NEVER_NS = 2**62
 
 PROCESSING_MS = (2.1, 1.3, 3.7, 1.0, 4.9, 2.6, 1.8, 3.2)
-"""Times from the end of a line from the host to the start of the board's reply, ms. The board uses
-these times in turn."""
+"""Times from the arrival of a line from the host to the start of the board's reply, ms. The board
+uses these times in turn."""
 
 
 class FakeMcu(Faults):
     """The simulated board.
 
-    Call `advance()` at the times that `next_ns()` returns, to get the bytes that the board sends.
+    Pass the bytes of the host to `receive()`. Call `advance()` at the times that `next_ns()`
+    returns, to get the bytes that the board sends.
     """
 
     def __init__(self, config: Config, now_ns: int = 0) -> None:
@@ -70,8 +71,8 @@ class FakeMcu(Faults):
         self._counts = config.sim.encoder_counts
         self._wiring = _wiring(config.mcu.wheels)
         self._now_ns = self._moved_ns = now_ns
-        """Monotonic time of the last event or call of `advance()`, and monotonic time up to which
-        the vehicle is simulated, ns."""
+        """`_now_ns` is the monotonic time of the last event or of the last call of `advance()`, ns.
+        `_moved_ns` is the monotonic time up to which the vehicle is simulated, ns."""
         self._events: list[tuple[int, int, str, bytes]] = []
         self._order = count()
         self._processing = cycle(PROCESSING_MS)
@@ -89,26 +90,27 @@ class FakeMcu(Faults):
         self._counted = [0.0] * 4
         self._replied_ns = now_ns - NS_PER_S
         self.heard: deque[tuple[int, bytes]] = deque(maxlen=4096)
-        """The last received lines, valid or not, each with the monotonic time, ns, at which its
-        last byte arrived."""
+        """The last received lines, valid or not. Each is a pair of the monotonic time at which its
+        last byte arrived, ns, and the line."""
         self.valid_lines = 0
         self._watchdog_trips = 0
         self._checks = False
-        """Whether the host has sent a line with a checksum. If it has, the board adds a checksum to
-        its status lines too."""
+        """Whether the host has sent a valid line with a checksum. If so, the board adds a checksum
+        to its status lines too."""
         self._bumpers = "." * (len(config.safety.bumpers) or 4)
-        """Field `bumpers` of a status line while no bumper is pressed: a dot for each bumper."""
+        """Field `bumpers` of the status line while no bumper is pressed: one dot per bumper."""
         self._inputs: tuple[tuple[int, int, str, str], ...] = ()
-        """The faults of the inputs: begin (ns), end (ns), field of the status line, and its value.
-        The value `silent` leaves the field out of the line. If several faults of one field are on,
-        the last one decides, except that a bumper counts as pressed if any of them presses it."""
+        """The faults of the inputs, each as a tuple of its begin, ns, its end, ns, the field of the
+        status line, and the value of this field. The value `silent` leaves the field out of the
+        line. If several faults of one field are on, the last one decides. For bumpers instead, each
+        bumper that any of the faults presses is reported as pressed."""
         self._inputs_clock = b""
         self._battery_clock = b""
         self._charge = self._capacity = 1.0
         """State of charge of the battery, 0 to 1, and its capacity, ampere seconds."""
         self._drained_ns = self._rested_ns = now_ns
-        """Monotonic times at which the charge was computed last, and at which all set points were
-        zero last, ns."""
+        """`_drained_ns` is the monotonic time at which the charge was last computed, ns.
+        `_rested_ns` is the monotonic time at which all set points were last zero, ns."""
         if config.sim.boot_time:
             self._schedule(self._boot_until_ns, "booted", b"")
         self._lasting = ExitStack()
@@ -133,7 +135,7 @@ class FakeMcu(Faults):
     # Time.
 
     def receive(self, now_ns: int, data: bytes) -> None:
-        """Accept bytes that the host wrote at `now_ns`. They arrive at the rate of the wire."""
+        """Accept bytes that the host wrote at `now_ns`. They arrive at the speed of the wire."""
         start, taken = max(self._in_free_ns, now_ns), 0
         data = self._damaged(data)
         *lines, rest = data.split(b"\n")
@@ -146,14 +148,14 @@ class FakeMcu(Faults):
         self._in_free_ns = start + wire_ns(len(data), self.baud_rate)
 
     def next_ns(self) -> int | None:
-        """Return the monotonic time, ns, at which to call `advance()` next.
+        """Return the monotonic time at which to call `advance()` next, ns.
 
-        Returns None if the board has nothing to do until the next call of `receive()`.
+        Return None if the board has nothing to do until the next call of `receive()`.
         """
         return self._events[0][0] if self._events else None
 
     def advance(self, now_ns: int) -> bytes:
-        """Let time pass up to `now_ns`. Return the bytes that the host received in that time."""
+        """Advance the time to `now_ns`. Return the bytes that the host receives until then."""
         out = b""
         while self._events and self._events[0][0] <= now_ns:
             due_ns, _, what, data = heapq.heappop(self._events)
@@ -186,7 +188,10 @@ class FakeMcu(Faults):
         return out
 
     def reset(self, now_ns: int, deaf_ns: int = RESET_NS) -> None:
-        """Reset the board: stop the motors, send noise once, and ignore input for `deaf_ns` ns."""
+        """Reset the board, which stops its motors and ignores its input for `deaf_ns` ns.
+
+        After half of this time, the board sends some noise, as a bootloader does.
+        """
         self._now_ns = now_ns
         self._events.clear()
         self._held = self._batch = b""
@@ -236,7 +241,8 @@ class FakeMcu(Faults):
                 self._catch_up()
                 self._fed_ns = now_ns
             return
-        # The property `vehicle` first simulates the robot up to now with the old set points.
+        # Reading the property `vehicle` first simulates the robot up to now with the old set
+        # points.
         set_points = self.vehicle.set_points
         for motor, value in command.values.items():
             wheel, forward = self._wiring[self.drivers[motor]]
@@ -279,8 +285,8 @@ class FakeMcu(Faults):
     def _handed_over(self, now_ns: int, what: str, data: bytes) -> bytes:
         """Return the bytes that the USB adapter passes on to the host at `now_ns`.
 
-        `what` is "batch" if the timer of the adapter has expired, and "sent" if `data` has arrived
-        from the board.
+        `what` is "batch" if the timer of the adapter has expired. It is "sent" if the bytes `data`
+        of the board have arrived at the adapter.
         """
         until_ns = self._stalled_until(now_ns)
         if until_ns > now_ns:
@@ -335,7 +341,7 @@ class FakeMcu(Faults):
         return [speed if abs(speed) >= 0.005 else 0.0 for speed in seen]
 
     def _sample(self) -> tuple[int, ...]:
-        """Return the time of the last encoder reading, ms since power-on, and the four counts."""
+        """Return the time of the last encoder reading, ms since booting, and the four counts."""
         read_ns, _ = self._window
         return (read_ns - self._on_ns) // MS, *(round(count) for count in self._counted)
 
@@ -355,7 +361,7 @@ class FakeMcu(Faults):
             self._send(now_ns, self._damaged(protocol.status(fields, self._checks)))
 
     def _tell_battery(self, now_ns: int) -> None:
-        """Drain the battery for the time since the last call, and send its values to the host."""
+        """Drain the battery for the time since the last call, and report it in a status line."""
         seconds, self._drained_ns = (now_ns - self._drained_ns) / NS_PER_S, now_ns
         turning = sum(map(abs, self.vehicle.set_points))
         if not turning:
@@ -373,22 +379,23 @@ class FakeMcu(Faults):
             if self._now_ns <= change_ns < NEVER_NS:
                 self._schedule(change_ns, "status", b"")
 
-    # These faults are here because they need the events of the board.
+    # The following faults are not in `faults.py`, because they need the events of the board.
 
     def estop(self) -> Fault:
-        """Make the board report ten times a second that the emergency stop is released."""
+        """Make the board report ten times per second that the emergency stop is released."""
         return self._input("estop", "ok")
 
     def estop_pressed(self, after_s: float, length_s: float) -> Fault:
-        """Make the board report the emergency stop as pressed, and before and after as released.
+        """Make the board report that a person presses the emergency stop for a while.
 
-        The press begins `after_s` s after this fault is switched on, and lasts `length_s` s (0: for
-        ever). The motors keep their power.
+        The press begins `after_s` s after this fault is switched on, and lasts `length_s` s. If
+        `length_s` is 0, it does not end. The board reports a released emergency stop before and
+        after the press. The motors keep their power.
         """
         return self._input("estop", "pressed", after_s, length_s)
 
     def estop_silent(self, after_s: float, length_s: float) -> Fault:
-        """Make the board report a released emergency stop, and then omit these reports.
+        """Make the board report a released emergency stop, and omit these reports for a while.
 
         The reports end `after_s` s after this fault is switched on, and begin again `length_s` s
         later. If `length_s` is 0, they do not begin again.
@@ -403,16 +410,17 @@ class FakeMcu(Faults):
         return self._input("bumpers", self._bumpers)
 
     def bumper_pressed(self, number: float, after_s: float, length_s: float) -> Fault:
-        """Make the board report bumper `number` (from 1) as pressed, before and after as released.
+        """Make the board report that the bumper `number`, counted from 1, is pressed for a while.
 
-        The press begins `after_s` s after this fault is switched on, and lasts `length_s` s (0: for
-        ever). The motors keep their power.
+        The press begins `after_s` s after this fault is switched on, and lasts `length_s` s. If
+        `length_s` is 0, it does not end. The board reports a released bumper before and after the
+        press. The motors keep their power.
         """
         marks = ["X" if i == number else mark for i, mark in enumerate(self._bumpers, 1)]
         return self._input("bumpers", "".join(marks), after_s, length_s)
 
     def bumpers_silent(self, after_s: float, length_s: float) -> Fault:
-        """Make the board report released bumpers, and then omit these reports.
+        """Make the board report released bumpers, and omit these reports for a while.
 
         The reports end `after_s` s after this fault is switched on, and begin again `length_s` s
         later. If `length_s` is 0, they do not begin again.
@@ -420,18 +428,20 @@ class FakeMcu(Faults):
         return self._input("bumpers", "silent", after_s, length_s)
 
     def driver_fault(self, after_s: float, length_s: float) -> Fault:
-        """Make the board report a fault of the motor driver.
+        """Make the board report that the motor driver has a fault for a while.
 
-        The reports begin `after_s` s after this method switches the fault on, and end `length_s` s
-        later. If `length_s` is 0, they do not end.
+        The driver's fault begins `after_s` s after this method is called, and lasts `length_s` s.
+        If `length_s` is 0, it does not end. Before and after it, the board reports that the motor
+        driver is ok.
         """
         return self._input("driver", "fault", after_s, length_s)
 
     @contextmanager
     def battery(self, percent: float, minutes: float) -> Iterator[None]:
-        """Make the board report a battery ten times a second. The charge begins at `percent` %.
+        """Make the board report a battery ten times per second. Its charge begins at `percent` %.
 
-        A full battery lasts `minutes` minutes while the robot stands, and less while it drives.
+        A full battery would last `minutes` minutes if the robot only stood. It drains faster while
+        the robot drives.
         """
         clock = b"battery %d" % next(self._order)
         self._schedule(self._now_ns + STATUS_NS, "battery", clock)
@@ -462,12 +472,12 @@ class FakeMcu(Faults):
 
     @contextmanager
     def free_running(self, period_s: float = 0.1) -> Iterator[None]:
-        """Make the board report every `period_s` s instead of answering lines.
+        """Make the board report every `period_s` s by its own clock instead of answering lines.
 
-        The reports end with a comma, and have unpadded speeds (`3.14` instead of `03.14`).
+        The reports end with a comma, and their speeds are not padded (`3.14` instead of `03.14`).
         """
         period_ns = int(period_s * NS_PER_S)
-        # The name of the clock is new, so that events of an older clock are ignored.
+        # Each clock has a new name, so that the board ignores events of an older clock.
         clock = b"clock %d" % next(self._order)
         self._schedule(self._now_ns + period_ns, "report", clock)
         with self._with(
@@ -477,7 +487,10 @@ class FakeMcu(Faults):
 
 
 def _wiring(wheels: WheelMap) -> list[tuple[int, int]]:
-    """Return for each motor a to d its wheel's index in `WHEELS`, and -1 if reversed, else 1."""
+    """Return a pair for each of the motors a to d: the index of its wheel in `WHEELS`, and a sign.
+
+    The sign is -1 if the motor is reversed, else 1.
+    """
     motors = (wheels.front_right, wheels.front_left, wheels.rear_left, wheels.rear_right)
     place = {motor[1]: (index, -1 if motor[0] == "-" else 1) for index, motor in enumerate(motors)}
     return [place[letter] for letter in "abcd"]

@@ -1,7 +1,7 @@
-"""The switches of the faults of the simulated board and its wire.
+"""The switches for the faults of the simulated board and its wire.
 
-`fake_mcu.py` implements the effects of the faults. No fault is random. A fault that affects only
-some lines affects every n-th line.
+`fake_mcu.py` implements the effects of the faults. No fault is random: a fault that affects only
+some of the lines affects every n-th line.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from acsard.core.values import NS_PER_S
 Fault = AbstractContextManager[None]
 
 USB_PACKET = 62
-"""Size of a full packet, bytes. An FTDI adapter sends it without waiting for its timer."""
+"""Size of a full USB packet, bytes. An FTDI adapter sends it without waiting for its timer."""
 
 WATCHDOG_NS = 300_000_000
-"""Silence of the host after which the board stops the motors, ns."""
+"""Duration of the host's silence after which the board stops the motors, ns."""
 
 
 class Faults:
@@ -44,21 +44,25 @@ class Faults:
         self.baud_rate = 115200
         self.reply_gap_ns = 0
         self.drivers = [0, 1, 2, 3]
-        """The motor that each channel drives. Channels 0 to 3 are the board's outputs a to d."""
+        """The motor that each channel drives. Channels 0 to 3 are the outputs a to d of the
+        board."""
         self.drives = [1.0] * 4
-        """Factor from a channel's command to its motor's speed: 1, -1 if reversed, 0 if dead."""
+        """For each channel, the factor from its command to the set point of its motor: 1, or -1 if
+        the motor is reversed, or 0 if it is dead."""
         self.push: float | None = None
-        """Speed at which a person pushes the robot, m/s; None if nobody pushes it."""
+        """Speed at which a person pushes the robot, m/s, or None if nobody pushes it."""
         self.encoders = [0, 1, 2, 3]
         """The motor whose encoder each channel reads."""
         self.encoder_signs = [1, 1, 1, 1]
         self.understand: Callable[[bytes], protocol.Command | None] = protocol.whole
         self.samples = True
         self.latency_ns = 0
-        """Interval at which the USB adapter sends even an unfilled packet, ns; 0: no adapter."""
+        """Interval at which the USB adapter also sends a packet that is not full, ns. 0 means that
+        there is no adapter."""
         self.stall_every_ns = self.stall_ns = 0
         self.lose_reply = self.lose_command = self.bit_error = 0
-        """The n of each fault that affects every n-th line. 0 means that the fault is off."""
+        """Each of these faults affects every n-th line. The value is n, or 0 if the fault is
+        off."""
         self._passed = {"reply": 0, "command": 0, "bit": 0}
         self._clock = b""
 
@@ -81,7 +85,7 @@ class Faults:
         """Simulate the vehicle up to now. `FakeMcu` implements this."""
 
     def _hit(self, what: str, every: int) -> bool:
-        """Count an event of kind `what`, and return True for every n-th one, where n is `every`.
+        """Count an event of kind `what`. Return True for every n-th event, where n is `every`.
 
         If `every` is 0, always return False.
         """
@@ -120,7 +124,7 @@ class Faults:
         return self._with(stuck=wheel)
 
     def frozen_encoder(self, wheel: int) -> Fault:
-        """Make the board repeat the last measured speed of motor `wheel` (0 to 3 for a to d)."""
+        """Make the board keep reporting the last speed of motor `wheel` (0 to 3 for a to d)."""
         return self._with(frozen=wheel)
 
     @contextmanager
@@ -153,7 +157,7 @@ class Faults:
         return self._with(encoder_signs=[-s if i == wheel else s for i, s in signs])
 
     def dead_motor(self, wheel: int) -> Fault:
-        """Keep the motor of channel `wheel` (0 to 3 for a to d) from turning."""
+        """Make the motor of channel `wheel` (0 to 3 for a to d) ignore its commands."""
         return self._with(drives=[0.0 if i == wheel else d for i, d in enumerate(self.drives)])
 
     def pushed(self, speed: float) -> Fault:
@@ -190,12 +194,12 @@ class Faults:
     def comma_latched(self) -> Fault:
         """Make the board obey each value that a comma follows, and ignore checksums.
 
-        Old firmware does this too.
+        Some old firmware behaves like this.
         """
         return self._with(understand=protocol.latched)
 
     def no_check(self) -> Fault:
-        """Make the board obey lines with a checksum without checking it, and reply without one."""
+        """Make the board ignore the checksums of the host's lines, and reply without checksums."""
         return self._with(understand=protocol.prefix)
 
     def plain_only(self) -> Fault:
@@ -203,11 +207,11 @@ class Faults:
         return self._with(understand=protocol.plain_only)
 
     def no_sample(self) -> Fault:
-        """Make the board reply with a checksum, but never with its time and encoder counts."""
+        """Make the board reply with a checksum, but never with the board's time and counts."""
         return self._with(samples=False)
 
     def no_watchdog(self) -> Fault:
-        """Let the motors run on when the host is silent."""
+        """Keep the motors running when the host is silent."""
         return self._with(watchdog=False)
 
     def late_watchdog(self, time_s: float = 1.0) -> Fault:
@@ -219,11 +223,11 @@ class Faults:
         return self._with(any_feeds=True)
 
     def lost_replies(self, every: int = 5) -> Fault:
-        """Lose every n-th reply on the way to the host, where n is `every`."""
+        """Drop every n-th reply on its way to the host, where n is `every`."""
         return self._with(lose_reply=every)
 
     def lost_commands(self, every: int = 5) -> Fault:
-        """Lose every n-th line on the way to the board, where n is `every`."""
+        """Drop every n-th line on its way to the board, where n is `every`."""
         return self._with(lose_command=every)
 
     def bit_errors(self, every: int = 7) -> Fault:

@@ -1,4 +1,4 @@
-"""Repeatable random numbers: the n-th number of a seed is the same in any order of calls.
+"""Generates repeatable random numbers: the n-th number of a seed is the same in any order of calls.
 
 The numbers come from the mixing function of SplitMix64 (Steele, Lea & Flood, Fast splittable
 pseudorandom number generators, 2014), applied to n. So the module keeps no state.
@@ -13,13 +13,13 @@ _STEP = 0x9E3779B97F4A7C15
 
 
 def uniform(seed: int, n: int) -> float:
-    """Return the n-th number of this seed, uniformly distributed in [0, 1)."""
+    """Return the n-th random number of `seed`, uniformly distributed in [0, 1)."""
     z = (_mixed(seed & _MASK) + n * _STEP) & _MASK
     return (_mixed(z) >> 11) / (1 << 53)
 
 
 def gauss(seed: int, n: int) -> float:
-    """Return the n-th number of this seed from the standard normal distribution (Box-Muller)."""
+    """Return the n-th random number of `seed`, with a standard normal distribution (Box-Muller)."""
     radius = math.sqrt(-2.0 * math.log(1.0 - uniform(seed, 2 * n)))
     return radius * math.cos(math.tau * uniform(seed, 2 * n + 1))
 

@@ -1,8 +1,8 @@
 """The serial protocol as the board implements it: the lines that it obeys, and its answers.
 
-There is a decoder for each kind of firmware; `whole()` is that of the reference firmware. A checked
-line is a plain line with a suffix: a sequence number and a checksum. The module shares no code with
-the host.
+There is a decoder for each kind of firmware. `whole()` is the decoder of the reference firmware. A
+checked line is a plain line with a suffix: a sequence number and a checksum. The module shares no
+code with the host.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ class Command(Struct, frozen=True):
     values: dict[int, float]
     """Speeds by motor (0 to 3 for a to d), rad/s."""
     sequence: bytes = b""
-    """The two digits of the sequence number of a checked line; b"" for a plain line."""
+    """The two digits of the sequence number of a checked line, or b"" for a plain line."""
     wants_sample: bool = False
     """Whether the line asks for a reply with the board's time and encoder counts."""
 
 
 def whole(line: bytes) -> Command | None:
-    """Decode a plain or checked line like the reference firmware; return None if it is invalid."""
+    """Decode a plain or checked line like the reference firmware. Return None if it is invalid."""
     text = line.removesuffix(b"\n").removesuffix(b"\r")
     if b"#" not in text and b"*" not in text:
         return _plain(text)
@@ -54,12 +54,15 @@ def whole(line: bytes) -> Command | None:
 
 
 def plain_only(line: bytes) -> Command | None:
-    """Decode a line like firmware that accepts only plain lines: a suffix makes it invalid."""
+    """Decode a line like firmware that accepts only plain lines. Return None for any other line."""
     return _plain(line.removesuffix(b"\n").removesuffix(b"\r"))
 
 
 def prefix(line: bytes) -> Command | None:
-    """Decode a line like firmware that ignores the text after the four values."""
+    """Decode a line like firmware that ignores all text after the four values.
+
+    Return None if the four values are not valid.
+    """
     return _plain(line[:PLAIN])
 
 
@@ -86,7 +89,7 @@ def _plain(text: bytes) -> Command | None:
     return None if values is None else Command(dict(enumerate(values)))
 
 
-# A robot at a constant speed gets the same values again and again, so cache them.
+# A robot at a constant speed gets the same values again and again, so they are cached.
 @lru_cache(256)
 def _values(text: bytes) -> tuple[float, ...] | None:
     match = _LINE.fullmatch(text)
@@ -115,7 +118,8 @@ def speeds_text(speeds: tuple[float, ...], separator: str, unpadded: bool) -> by
 def suffix(text: bytes, sequence: bytes, sample: Sequence[int]) -> bytes:
     """Return the suffix of a checked reply whose plain part is `text`.
 
-    `sample` is the milliseconds and the four encoder counts, or empty for a reply without them.
+    `sequence` are the two digits of the sequence number. `sample` is the board's time in ms and the
+    four encoder counts, or empty for a reply without them.
     """
     body = b"#" + sequence
     if sample:
@@ -136,7 +140,7 @@ def identity(counts: int, watchdog_ms: int, sample: bool) -> bytes:
     """Return the line with which the firmware identifies itself.
 
     `counts` is the number of encoder counts per wheel revolution. `sample` says whether the
-    firmware can add its time and encoder counts to its replies.
+    firmware can add the board's time and encoder counts to replies.
     """
     text = f"!acsard-mcu 1 counts={counts} watchdog_ms={watchdog_ms} check=1 sample={int(sample)}"
     return text.encode() + b"\r\n"

@@ -1,6 +1,6 @@
 """Observes the true motion of the simulated robot at 100 Hz, and simulates a gyro.
 
-The simulated board does not use these observations: it reports only the speeds from its encoders.
+The simulated board does not use these observations. It reports only what its encoders measure.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ class Sight(Struct, frozen=True):
     """Monotonic time of the observation, ns."""
     pose: Pose
     gyro: float
-    """Turn rate that the gyro reports, rad/s: the mean since the last observation, delayed by
-    `[sim] gyro_delay`."""
+    """Turn rate that the gyro reports, rad/s. It is the mean rate between two observations, delayed
+    by `[sim] gyro_delay`, with the bias and the noise of the gyro."""
 
 
 class WatchedMcu(FakeMcu):
@@ -40,15 +40,16 @@ class WatchedMcu(FakeMcu):
         self._looks = 0
         self._look_ns = now_ns + LOOK_NS
         self._history: deque[tuple[int, float]] = deque([(now_ns, 0.0)])
-        """Times (ns) and angles turned until then (rad), as far back as the delayed gyro needs."""
+        """Pairs of a monotonic time, ns, and the angle that the robot turned until then, rad. They
+        go back as far as the delayed gyro needs."""
 
     def next_ns(self) -> int:
-        """Return the monotonic time, ns, at which to call `advance()` next."""
+        """Return the monotonic time at which to call `advance()` next, ns."""
         due_ns = super().next_ns()
         return self._look_ns if due_ns is None else min(due_ns, self._look_ns)
 
     def advance(self, now_ns: int) -> bytes:
-        """Let time pass up to `now_ns`. Return the bytes that the host received in that time."""
+        """Advance the time to `now_ns`. Return the bytes that the host receives until then."""
         out = b""
         while self._look_ns <= now_ns:
             out += super().advance(self._look_ns)
@@ -69,7 +70,10 @@ class WatchedMcu(FakeMcu):
         self._see(Sight(now_ns, self.vehicle.pose, rate))
 
     def _turned(self, at_ns: int) -> float:
-        """Return the angle turned until `at_ns`, or until the start of the history, rad."""
+        """Return the angle that the robot had turned at `at_ns`, rad.
+
+        If `at_ns` is outside the history, return the angle at the nearer end of the history.
+        """
         before_ns, before = self._history[0]
         if at_ns <= before_ns:
             return before

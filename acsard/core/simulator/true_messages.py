@@ -1,4 +1,4 @@
-"""Makes the published messages from a `Sight`, an observation of the simulated robot."""
+"""Makes the messages that the simulator publishes from a `Sight`, an observation of its robot."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ transform connects it with `odom`, so no program can mistake the true pose for o
 
 
 def true_pose(sight: Sight, wall_ns: int) -> PoseStamped:
-    """Return the true pose of base_link with the stamp `wall_ns`, in the frame `sim`."""
+    """Return the true pose of base_link in the frame `sim`. `wall_ns` is the stamp, ns."""
     pose = sight.pose
     where = Pose(Vector3(pose.x, pose.y), from_yaw(pose.yaw))
     return PoseStamped(Header(Time.from_ns(wall_ns), FRAME), where)
@@ -21,8 +21,8 @@ def true_pose(sight: Sight, wall_ns: int) -> PoseStamped:
 def turn_rate(sight: Sight, frame: str, deviation: float, wall_ns: int) -> Imu:
     """Return the turn rate that the gyro measured, as an Imu message without other measurements.
 
-    `deviation` is the standard deviation of the gyro's noise, rad/s. `wall_ns` is the stamp, ns
-    since 1970.
+    `frame` is the frame id. `deviation` is the standard deviation of the gyro's noise, rad/s.
+    `wall_ns` is the stamp, ns since 1970.
     """
     unknown, variance = [-1.0] + [0.0] * 8, deviation * deviation
     known = [variance, 0.0, 0.0, 0.0, variance, 0.0, 0.0, 0.0, variance]

@@ -1,8 +1,8 @@
 """Simulates the robot: four motors with lag, and the motion of the base on the floor.
 
 A motor follows its set point as a first-order system. The base moves according to the true speeds
-of the wheels, the true radii and the true effective track. `[sim]` can make the radii and the track
-differ from the configured ones. Wheels are in the order of `values.WHEELS`.
+of the wheels, their true radii and the true effective track. Settings in `[sim]` can make the true
+radii and the true track differ from those in `[drive]`. Wheels are in the order `values.WHEELS`.
 
 The true effective track depends on the turn rate. Let L be the configured effective track, m the
 setting `track_multiplier`, k the setting `track_rate_dependence`, and w the turn rate in rad/s that
@@ -48,11 +48,11 @@ class Vehicle:
         self.pose = Pose()
         """The true pose of base_link relative to its start."""
         self.turned = 0.0
-        """Angle by which the robot turned left since its start, rad; each full turn adds 2 pi."""
+        """Angle by which the robot turned left since its start, rad. Each full turn adds 2 pi."""
         self.turn_slip = 0.0
-        """Fraction of each turn that is lost because wheels skid, 0 to 1."""
+        """Fraction of each turn that is lost because the wheels skid, 0 to 1."""
         self.load = 0.0
-        """Fraction of each set point that the motors do not reach, 0 to 1."""
+        """Fraction of each set point by which the motors stay below it, 0 to 1."""
 
     def advance(self, dt: float, push: float | None = None) -> None:
         """Move the robot for `dt` s according to its set points.
@@ -79,7 +79,8 @@ class Vehicle:
         gone, turned, speeds, angles = 1.0 - rest, [0.0] * 4, self.speeds, self.angles
         for i, goal in enumerate(goals):
             error = speeds[i] - goal
-            # This is the integral of an exponential approach, so the path does not depend on dt.
+            # This is the exact integral of the exponential approach, so the path does not depend on
+            # the size of dt.
             angle = turned[i] = goal * dt + error * lag * gone
             speed = goal + error * rest
             speeds[i] = speed if abs(speed) > 1e-9 else 0.0
@@ -93,7 +94,7 @@ class Vehicle:
         self.pose = arc(self.pose, (left + right) / 2, turn)
 
     def _grip(self) -> float:
-        """Return the fraction of a turn that is not lost to skidding wheels now, 0 to 1."""
+        """Return the fraction of a turn that is not lost because the wheels skid, 0 to 1."""
         kept = 1.0 - self.turn_slip
         if self._floor:
             kept *= 1.0 - self._floor * uniform(self._seed, int(self._time / GRIP_S))

@@ -1,7 +1,7 @@
 """A serial connection to the simulated board in virtual time, in which waiting takes no real time.
 
-`acsard mcu check` can use this connection in place of a serial port (`checkup.board.Wire`). With a
-wrong baud rate, the bytes of both directions arrive garbled.
+`acsard mcu check` can use this connection in place of a serial port (`checkup.board.Wire`). If the
+baud rates of host and board differ, the bytes of both directions arrive garbled.
 """
 
 from __future__ import annotations
@@ -42,9 +42,10 @@ class VirtualWire:
         self.mcu.receive(self._now_ns, garbled(data, self._baud_rate, self.mcu.baud_rate))
 
     def listen(self, until_ns: int) -> list[Piece]:
-        """Let time pass up to `until_ns`, and return the bytes that the host received in that time.
+        """Advance the virtual time to `until_ns`, and return the bytes that the host receives.
 
-        Each piece is the virtual time of its arrival, ns, and its bytes.
+        The bytes come in pieces. Each piece is a pair of the virtual time of its arrival, ns, and
+        its bytes.
         """
         pieces = []
         while (due_ns := self.mcu.next_ns()) is not None and due_ns <= until_ns:
