@@ -57,8 +57,8 @@ class Choice(Struct, frozen=True):
 
 
 IDLE = Choice()
-"""The choice if no command has arrived within the timeout of its source, not even one that was
-refused because of its stamp."""
+"""The choice if no command has arrived within the timeout of its source. A command that was refused
+because of its stamp also counts as arrived, and then the choice is not `IDLE`."""
 
 
 class _Source:
@@ -127,8 +127,8 @@ class _Source:
     def present(self, now_ns: int) -> list[Sender]:
         """Return the senders that keep their place, in the order in which they get the robot.
 
-        Armed senders come before the others. Within both groups, live senders come first, and then
-        the order is the one in which the senders began to send.
+        Armed senders come before unarmed senders. In each of these two groups, live senders come
+        first, and senders of equal rank are in the order in which they began to send.
         """
         present = [sender for sender in self.senders.values() if sender.present(now_ns)]
         if len(present) < 2:

@@ -1,10 +1,11 @@
 """Follows the bumpers that the board reports, and decides which motion they allow.
 
-A pressed bumper brings the robot to rest at once. With `safety.bumper = "stop"`, the press also
-latches a stop. With `safety.bumper = "away"`, each sender must send a zero before the robot moves
-again. Until the bumper is released, the robot then drives only straight away from the bumper, at
-`AWAY_SPEED` or less. The robot may not turn, because a corner could sweep into the obstacle. No
-motion leads away from a bumper at the left or the right, because the robot cannot move sideways.
+A press of a bumper sets the command to zero without a ramp. With `safety.bumper = "stop"`, the
+press also latches a stop. With `safety.bumper = "away"`, each sender must send a zero before the
+robot moves again. Until the bumper is released, the robot then drives only straight away from the
+bumper, at `AWAY_SPEED` or less. The robot may not turn, because a corner could sweep into the
+obstacle. No motion leads away from a bumper at the left or the right, because the robot cannot move
+sideways.
 
 If a board that has reported bumpers stops reporting them, a stop is latched, both with "stop" and
 with "away". A bumper is not a safety function, because the status line may be lost or late.

@@ -7,9 +7,9 @@
 - `gyro.py` takes the heading from a gyro, and compares the gyro with the wheels that
   `wheel_faults.py` does not ignore.
 - `learned_track.py` chooses the effective track (the distance between the wheels that makes turns
-  come out right): the configured one, or one learned from the comparison with a gyro.
+  come out right): the configured track, or a track learned from the comparison with a gyro.
 
-Each check uses the results of another one, and only this module knows the order of the checks.
+Each check uses the results of another check, and only this module knows the order of the checks.
 """
 
 from __future__ import annotations
@@ -100,9 +100,9 @@ class ConsistencyChecks:
         return found
 
     def taken_back(self, turn: float) -> float:
-        """Record that the turn of recomputed lines has changed, because a wheel proved faulty.
+        """Record that recomputing the pose without a faulty wheel has changed earlier turns.
 
-        `turn` is the sum of the changes in the lines with `on_trial`, rad. Return the angle that
+        `turn` is the sum of the changes, rad, over the lines with `on_trial`. Return the angle that
         the caller must subtract from the heading, rad: `turn` if the gyro is proven by now,
         otherwise 0.
         """

@@ -52,7 +52,7 @@ LEAST = 1e-8
 an error."""
 
 PERIOD = 0.01
-"""Period of the feedback lines that is assumed before one is measured, s."""
+"""Period of the feedback lines that is assumed until it is measured, s."""
 
 SMOOTHED = 0.05
 """Weight of the newest period in the mean period of the feedback lines. The weight is small,
@@ -133,8 +133,8 @@ def columns(
     multiplies all lengths, and the fraction of each distance that the wheels lose by slip. The
     scale and the slip share one column. A parameter with a standard deviation of 0 has no column.
 
-    If `learned` is not None, the last column is that of the error of the learned track. The numbers
-    in this column are 0 while the configured track is in use.
+    If `learned` is not None, the last column is for the error of the learned track. The numbers in
+    this column are 0 while the configured track is in use.
     """
     used = learned or CONFIGURED
     track = kinematics.track * used.share
@@ -173,7 +173,7 @@ class TwistUncertainty:
     - q is the quantization step of the wheel speeds. Each wheel has the variance q^2 / 12. a_v and
       a_w follow from the kinematics, with two wheels on each side.
     - T is the mean period of the feedback lines. A line reports the mean speed over one period.
-    - var(d) and var(dyaw) are the noise of one period, so that the integrated twists are as
+    - var(d) and var(dyaw) are the noise of one period. With them, the integrated twists are as
       uncertain as the pose.
     - The sums are over the uncertain parameters of the kinematics (c_1 to c_4: see `columns`).
 
@@ -247,8 +247,8 @@ class TwistUncertainty:
         )
 
     def with_gyro(self, variances: TwistVariances, angular: float) -> TwistVariances:
-        """Return `variances`, with that of the turn rate replaced by `angular`, rad2/s2.
+        """Return `variances`, but with `angular` as the variance of the turn rate.
 
-        `angular` is the variance of the turn rate according to a gyro.
+        `angular` is the variance of a gyro's rate, rad2/s2.
         """
         return TwistVariances(variances.linear, variances.lateral, min(max(LEAST, angular), MOST))

@@ -1,8 +1,8 @@
 """Limits the log lines about events of the same name to one per second on average.
 
-A few lines of one name may be written at once, and after that one per second. Each line reports the
-number of events since the previous line. So neither a client that floods the bus nor a serial line
-with a loose contact can flood the log.
+A few lines of one name may follow each other without a delay, and after that one line per second.
+Each line reports the number of events since the previous line. So neither a client that floods the
+bus nor a serial line with a loose contact can flood the log.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class EventThrottle:
     def __init__(self) -> None:
         self._held: dict[EventName, _Held] = {}
         self._number = 0
-        """Number of all events so far."""
+        """Number of events of all names so far."""
         self._free_ns: dict[EventName, int] = {}
         """For each event name, the monotonic time at which the next line would be on schedule, ns.
         Each written line moves this time on by one second, so a burst moves it into the future."""
@@ -76,7 +76,8 @@ class EventThrottle:
             held.number = self._number
         told = [name for name, held in self._held.items() if self._may(name, held.news, now_ns)]
         if "stop" in told or "clear" in told:
-            # The log must not end with a `clear` that came before a stop, or the other way round.
+            # The lines of a stop and of a `clear` must be in the order of these events, so that the
+            # end of the log shows whether the robot is stopped.
             told += [name for name in ("stop", "clear") if name in self._held and name not in told]
             told.sort(key=lambda name: self._held[name].number)
         return tuple([self._held.pop(name).line() for name in told])

@@ -71,8 +71,8 @@ LONGEST_PROOF_NS = 2 * NS_PER_S
 applies instead if it is shorter."""
 
 JUMP_PROOF_NS = 3 * NS_PER_S // 2
-"""Shortest time for which the delay must be constant after it has jumped, ns. The jump is more
-likely a backlog that arrives in bursts than a clock that was set."""
+"""Shortest time for which the delay must be constant after it has jumped, ns, before it is trusted.
+The cause of the jump is more likely a backlog that arrives in bursts than a clock that was set."""
 
 GAP_NS = 2 * NS_PER_S
 """A silence of a sender that is longer than this, ns, is a pause. If the timeout of the source is
@@ -367,7 +367,7 @@ class _Clock:
         return True
 
     def _accrue(self, at_ns: int, most_ns: int) -> None:
-        """Refill the budget for the time since the last call, up to `most_ns`."""
+        """Refill the budget for the time since the last call, to at most `most_ns`."""
         grown = (at_ns - self._budget_at_ns) // FORGIVE_RATE
         self._budget, self._budget_at_ns = min(self._budget + grown, most_ns), at_ns
 
@@ -420,9 +420,9 @@ class Freshness:
         return verdict
 
     def _in_order(self, command: Command, gap_ns: int) -> Verdict:
-        """Judge a command without a stamp by its number. A pause is longer than `gap_ns`.
+        """Judge a command without a stamp by its sequence number.
 
-        After a pause, the numbers of a sender may restart.
+        After a silence of more than `gap_ns` ns, the numbers of a sender may restart.
         """
         number, at_ns = command.sequence, command.arrived_ns
         if number is None:

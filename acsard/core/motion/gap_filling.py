@@ -1,12 +1,13 @@
 """Fills gaps in the feedback: estimates the motion of the wheels in a gap, and its uncertainty.
 
-`Rolling` computes the angles that the wheels rolled since the last plausible feedback line. It uses
-the first of these sources that exists: the encoder counts in the line, whole counts that are
-recovered from the speeds in the line, or these speeds times the time. Each moment and each count is
-used exactly once. In a gap that no line covers, `Rolling` assumes the speed before the gap for the
-first half of the gap, and the speed after the gap for the second half. If the daemon commanded rest
-during the first half, the speed before the gap is assumed only until that command. The motion
-during implausible lines, and in the gaps before them, is computed with the next plausible line.
+`Rolling` computes the angles that the wheels rolled since the last plausible feedback line. (An
+implausible line is a line that `sanity.py` or `Confirmation` rejects.) `Rolling` uses the first of
+these sources that exists: the encoder counts in the line, whole counts that are recovered from the
+speeds in the line, or these speeds times the time. Each moment and each count is used exactly once.
+In a gap that no line covers, `Rolling` assumes the speed before the gap for the first half of the
+gap, and the speed after the gap for the second half. If the daemon commanded rest during the first
+half, the speed before the gap is assumed only until that command. The motion during implausible
+lines, and in the gaps before them, is computed with the next plausible line.
 
 A damaged line after a gap would falsify the motion of the whole gap. `Confirmation` therefore holds
 a line with a doubtful speed until other lines confirm this speed or refute it.

@@ -225,7 +225,7 @@ class Gyro:
     def _time_of(self, sample: GyroSample) -> int:
         """Return the monotonic time of arrival of a sample, ns, minus the jitter of that time.
 
-        The jitter follows from the stamps. Without stamps, it is taken as 0.
+        The stamps show the jitter. Without stamps, the jitter counts as 0.
         """
         last, self._last = self._last, sample
         if last is None or sample.stamp_ns is None or last.stamp_ns is None:

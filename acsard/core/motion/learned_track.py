@@ -87,7 +87,7 @@ def _use(learned: Track | None, before: TrackUse) -> TrackUse:
 
 
 def beside(learned: Track, multiplier: float, use: TrackUse) -> str:
-    """Return words that state the learned and the configured track, and the one that is in use.
+    """Return words that state the learned track, the configured track, and which of them is used.
 
     The text gives both tracks as multiples of the wheel separation. `multiplier` is the multiple
     for the configured track.

@@ -32,7 +32,7 @@ class _State(Struct, frozen=True):
 
 
 class Limiter:
-    """Moves the allowed twist step by step towards a requested one, within the `[limits]`."""
+    """Moves the allowed twist step by step towards a requested twist, within the `[limits]`."""
 
     def __init__(self, limits: LimitsConfig, kinematics: Kinematics) -> None:
         self._kinematics = kinematics
@@ -113,7 +113,7 @@ class Limiter:
         return fallen
 
     def cut(self) -> Twist:
-        """Set the twist to rest at once, without a ramp, and return it."""
+        """Set the allowed twist to zero without a ramp, and return it."""
         self.state = _State(REST, 0.0, 0.0)
         return REST
 

@@ -17,8 +17,8 @@ does not. The sender stays armed until `require_neutral`, `disarm` or `unlearn` 
 
 A live sender keeps its place before other senders. Two events must not cost it this place: a stall
 of the daemon, and doubtful stamps, for example because the sender's clock was set. Otherwise a
-sender that holds the robot still would lose the robot to a sender that moves it. In these cases,
-the sender keeps its place for at most `PLACE_NS` after its last accepted command.
+sender that holds the robot still would lose the robot to a sender of speeds. In these cases, the
+sender keeps its place for at most `PLACE_NS` after its last accepted command.
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ class Sender:
         self._armed, self._zero_ns = self._proven_armed, self._proven_zero_ns
 
     def resume(self, before_ns: int, now_ns: int) -> None:
-        """Continue after the daemon stood still from `before_ns` to `now_ns`, monotonic.
+        """Continue after the daemon stood still from `before_ns` to `now_ns` (monotonic times).
 
         The bus may deliver the commands of that time only after this step. Therefore the sender
         keeps its place for one timeout more, at most until `PLACE_NS` after its last accepted

@@ -138,8 +138,8 @@ class Odometry:
     def set_pose(self, pose: Pose) -> None:
         """Set the pose of base_link in odom, with the uncertainty of an initial pose.
 
-        The angles of the wheels do not change. The motion in held and in impossible lines, which is
-        not in the pose yet, is dropped, because it happened before this call.
+        The angles of the wheels do not change. The motion in held and in implausible lines, which
+        is not in the pose yet, is dropped, because it happened before this call.
         """
         self._confirmation.forget()
         self._rolling.forget()
@@ -163,17 +163,17 @@ class Odometry:
         return {name: count for name, count in ({"gaps": self.gaps} | ms).items() if count}
 
     def skip(self, feedback: Feedback) -> None:
-        """Ignore the speeds of an impossible feedback line.
+        """Ignore the speeds of an implausible feedback line (see `sanity.py`).
 
-        The next possible line adds the motion of both lines to the pose. If the impossible line has
-        encoder counts, its motion comes from these counts.
+        The next plausible line adds the motion of both lines to the pose. If the implausible line
+        has encoder counts, its motion comes from these counts.
         """
         self._rolling.skip(feedback)
 
     def confirmed(self, feedback: Feedback) -> tuple[list[Feedback], int]:
         """Return a pair: the lines for `fold`, the oldest first, and the number of dropped lines.
 
-        `feedback` is the next possible line. It is held if it covers a long time with a speed that
+        `feedback` is the next plausible line. It is held if it covers a long time with a speed that
         no other wheel and no other line confirms yet.
         """
         rolling, believed = self._rolling, self.checks.wheels.believed

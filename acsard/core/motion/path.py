@@ -48,7 +48,7 @@ class Path:
         return dx, dy, heading
 
     def turn(self, turn: float) -> None:
-        """Add a turn on the spot by `turn` rad."""
+        """Add a turn in place by `turn` rad."""
         self._turn(turn)
         self.pose = Pose(self._x, self._y, self._yaw)
 

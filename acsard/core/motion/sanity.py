@@ -28,7 +28,7 @@ WINDOW = 1000
 100 Hz."""
 
 SHARE = 0.01
-"""If more than this share of the lines in a window is impossible, one warning is logged."""
+"""If more than this fraction of the lines in a window is impossible, one warning is logged."""
 
 SLACK = 2.0
 """Change of a speed, rad/s, that is allowed in addition to `feedback.wheel_acceleration`. Coarse
@@ -54,8 +54,8 @@ class Sanity:
         self._settings = feedback
         self._last: WheelSpeeds | None = None
         self._trusted = False
-        """Whether `_last` agreed with the possible line before it: the speeds changed so little
-        that they could also jump back within one line."""
+        """Whether `_last` agreed with the possible line before it. If it did, a next line with the
+        speeds of that earlier line would be possible too."""
         self._rejected: list[tuple[WheelSpeeds, float]] = []
         """The newest impossible lines since `_last`: pairs of the speeds and the time since
         `_last`, s. Lines with a speed over `feedback.wheel_speed` are not included."""

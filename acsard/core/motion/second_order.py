@@ -50,8 +50,8 @@ from acsard.core.motion.se2 import (
 from acsard.core.values import PoseCovariance
 
 MAX_HEADING_VARIANCE = 1.0
-"""Largest variance of the heading for which the terms are computed, rad2. With a larger one
-the series does not converge, and the terms are 0."""
+"""Largest variance of the heading for which the terms are computed, rad2. With a larger variance
+the series does not converge, and a stretch adds nothing to the terms."""
 
 NOTHING = PoseCovariance(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 

@@ -8,7 +8,7 @@ wheel lies between its command and the speed that a wheel with `feedback.respons
 by now. Without a reference, only a stuck wheel is found, because a person who pushes the robot may
 turn one wheel and not the other.
 
-`Suspect` tests a wheel that contradicts the other one of its side. `Stuck` tests every wheel,
+`Suspect` tests a wheel that contradicts the other wheel of its side. `Stuck` tests every wheel,
 because a stuck encoder agrees with the other wheel until the command changes.
 """
 
@@ -35,23 +35,23 @@ LEAVES = 0.05
 """Least change of the command, rad/s, after which a healthy wheel must report another speed."""
 
 VOTE = 1 / 3
-"""A reference (a gyro or the command) decides which of two wheels is faulty only if it is clearly
-nearer to one of them. The two distances from the reference must differ by at least this share of
-the difference between the wheels."""
+"""A reference (a gyro or the command) decides which of two wheels is faulty only if the reference
+is clearly nearer to one of them. The two distances from the reference must differ by at least this
+fraction of the difference between the wheels."""
 
 HAND_S = 0.3
 """Time for which a wheel must repeat one speed without a command before it is called stuck, s. A
 hand cannot turn a wheel as evenly as this."""
 
 DEAD, REVERSED = 0.1, 0.3
-"""Shares of the turn of the other wheel on the same side. A wheel is dead if it turns by less than
-the share `DEAD`. It is reversed if it turns in the opposite direction, and the sizes of the two
-turns differ by less than the share `REVERSED`."""
+"""Fractions of the angle that the other wheel of the side rolled. A wheel is dead if it rolled by
+at most the fraction `DEAD`. It is reversed if it rolled in the opposite direction, and if the
+magnitudes of the two angles differ by at most the fraction `REVERSED`."""
 
 STUCK = 0.3
-"""Smallest difference between the two wheels of a side at which one can be called stuck, as a share
-of the faster wheel's angle. If the difference is smaller, the wheel with the constant speed may be
-healthy while the other wheel slips."""
+"""Smallest difference between the two wheels of a side at which one of them can be called stuck, as
+a fraction of the faster wheel's angle. If the difference is smaller, the wheel with the constant
+speed may be healthy while the other wheel slips."""
 
 WheelFault = Literal["dead", "reversed", "stuck"]
 
@@ -109,7 +109,7 @@ class Suspect:
         self._begun: float | None = None
         """Magnitude of the angle that the wheel rolled in the first line of the test, rad."""
         self._known = False
-        """Whether the command could serve as a reference in any line of the test."""
+        """Whether the command could serve as a reference in at least one line of the test."""
 
     def looks(self, own: float, other: float, same: bool, dt: float, count: float) -> bool:
         """Add a feedback line of `dt` s, and return whether the wheel now shows a sign of a fault.
@@ -199,9 +199,9 @@ class Stuck:
         self._seconds = self._followed = self._other = 0.0
 
     def left_by(self, command: float) -> bool:
-        """Return whether `command`, rad/s, differs from the command when the present speed began.
+        """Return whether the command has changed since the wheel first reported its present speed.
 
-        The present speed began when the wheel first reported it.
+        `command` is the present command, rad/s.
         """
         return abs(command - self._command) >= LEAVES
 

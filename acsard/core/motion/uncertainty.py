@@ -19,10 +19,10 @@ deviation. Each step updates both parts, and their sum is published (' means tra
 - G_p has a column for each parameter: the error of the pose that it causes in this step
   (`error_model.columns`).
 
-The covariance in nav_msgs/Odometry is that of x and y in the axes of odom, and of yaw. To first
-order it equals the covariance of e in these axes, so P_total is published. Rotated by -yaw, P_total
-is the covariance of e in the axes of base_link. This rotated covariance is right even if the
-heading is so uncertain that the possible positions form an arc and not an ellipse.
+The covariance in nav_msgs/Odometry is defined for x and y in the axes of odom, and for yaw. To
+first order it equals the covariance of e in these axes, so P_total is published. Rotated by -yaw,
+P_total is the covariance of e in the axes of base_link. This rotated covariance is right even if
+the heading is so uncertain that the possible positions form an arc and not an ellipse.
 
 The noise of a turn depends on |dyaw|. On a straight drive, the encoder counts of both sides arrive
 at different times, so the heading turns back and forth by one count. The sum of |dyaw| over all
@@ -108,7 +108,7 @@ class PoseUncertainty:
         self._phase = (count**2 / 24 / 2, count**2 / 24 * 2 / track**2, 0.0)
 
     def set(self, yaw: float) -> None:
-        """Reset the covariance to that of an initial pose with the heading `yaw`, rad."""
+        """Reset the covariance to the initial one, for a pose with the heading `yaw`, rad."""
         xx, yy, _, _, _, yawyaw = self._model.settings.pose_covariance_diagonal
         self._p = PoseCovariance(xx, 0.0, 0.0, yy, 0.0, yawyaw)
         self._cos, self._sin = math.cos(yaw), math.sin(yaw)
@@ -163,7 +163,7 @@ class PoseUncertainty:
         self._publish()
 
     def doubt(self, along: float, yaw: float) -> None:
-        """Add variances to the last step: `along` for its distance, m2, and `yaw` for its turn."""
+        """Add the variances `along` of distance, m2, and `yaw` of turn, rad2, to the last step."""
         if not self._lost:
             self._p = added(self._p, along, yaw, 0.0, self._cos, self._sin)
             self._publish()

@@ -262,7 +262,7 @@ class _Side:
 
 
 class WheelFaults:
-    """Checks all wheels, and decides which to ignore and whether any slips."""
+    """Checks all wheels, and decides which wheels the pose ignores and which sides slip."""
 
     def __init__(self, kinematics: Kinematics, counts: int, feedback: FeedbackConfig) -> None:
         """Start without evidence of a fault.
