@@ -78,8 +78,8 @@ class Bumpers(BoardInput):
     def latching(self) -> bool:
         """Whether bumpers that count as pressed latch a stop.
 
-        With `safety.bumper = "away"`, only bumpers that the board does not report any more latch a
-        stop.
+        If the robot may drive away from bumpers, they latch a stop only when the board does not
+        report them any more.
         """
         return not self._away or self.state == "silent"
 

@@ -123,11 +123,12 @@ class _Proof:
     The test compares the minimum delays of successive intervals. An interval is called a half,
     because it lasts half of the nominal duration of the test. A test may take more than two halves.
 
-    - For a known clock (`again`), the test restarts with the second half if the first two differ.
-    - For a new clock whose first two halves differ, the test compares the last eight halves in
-      four pairs. The minima of the pairs must agree within the same limit (`EVEN`), or differ by
-      at most `EARLY_NS` without a trend. A trend means that the minima only fall, as while a
-      backlog arrives, or only rise, as while a queue grows.
+    - For a known clock (`again`), the test restarts with the second half if the minima of the first
+      two halves differ too much.
+    - For a new clock in this case, the test compares the last eight halves in four pairs. The
+      minima of the pairs must agree within the same limit (`EVEN`), or differ by at most `EARLY_NS`
+      without a trend. A trend means that the minima only fall, as while a backlog arrives, or only
+      rise, as while a queue grows.
     """
 
     def __init__(

@@ -93,7 +93,7 @@ class Rolling:
 
     @property
     def skipped(self) -> float:
-        """Time since the last plausible line that implausible lines without counts cover, s.
+        """Total time of the implausible lines without counts since the last plausible line, s.
 
         It includes the gaps before these lines.
         """
@@ -233,7 +233,7 @@ class Confirmation:
 
 
 def _alone(a: Motors, b: Motors, steps: Motors) -> float:
-    """Return the largest speed change of one wheel that the other of its side does not share.
+    """Return the largest speed change of one wheel that the other wheel of its side did not make.
 
     The speeds change from `b` to `a`, rad/s. `steps` are the quantization steps of the speeds,
     rad/s. A change by one known step does not count.

@@ -145,7 +145,7 @@ class Match:
         return -slope / ratio
 
     def add(self, wheels: float, gyro: float, dt: float, slips: bool) -> None:
-        """Add a feedback line, and learn from a block if this line completes one.
+        """Add a feedback line. When a block is complete, learn from the blocks so far.
 
         `wheels` and `gyro` are the turns in the last `dt` s according to wheels and gyro, rad. If
         `slips` is true in the last line of a block, nothing is learned from this block.

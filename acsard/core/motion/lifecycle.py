@@ -141,9 +141,9 @@ class Lifecycle:
     def stop(self, by: str, asked_ns: int, now: Instant) -> str:
         """Latch a stop with a new number, and return a text for the client.
 
-        This request changes nothing if the latch already names this client, and if another request
-        for a stop that arrived at the same time or later was processed before. `asked_ns` is the
-        monotonic time at which this request arrived. `by` is "" if the client is unknown.
+        The latch does not change if it already names this client, and if the daemon has already
+        processed a request for a stop with the same or a later time of arrival. `asked_ns` is the
+        monotonic time of arrival of this request. `by` is "" if the client is unknown.
         """
         latch, why = self.latches.stop, f"stopped by {by or 'request'}"
         named = latch is not None and any(cause.why == why for cause in latch.causes)

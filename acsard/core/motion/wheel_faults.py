@@ -368,7 +368,10 @@ class WheelFaults:
         return right.fault(speeds, limit) or left.fault(speeds, limit)
 
     def _notice(self, speeds: Motors, dt: float, still: bool) -> None:
-        """Set `pushed` if wheels turn after a rest without a command, once per `REPEATED_S`."""
+        """Set `pushed` if wheels that rested turn without a command.
+
+        Set it at most once per `REPEATED_S`.
+        """
         fastest = 0.0
         if still:
             fastest = max([

@@ -70,9 +70,9 @@ class Expected:
         self.commanded, self._begins, self.clear = 0.0, True, False
 
     def slow_down(self, front: float, rear: float) -> None:
-        """Reduce the expected speed to the reported speeds `front` and `rear`, rad/s.
+        """Limit the expected speed to the larger one of two reported speeds, rad/s.
 
-        The motors may have been stopped.
+        The caller must call this if the board may have stopped the motors.
         """
         most = faster(front, rear)
         self.speed, self._slow = (
