@@ -221,7 +221,7 @@ class EmergencyStop(BoardInput):
         return None if status.estop is None else (status.estop,)
 
     def words(self) -> str:
-        """Return the reason of the stop that a press causes."""
+        """Return words for a pressed emergency stop, for use as the reason of a stop."""
         return PRESSED
 
     def released(self, before: EstopState) -> str:

@@ -129,6 +129,7 @@ def columns(
 
     where r is `wheel_radius`, b is `wheel_separation`, and phi_l and phi_r are the angles that the
     wheels rolled.
+
     The parameters are the multipliers m_l, m_r and m_L, the ratio m_r / m_l, a scale that
     multiplies all lengths, and the fraction of each distance that the wheels lose by slip. The
     scale and the slip share one column. A parameter with a standard deviation of 0 has no column.

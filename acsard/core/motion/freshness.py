@@ -8,14 +8,14 @@ than that of an accepted command. The clock of a sender is in one of two states:
 
     new      The minimum is not known. Delays fall while a backlog arrives. Therefore a test of
              several commands (the proof) must first show that the delays no longer fall.
-    known    The minimum is trusted until a proof shows another one.
+    known    The minimum is trusted until a proof shows another minimum.
 
 There are two kinds of clocks. A *steady* clock is never adjusted. Our client, tools and web page
-declare that with `"steady": true`. If a command with such a stamp looks late, the command is really
-late, and it stays refused.
+declare a steady clock with `"steady": true`. If a command with such a stamp looks late, the command
+is really late, and it stays refused.
 
 A *foreign* clock may be set or slewed, which looks like a change of the delay. If the new delay
-proves constant, it is trusted, and the sender must return to neutral. A congested network can look
+proves constant, it is trusted, and the sender must send a zero again. A congested network can look
 the same. Therefore the sum of the rises of the delay that are trusted in this way is bounded by a
 budget: `FORGIVE_NS`, refilled by 1 s a minute. If the stamps of more than one command go back or
 stand still, the adjustment of the clock is visible and costs no budget, because no network can
@@ -23,10 +23,10 @@ cause that. After a pause of the sender, a rise is trusted even beyond the budge
 may have been set by any amount. A pause is longer than 2 s, and longer than the timeout of the
 source.
 
-Sequence numbers show which commands the network lost, repeated or delivered in another order. The
-daemon does not take lost commands for a pause, and a repeated command changes nothing.
+Sequence numbers show which commands the network lost, repeated or delivered in another order. Lost
+commands do not count as a pause, and a repeated command changes nothing.
 
-Arrivals are measured by the monotonic clock, because our own wall clock may be set.
+Times of arrival are measured by the monotonic clock, because our own wall clock may be set.
 """
 
 from __future__ import annotations
