@@ -1,1 +1,1 @@
-"""Odometry, choice of the command, limits, modes and safety inputs of the robot, without I/O."""
+"""Decides how the robot moves: odometry, choice of the command, limits, modes. Does no I/O."""

@@ -1,14 +1,14 @@
 """Chooses the one command that the robot follows: first the source, then the sender of that source.
 
 A sender is live while its last command is not older than the timeout of its source, and a source is
-live while one of its senders is. A sender whose stamps come into doubt is treated as live for a
-short time (`Sender.present`), but the robot stands still meanwhile.
+live while one of its senders is live. If the stamps of a live sender come into doubt, the sender
+still keeps its place for a short time (`Sender.present`), but the robot stands still meanwhile.
 
 - The robot follows the live source of the highest priority. Among sources of equal priority, the
   robot follows the one that began to send first, until that source falls silent. The same rule
   applies to the senders of one source.
-- A live source that is not armed yet (`neutral.py`) keeps its priority, and the robot stands still.
-  Otherwise a source of lower priority would drive the robot in its place.
+- A live source without an armed sender (`neutral.py`) keeps its priority, and the robot stands
+  still. Otherwise a source of lower priority would drive the robot instead.
 - A source that sends zeros holds the robot still for any length of time. The arbiter cannot tell
   whether an operator wants that or a controller has failed, so `state` and the log report it.
 
@@ -29,15 +29,15 @@ from acsard.core.motion.neutral import Sender, is_zero
 from acsard.core.values import NS_PER_S, REST, Command, SourceStatus, Twist, Wait
 
 MAX_SENDERS = 16
-"""Largest number of senders that one source remembers. Live, armed senders are never replaced,
-and neither is one that must send a zero again because its clock was just set."""
+"""Largest number of senders that one source remembers. A new sender never replaces one that may
+keep the robot (`Sender.holds`), such as a live, armed sender."""
 
 Objection = Literal["", "unknown_source", "not_finite", "too_many_senders", "unproven", "stale"]
 """The reason to refuse a command, or "" if the arbiter accepts it."""
 
 LASTING_S = (3.0, 10.0, 60.0, 600.0, 3600.0)
-"""`state` reports for how long a sender has sent only zeros, or has sent commands although it is
-not armed. `state` shows that duration rounded down to one of these values, s."""
+"""`state` reports for how long a sender has sent only zeros, or only speeds although it is not
+armed. That duration is rounded down to one of these values, s."""
 
 NOTHING, COMMAND = Wait("nothing"), Wait("command")
 
@@ -57,8 +57,8 @@ class Choice(Struct, frozen=True):
 
 
 IDLE = Choice()
-"""The choice if no command has arrived within the timeout of its source. A command that is refused
-because of its stamp counts as arrived."""
+"""The choice if no command has arrived within the timeout of its source. A command that was refused
+because of its stamp also counts as arrived, and then the choice is not `IDLE`."""
 
 
 class _Source:
@@ -79,7 +79,10 @@ class _Source:
             sender.use(self.timeout_ns, self.pause_ns)
 
     def add(self, name: str, now_ns: int) -> Sender | None:
-        """Add a sender and return it, or None if `MAX_SENDERS` senders are live and armed."""
+        """Add a sender and return it, or return None if the source already has too many senders.
+
+        It has too many if `MAX_SENDERS` senders may keep the robot (`Sender.holds`).
+        """
         if len(self.senders) >= MAX_SENDERS:
             least = min(self.senders, key=lambda other: self._account(other, now_ns))
             if self._account(least, now_ns)[0]:
@@ -95,19 +98,23 @@ class _Source:
         return holds, holds or sender.armed(now_ns), sender.noticed_ns
 
     def cancel_zeros(self, at_ns: int) -> None:
-        """Record a message that may be a speed of any sender with a shared identity."""
+        """Cancel the zeros of shared identities, because any of them may have sent a speed.
+
+        `at_ns` is the monotonic time at which the message that may be a speed arrived.
+        """
         for sender in self.senders.values():
             sender.cancel_zero(at_ns)
 
     def doubt(self, command: Command, was_set: bool) -> None:
-        """React to doubt about the clock that stamped `command`, if its sender uses this source.
+        """Undo the effect of zeros on this source whose stamps come from a doubtful clock.
 
-        Behind a bridge, several programs with clocks of their own share one identity. Therefore,
-        if the command came to another source, nothing happens unless the same clock stamped the
-        last command to this source.
+        The doubtful clock is that of `command`, which may have come to another source. If the clock
+        was set (`was_set`), the sender must send a zero again. Otherwise the clock is unproven, and
+        the zeros that it has stamped so far do not count. Later zeros arm the sender as usual.
 
-        If the clock was set, the sender must send a zero again. Otherwise the clock is unproven:
-        undo the effect of the zeros that it has stamped so far. Later zeros arm as usual.
+        Behind a bridge, several programs with clocks of their own share one identity. Therefore a
+        command to another source has an effect here only if the same clock stamped the last command
+        of this sender to this source.
         """
         sender = self.senders.get(command.sender)
         if sender is None or (command.source != self.name and command.clock != sender.clock):
@@ -120,7 +127,8 @@ class _Source:
     def present(self, now_ns: int) -> list[Sender]:
         """Return the senders that keep their place, in the order in which they get the robot.
 
-        Armed senders come first, then those that are live, then those that came first.
+        Armed senders come before unarmed senders. In each of these two groups, live senders come
+        first, and senders of equal rank are in the order in which they began to send.
         """
         present = [sender for sender in self.senders.values() if sender.present(now_ns)]
         if len(present) < 2:
@@ -131,7 +139,7 @@ class _Source:
         )
 
     def latest_ns(self) -> int | None:
-        """Return the monotonic time, ns, of the last accepted command, or None without one."""
+        """Return the monotonic time of the last accepted command, ns, or None if there is none."""
         times = [s.arrived_ns for s in self.senders.values() if s.arrived_ns is not None]
         return max(times, default=None)
 
@@ -140,12 +148,18 @@ class _Source:
             sender.require_neutral()
 
     def neutral(self, sender: Sender, lasts: float = 0.0) -> Wait:
-        """Return the `Wait` of a sender that drives only after a zero speed: `lasts` s so far."""
+        """Return the `Wait` of a sender that must send a zero before it may drive.
+
+        `lasts` is the time for which the sender has already sent speeds instead, s.
+        """
         pause = self.pause_ns / NS_PER_S
         return Wait("neutral", self.name, pause, lasts=lasts, ros=sender.ros, shared=sender.shared)
 
     def doubted(self, now_ns: int) -> Wait | None:
-        """Return why the robot does not follow a recent command with a doubtful stamp, or None."""
+        """Return why the robot does not follow a recent command because of its stamp.
+
+        Return None if there is no such command.
+        """
         doubtful = [sender for sender in self.senders.values() if sender.doubtful(now_ns)]
         if not doubtful:
             return None
@@ -162,7 +176,8 @@ class _Source:
     def obstacle(self, sender: Sender, now_ns: int, lasting: bool = True) -> Wait:
         """Return why this sender, which keeps its place, cannot drive the robot.
 
-        If `lasting`, a sender that must send a zero is told for how long it has sent speeds.
+        If the reason is that the sender must send a zero, and `lasting` is true, the result
+        contains the time for which it has sent speeds instead.
         """
         if not sender.live(now_ns):
             return self.why(sender, now_ns)
@@ -198,7 +213,7 @@ class Arbiter:
 
         Only a zero that arrives at the monotonic time `since_ns` or later arms a sender. An older
         zero, for example from before a stop was cleared, does not show that the sender wants the
-        robot to rest now. Of several calls in one step, the latest time counts.
+        robot to rest now. After several calls, the latest `since_ns` of all calls counts.
         """
         self._since_ns = max(self._since_ns, since_ns)
         for source in self._ranking:
@@ -206,10 +221,10 @@ class Arbiter:
         self._holder = self._followed = None
 
     def begin(self, now_ns: int) -> None:
-        """Begin a step at this monotonic time, before its commands.
+        """Begin a step at the monotonic time `now_ns`. Call this before `accept` in each step.
 
-        If the daemon stood still since the last step, the bus may not have delivered yet what
-        arrived meanwhile. Each sender keeps its place for a short time more, and
+        If the daemon stood still since the last step, the bus may not have delivered the commands
+        of that time yet. Therefore each sender keeps its place for a short time more, and a running
         `commands.neutral_pause` takes longer (see `Sender.resume`).
         """
         before_ns, self._begun_ns = self._begun_ns, now_ns
@@ -239,7 +254,7 @@ class Arbiter:
         if sender is None:
             return "too_many_senders"
         if verdict in ("set", "first"):
-            # The doubt about a clock concerns the zeros that it stamped on every source.
+            # The doubt about a clock concerns its stamps on all sources.
             for other in self._ranking:
                 other.doubt(command, verdict == "set")
         sender.take(command, self._since_ns, verdict, self._watched_ns)
@@ -248,10 +263,10 @@ class Arbiter:
     def notice(self, source: str, sender: str, arrived_ns: int, shared: bool = False) -> None:
         """Record a lost or unusable message, which may have commanded motion.
 
-        If its sender is unknown ("") or has a `shared` identity, the message cancels the zeros of
-        all shared identities of `source` for which `commands.neutral_pause` was not over when it
-        arrived. Of messages that were lost, the time is unknown: `sender` is "" and `arrived_ns` is
-        0, and each zero is cancelled that has not armed its sender yet.
+        If the sender is unknown ("") or has a `shared` identity, the message cancels zeros of all
+        shared identities of `source`: those zeros whose `commands.neutral_pause` was not over when
+        the message arrived. For a lost message, whose time is unknown, `sender` is "" and
+        `arrived_ns` is 0. It cancels every zero that has not armed its sender yet.
         """
         known = self._sources.get(source)
         if known is None:
@@ -280,8 +295,8 @@ class Arbiter:
                 and source.priority == first[0].priority
                 and kept.holds(now_ns)
             ):
-                # A sender that came before `kept` may have become armed just now. The robot still
-                # follows `kept`.
+                # A sender that began to send before `kept` may have become armed just now. The
+                # robot still follows `kept`.
                 first = source, kept
                 break
         if first is None:
@@ -310,10 +325,11 @@ class Arbiter:
 
     @property
     def forgiven_ns(self) -> int:
-        """Sum of the trusted rises, ns, of the delay of commands that no stamp explains.
+        """Sum of all rises of the commands' delay that were trusted without an explanation, ns.
 
-        A rise is trusted within the budget, or after a pause of the sender. A rise that the stamps
-        show to be an adjustment of the sender's clock does not count.
+        A rise is trusted within a budget, or after a pause of the sender (`freshness.py`). If the
+        stamps show that the sender's clock was adjusted, this explains the rise, so it does not
+        count here.
         """
         return self._freshness.forgiven_ns
 
@@ -339,7 +355,7 @@ class Arbiter:
 
 
 def _lasts(ns: int) -> float:
-    """Return a duration of `ns` rounded down to a value of `LASTING_S`, s; 0.0 if it is shorter."""
+    """Return the duration `ns` in s, rounded down to a value of `LASTING_S`, or to 0.0."""
     if ns < LASTING_S[0] * NS_PER_S:
         return 0.0  # Nearly every step ends here.
     return max(seconds for seconds in LASTING_S if ns >= seconds * NS_PER_S)

@@ -1,6 +1,6 @@
 """Creates the sentences and events about modes, commands and the senders that drive the robot.
 
-The sentences go into `state` and `diagnostics`, and the events into the log. `event_throttle.py`
+The sentences go into `state` and `diagnostics`, and the events go into the log. `event_throttle.py`
 limits the number of lines in the log.
 """
 
@@ -122,7 +122,10 @@ class CommandEvents:
         return events + self._kept_waiting(mode, choice)
 
     def _kept_waiting(self, mode: Mode, choice: Choice) -> list[Event]:
-        """Return an event, once, if a source's speeds have had no effect for a while."""
+        """Return a list with one event if a source's speeds have had no effect for a while.
+
+        The event is not repeated while this goes on.
+        """
         wait, kept = choice.wait, ""
         if mode not in (Mode.READY, Mode.DRIVING) or wait.what not in ("neutral", "zeros"):
             self._kept = ""

@@ -5,8 +5,8 @@ because the current of starting motors makes the voltage drop for some tenths of
 battery latches a stop, which `lifecycle.py` keeps. The call `clear` does not release the stop until
 the mean has risen above the threshold by `battery.hysteresis`.
 
-If a board no longer reports its battery, the robot does not stop: a robot that stands still in the
-way is the greater danger, and the voltage falls slowly. The level is then "unknown".
+If the board stops reporting its battery, the level becomes "unknown" and the robot does not stop: a
+robot that blocks the way is the greater danger, and the voltage falls slowly.
 """
 
 from __future__ import annotations
@@ -24,24 +24,25 @@ A battery takes minutes from one level to the next, so the robot reacts soon eno
 
 SETTLE_S = 3.0
 """Time that the reports of the battery must cover before their mean decides the level, s. The time
-starts again after each silence. The time between two reports counts as at most `LONGEST_NS`. A
-motor start within `SETTLE_S` lowers the mean by up to a tenth of the voltage drop."""
+starts from 0 after each silence of the board, and each interval between two reports counts as at
+most `LONGEST_NS`. A motor start in this time lowers the mean by up to a tenth of the voltage
+drop."""
 
 SILENT_S = 5.0
-"""Age at which a value of the battery is dropped, s. At one report a second, four reports in a row
-may be lost."""
+"""Age at which a value of the battery is dropped, s. At one report a second, four consecutive
+reports may be lost without an effect."""
 
 LONGEST_NS = 300_000_000
 """Largest weight of a report in the mean, ns: the duration of a motor start. The weight is the time
 since the previous report. Without this bound, a report during a motor start would weigh too much
-after a gap. Because of the bound, a mean of one report a second follows the voltage about a third
-as fast as it otherwise would."""
+after a gap. The bound has a price: with one report a second, the mean follows the voltage at only a
+third of the speed."""
 
 EMPTY = "battery below "
-"""Beginning of the reason for the stop at the level "stop"."""
+"""The first words of the reason for a stop by an empty battery (`Battery.why`)."""
 
 ORDER: tuple[BatteryLevel, ...] = get_args(BatteryLevel)[:4]
-"""The battery levels without "unknown", from the best to the worst."""
+"""The battery levels from the best to the worst, except "unknown"."""
 
 MISSING = (
     "the board has not reported its battery, but the configuration has thresholds in [battery]"
@@ -80,7 +81,10 @@ class Battery:
     """The values of the battery that the board reports, and the level that follows from them."""
 
     def __init__(self, config: BatteryConfig, stopped: bool = False) -> None:
-        """`stopped` says whether an empty battery stopped the robot before this daemon started."""
+        """Start without a report.
+
+        `stopped` says whether an empty battery stopped the robot before this daemon started.
+        """
         self._config = config
         self._bounds = config.bounds
         self.status: BatteryStatus | None = None
@@ -90,17 +94,19 @@ class Battery:
         self._values: dict[str, tuple[float, int]] = {}
         """The last values by name, each with its monotonic time of arrival, ns."""
         self._awaited = True
-        """Whether the board has not reported `battery.measure` since the port was opened."""
+        """True from the opening of the port until the board reports the value that
+        `battery.measure` names."""
         self._known: BatteryLevel = "stop" if stopped and "stop" in self._bounds else "ok"
-        """The last level that was not "unknown": silence of the board does not end a stop."""
+        """The last level other than "unknown". It stays if the board falls silent, because silence
+        must not end a stop."""
         self._told: BatteryLevel | None = None
-        """The level in the last event, None before the first one."""
+        """The level in the last event, None before the first event."""
         self._mean: float | None = None
         self._since_ns = self._mean_ns = 0
-        """Monotonic times of the first report since the last silence, and of the last report in the
-        mean, ns."""
+        """Monotonic times, ns. `_since_ns` is that of the first report since the last silence, and
+        `_mean_ns` is that of the newest report in `_mean`."""
         self._stood_ns = 0
-        """Sum of the weights of the reports in the mean since the last silence, ns."""
+        """Sum of the weights of all reports in `_mean`, ns (see `LONGEST_NS`)."""
 
     @property
     def held(self) -> bool:
@@ -121,11 +127,15 @@ class Battery:
         return f"charge the battery to {_with_unit(config, config.stop_below + config.hysteresis)}"
 
     def reopen(self) -> None:
-        """Record that the port was opened: another board may answer now."""
+        """Record that the port was opened, so that another board may answer from now on."""
         self._awaited = True
 
     def forget(self) -> None:
-        """Forget the level, unless the board has reported the measure since the port was opened."""
+        """Forget the level, unless it comes from the board that answers now.
+
+        It does if the board has reported the value that `battery.measure` names since the port was
+        opened.
+        """
         if self._awaited:
             self._known, self._told, self._mean = "ok", None, None
             self._values.pop(self._config.measure, None)
@@ -135,7 +145,7 @@ class Battery:
     def look(self, reports: Iterable[tuple[int, BoardStatus]], now_ns: int) -> list[Event]:
         """Process the status lines since the last step, and return an event if the level changed.
 
-        Each item of `reports` is the monotonic time of arrival, ns, and the status line.
+        Each item of `reports` is a pair: the monotonic time of arrival, ns, and the status line.
         """
         self.stopped_now = False
         news = False
@@ -172,7 +182,7 @@ class Battery:
             self._mean, self._since_ns, self._mean_ns = value, at_ns, at_ns
             self._stood_ns = 0
         elif at_ns > self._mean_ns:
-            # During the first `TIME_CONSTANT_S`, the result is the time-weighted mean of all
+            # Until the weights add up to `TIME_CONSTANT_S`, this is the weighted mean of all
             # reports. After that, it is an exponential mean.
             stood_ns = min(at_ns - self._mean_ns, LONGEST_NS)
             self._stood_ns += stood_ns
@@ -181,7 +191,10 @@ class Battery:
             self._mean_ns = at_ns
 
     def _level(self, now_ns: int) -> BatteryLevel | None:
-        """Update the level from the mean and return it; None until reports cover `SETTLE_S`."""
+        """Update the level from the mean, and return the level; None until it can be decided.
+
+        It can be decided when the reports cover `SETTLE_S`.
+        """
         measure, values = self._config.measure, self._values
         if measure not in values:
             self._mean = None

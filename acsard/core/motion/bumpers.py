@@ -1,13 +1,14 @@
 """Follows the bumpers that the board reports, and decides which motion they allow.
 
-A pressed bumper brings the robot to rest at once. With `safety.bumper = "stop"`, the press also
-latches a stop. With `safety.bumper = "away"`, each sender must send a zero before the robot moves
-again. Until the bumper is released, the robot then drives only straight away from the bumper, at
-`AWAY_SPEED` or less. The robot may not turn, because a corner could sweep into the obstacle. No
-motion leads away from a bumper at the left or the right, because the robot cannot move sideways.
+A press of a bumper sets the command to zero without a ramp. With `safety.bumper = "stop"`, the
+press also latches a stop. With `safety.bumper = "away"`, each sender must send a zero before the
+robot moves again. Until the bumper is released, the robot then drives only straight away from the
+bumper, at `AWAY_SPEED` or less. The robot may not turn, because a corner could sweep into the
+obstacle. No motion leads away from a bumper at the left or the right, because the robot cannot move
+sideways.
 
-If a board has reported bumpers and no longer does, a stop is latched, whether `safety.bumper` is
-"stop" or "away". A bumper is not a safety function, because the status line may be lost or late.
+If a board that has reported bumpers stops reporting them, a stop is latched, both with "stop" and
+with "away". A bumper is not a safety function, because the status line may be lost or late.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ AWAY_SPEED = 0.1
 """Highest speed away from a pressed bumper, m/s."""
 
 DIRECTIONS: dict[Place, int] = {"front": -1, "rear": 1, "left": 0, "right": 0}
-"""Sign of the linear speeds that lead away from a bumper at each place; 0 if no motion does."""
+"""For a bumper at each place, the sign of the linear speeds that lead away from it. It is 0 if no
+straight motion leads away."""
 
 ALLOWED = {-1: "backwards", 1: "forwards"}
 
@@ -42,7 +44,7 @@ def missing(safety: SafetyConfig) -> str:
 
 
 def pressed_words(places: Sequence[Place], pressed: Sequence[bool]) -> str:
-    """Return words that list the pressed bumpers, by their numbers if `places` is empty."""
+    """Return words that list the pressed bumpers, by place, or by number if `places` is empty."""
     numbers = [i for i, on in enumerate(pressed) if on]
     if not places:
         joined = " and ".join(str(i + 1) for i in numbers)
@@ -76,17 +78,18 @@ class Bumpers(BoardInput):
     def latching(self) -> bool:
         """Whether bumpers that count as pressed latch a stop.
 
-        If the robot may drive away from bumpers, only the silence of the board does.
+        If the robot may drive away from bumpers, they latch a stop only when the board does not
+        report them any more.
         """
         return not self._away or self.state == "silent"
 
     @property
     def held(self) -> str:
-        """Why the call `clear` must not release a stop now, in words; "" if it may."""
+        """Why the bumpers do not allow `clear` to release a stop now, in words; "" if they do."""
         return self.why if self.latching else ""
 
     def away(self, twist: Twist) -> Twist | None:
-        """Return the part of a twist that the pressed bumpers allow, None if they allow none of it.
+        """Return the part of `twist` that the pressed bumpers allow; None if they allow no part.
 
         The pressed bumpers allow rest, and straight motion away from all of them at `AWAY_SPEED` or
         less.
@@ -111,8 +114,8 @@ class Bumpers(BoardInput):
 
         Return None if the line reports no bumpers or an unexpected number of bumpers, because a
         pressed bumper may be missing from the line. If `safety.bumpers` has places, the expected
-        number is that of the places. Otherwise it is the number in the previous report, but a line
-        that reports a press is accepted with any number of bumpers.
+        number is the number of places. Otherwise, it is the number in the previous report, but a
+        line that reports a press is accepted with any number of bumpers.
         """
         bumpers = status.bumpers
         if bumpers is None:

@@ -7,9 +7,9 @@
 - `gyro.py` takes the heading from a gyro, and compares the gyro with the wheels that
   `wheel_faults.py` does not ignore.
 - `learned_track.py` chooses the effective track (the distance between the wheels that makes turns
-  come out right): the configured one, or one learned from the comparison with a gyro.
+  come out right): the configured track, or a track learned from the comparison with a gyro.
 
-Each check uses the results of another one, and only this module knows the order of the checks.
+Each check uses the results of another check, and only this module knows the order of the checks.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ class ConsistencyChecks:
         encoder_counts: int,
         feedback: FeedbackConfig,
     ) -> None:
-        """Create the checks.
+        """Start with no faulty wheel, and with an unproven gyro if the robot has one.
 
-        `encoder_counts` is the number per revolution of a wheel, 0 if it is unknown.
+        `encoder_counts` is the number of counts per revolution of a wheel, 0 if it is unknown.
         """
         self._kinematics = kinematics
         self.wheels = WheelFaults(kinematics, encoder_counts, feedback)
@@ -49,11 +49,11 @@ class ConsistencyChecks:
         multiplier = kinematics.multipliers[2]
         self._track = LearnedTrack(multiplier) if odometry.learned_track else None
         self._by_wheels = 0.0
-        """Turn of the robot that the wheels show for the last feedback line, rad."""
+        """Turn of the robot in the last feedback line according to the wheels, rad."""
         self.turn: Turn | None = None
-        """Turn of the robot that the gyro measured for the last feedback line.
+        """Turn of the robot in the last feedback line according to the gyro.
 
-        None if the wheels provide the turn of this line.
+        None if the odometry must use the turn according to the wheels.
         """
         self.on_trial = False
         """Whether the wheels provided the turn of the last line because the gyro is not proven."""
@@ -74,15 +74,15 @@ class ConsistencyChecks:
             self.gyro.hear(samples)
 
     def forgive(self) -> None:
-        """Drop the correction that the gyro owes to the heading, because a new pose was set."""
+        """Drop the pending correction of the heading by the gyro, because a new pose was set."""
         if self.gyro is not None:
             self.gyro.forgive()
 
     def look(self, line: Feedback, rolled: Rolled) -> bool:
-        """Check a feedback line. `rolled` contains the angles of the wheels since the line before.
+        """Check a feedback line, and return whether it has proved a wheel faulty.
 
-        Return whether this line has proved a wheel faulty. The caller must then recompute the pose
-        from the earlier lines without this wheel.
+        If it has, the caller must recompute the pose from the earlier lines without this wheel.
+        `rolled` contains the angles that the wheels rolled since the line before.
         """
         wheels, gyro, turn, by_gyro = self.wheels, self.gyro, None, None
         if gyro is not None:
@@ -100,17 +100,19 @@ class ConsistencyChecks:
         return found
 
     def taken_back(self, turn: float) -> float:
-        """Tell the gyro that recomputing the pose has changed the heading by `turn` rad.
+        """Record that recomputing the pose without a faulty wheel has changed earlier turns.
 
-        Only lines with `on_trial` are included. Return the angle that the caller must subtract from
-        the heading, rad: `turn` if the gyro is proven by now, otherwise 0.
+        `turn` is the sum of the changes, rad, over the lines with `on_trial`. Return the angle that
+        the caller must subtract from the heading, rad: `turn` if the gyro is proven by now,
+        otherwise 0.
         """
         return 0.0 if self.gyro is None else self.gyro.taken_back(turn)
 
     def learn(self, turned: float) -> Track | None:
-        """Learn from a feedback line that turned the pose by `turned` rad; collect its events.
+        """Learn from the last feedback line, which turned the pose by `turned` rad.
 
-        Return the effective track for the next lines, None if no track is learned from a gyro.
+        Set `events`, and return the effective track for the next lines. Return None without a gyro,
+        or if `[odometry] learned_track` is false.
         """
         gyro, track, self.events = self.gyro, self._track, self.wheels.events
         if gyro is None:

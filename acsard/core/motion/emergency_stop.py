@@ -1,12 +1,13 @@
 """Follows the safety inputs that the board reports, and decides when one of them counts as pressed.
 
 `BoardInput` is the common base class of `EmergencyStop` and of the bumpers (`bumpers.py`). A board
-that has reported an input once must continue to report it. If it does not report it for `SILENT_S`,
-the input counts as pressed: a cable may be cut, or the emergency stop may have cut the board's own
-supply. `lifecycle.py` keeps the latch of the stop, which only the call `clear` releases.
+that has reported an input once must continue to report this input. After `SILENT_S` without a
+report, the input counts as pressed: a cable may be cut, or the emergency stop may have cut the
+board's own supply. `lifecycle.py` keeps the latch of the stop. Only the call `clear` releases it.
 
-When the port is opened again, another board may answer, which need not have the input. The state of
-the input then lasts until the board reports it, or until `session.py` finds that it does not.
+When the port is opened again, another board may answer, which need not have the input. The input
+then keeps its state until the board reports it, or until `session.py` finds that the board does not
+report it.
 
 This software is not the safety function. The hardware emergency stop cuts the power of the motors
 by itself. The daemon only learns of that, commands zeros, and keeps the robot stopped after the
@@ -43,14 +44,14 @@ SILENT_S = 0.5
 """Time without a report after which an input counts as pressed, s: five status lines at 10 Hz."""
 
 LATE_NS = 150_000_000
-"""If more time than this, ns, passes between two steps of the control loop, this computer was late.
-The longest control period that can be configured is 100 ms."""
+"""Longest time between two steps of the control loop, ns, for which this computer does not count as
+late. The longest control period that can be configured is 100 ms."""
 
 EXCUSE_NS = 100_000_000
-"""If this computer was late, the board counts as silent only after this further time, ns. In this
-time the daemon reads the lines and commands that arrived while the computer was late. The daemon
-grants the extra time only once between two reports, so a computer that is always late does not
-delay the stop forever."""
+"""Extra time after this computer was late, ns, before the board counts as silent. In this time, the
+daemon reads the lines and commands that arrived while the computer was late. The daemon grants the
+extra time only once between two reports, so a computer that is always late does not delay the stop
+forever."""
 
 PRESSED = "emergency stop pressed at the robot"
 SILENT = (
@@ -73,9 +74,9 @@ class BoardInput(ABC):
 
     table = TABLE
     silent: str
-    """The message for a robot that is stopped because the board does not report the inputs."""
+    """The reason of a stop that is latched because the board does not report the inputs."""
     events: tuple[EventName, EventName]
-    """The names of the events of a press and of a release."""
+    """The name of the event of a press, and the name of the event of a release."""
 
     def __init__(self, use: EstopUse) -> None:
         self.use = use
@@ -84,7 +85,7 @@ class BoardInput(ABC):
         self.pressed: tuple[bool, ...] | None = None
         """Whether each input counts as pressed, None if the board has never reported them."""
         self._awaited = True
-        """Whether the board has not reported the inputs since the port was opened."""
+        """True from the opening of the port until the board reports the inputs."""
         self.pressed_now = ""
         """Why an input began to count as pressed in the last `look`, in words; "" if none did."""
         self._reported_ns = self._looked_ns = 0
@@ -99,27 +100,30 @@ class BoardInput(ABC):
 
     @property
     def mend(self) -> str:
-        """What the operator must do before the call `clear` while an input counts as pressed."""
+        """Advice to the operator about an input that counts as pressed, in words."""
         return CHECK if self.state == "silent" else RELEASE
 
     @property
     def missing(self) -> bool:
-        """Whether the robot needs the inputs, and `_awaited` is true."""
+        """Whether the robot needs the inputs, but the board has not reported them.
+
+        Only reports since the port was last opened count.
+        """
         return self.use == "required" and self._awaited
 
     def reopen(self) -> None:
-        """Record that the port was opened: another board may answer now."""
+        """Record that the port was opened, so that another board may answer from now on."""
         self._awaited = True
 
     def forget(self) -> None:
-        """Forget the inputs, unless the board has reported them since the port was opened."""
+        """Forget the state, unless the board has reported the inputs since the port was opened."""
         if self._awaited:
             self.state, self.pressed = "", None
 
     def look(self, reports: Sequence[tuple[int, BoardStatus]], now_ns: int) -> list[Event]:
         """Process the status lines since the last step, and return the events of the changes.
 
-        Each item of `reports` is the monotonic time of arrival, ns, and the status line.
+        Each item of `reports` is a pair: the monotonic time of arrival, ns, and the status line.
         """
         self.pressed_now = ""
         if self.use == "off":
@@ -178,19 +182,23 @@ class EmergencyStop(BoardInput):
     def __init__(self, use: EstopUse, unpowered: bool = False) -> None:
         super().__init__(use)
         self.driver_fault = False
-        """Whether a line of the last `look` reports a fault of a motor driver that counts."""
-        self._unpowered = unpowered
-        """Whether the emergency stop was pressed since the robot was last released.
+        """Whether the last `look` had a report of a motor-driver fault that counts.
 
-        The emergency stop cuts the power of the drivers, and a driver without power reports a
-        fault. The power may come back later than the release. Therefore no fault of a driver counts
-        until the stop is released with `clear`, which is refused while a driver reports a fault.
+        A fault does not count while the drivers may have no power (`_unpowered`).
+        """
+        self._unpowered = unpowered
+        """Whether the emergency stop was pressed since the robot last had no latched stop.
+
+        The emergency stop cuts the power of the motor drivers, and a driver without power reports a
+        fault. The power may come back some time after the button is released. Therefore no driver
+        fault counts until `clear` has released the stop, which it does not while a driver reports
+        a fault.
         """
 
     def look(self, reports: Sequence[tuple[int, BoardStatus]], now_ns: int) -> list[Event]:
         """Process the status lines since the last step, and return the events of the changes.
 
-        Each item of `reports` is the monotonic time of arrival, ns, and the status line.
+        Each item of `reports` is a pair: the monotonic time of arrival, ns, and the status line.
         """
         self.driver_fault, pressed = False, bool(self.why)
         self._unpowered |= self.state == "pressed"
@@ -205,7 +213,7 @@ class EmergencyStop(BoardInput):
         return events
 
     def powered(self) -> None:
-        """Record that no stop is latched any more. From now on, each fault of a driver counts."""
+        """Record that no stop is latched any more, so that driver faults count from now on."""
         self._unpowered = False
 
     def read(self, status: BoardStatus) -> tuple[bool, ...] | None:
@@ -213,7 +221,7 @@ class EmergencyStop(BoardInput):
         return None if status.estop is None else (status.estop,)
 
     def words(self) -> str:
-        """Return the reason of the stop that a press causes."""
+        """Return words for a pressed emergency stop, for use as the reason of a stop."""
         return PRESSED
 
     def released(self, before: EstopState) -> str:

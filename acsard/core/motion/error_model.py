@@ -10,10 +10,11 @@ d = (dl + dr) / 2 and the turn dyaw = (dr - dl) / L. The errors of d and dyaw th
     var(dyaw) = k (|dl| + |dr|) / L^2
     cov(d, dyaw) = k (|dr| - |dl|) / (2 L)
 
-The settings can describe more errors than these. If the sides were the only cause of errors,
-`distance_variance_per_metre` D would be k / 2, and `yaw_variance_per_metre` Y would be 2 k / L^2.
-The model uses k = min(2 D, Y L^2 / 2) for the sides. The remaining part of D or Y is an error of
-the robot as a whole. In addition, skidding gives each turn the variance `yaw_variance_per_radian`.
+The settings can describe more errors than those of the two sides. If the sides were the only cause
+of errors, `distance_variance_per_metre` D would be k / 2, and `yaw_variance_per_metre` Y would be
+2 k / L^2. The model uses k = min(2 D, Y L^2 / 2) for the sides. The remaining part of D or Y is an
+error of the robot as a whole. In addition, skidding gives each turn the variance
+`yaw_variance_per_radian` for each radian.
 
 The errors of parameters, such as a wheel radius, do not average out, so they are not noise
 (Borenstein & Feng, Measurement and Correction of Systematic Odometry Errors in Mobile Robots,
@@ -30,10 +31,11 @@ from acsard.core.motion.learned_track import CONFIGURED, Track
 from acsard.core.values import Twist, TwistVariances
 
 Column = tuple[float, float, float, float]
-"""The error of an odometry step if one parameter, such as a wheel radius, is off by one sigma.
+"""The error of a step if one parameter, such as a wheel radius, is off by one standard deviation.
 
 The first two numbers are the error of the distance per m of distance and per rad of turn (m/m,
-m/rad). The last two are the error of the turn per m and per rad (rad/m, rad/rad).
+m/rad). The last two numbers are the error of the turn per m of distance and per rad of turn (rad/m,
+rad/rad).
 """
 
 SLIPPING = 100.0
@@ -46,21 +48,22 @@ MOST = 1e9
 """Largest variance of a twist, m2/s2 and rad2/s2. It means "unknown"."""
 
 LEAST = 1e-8
-"""Smallest variance of a twist, m2/s2 and rad2/s2. Filters treat a smaller one as an error."""
+"""Smallest variance of a twist, m2/s2 and rad2/s2. Filters treat a smaller variance as
+an error."""
 
 PERIOD = 0.01
-"""Period of the feedback lines that is assumed before one is measured, s."""
+"""Period of the feedback lines that is assumed until it is measured, s."""
 
 SMOOTHED = 0.05
-"""Weight of the newest period in the mean period of the feedback lines. It is small because periods
-vary: several lines may be read at the same time."""
+"""Weight of the newest period in the mean period of the feedback lines. The weight is small,
+because periods vary: several lines may be read at the same time."""
 
 
 class Noise:
     """Computes the noise of a step: the variances of its distance and its turn."""
 
     def __init__(self, odometry: OdometryConfig, track: float) -> None:
-        """Start with these settings and this effective track, m."""
+        """Use the variances in `odometry`. `track` is the effective track, m."""
         wheels = min(
             2 * odometry.distance_variance_per_metre,
             odometry.yaw_variance_per_metre * track * track / 2,
@@ -74,11 +77,11 @@ class Noise:
         self._to_both = wheels / (2 * track)
 
     def of(self, distance: float, turn: float, turned: float) -> tuple[float, float, float]:
-        """Return var(distance), var(turn) and their covariance for a step, in m2, rad2 and m rad.
+        """Return var(d) in m2, var(dyaw) in rad2 and cov(d, dyaw) in m rad for a step.
 
         Args:
-            distance: the distance of the step, m.
-            turn: the turn of the step, rad.
+            distance: the distance d of the step, m.
+            turn: the turn dyaw of the step, rad.
             turned: the part of |turn| that is not encoder noise, rad. The wheels skid only in this
                 part.
         """
@@ -108,7 +111,7 @@ class ErrorModel:
         self.noise = Noise(odometry, self.track)
 
     def turn_by(self, learned: Track | None) -> None:
-        """Use this effective track from now on; if it is None, use the configured one."""
+        """Use the effective track `learned` from now on, or the configured one if it is None."""
         self.track = self._kinematics.track * (learned or CONFIGURED).share
         """Effective track in use, m."""
         self.columns = columns(self._declared, self._kinematics, learned)
@@ -126,12 +129,13 @@ def columns(
 
     where r is `wheel_radius`, b is `wheel_separation`, and phi_l and phi_r are the angles that the
     wheels rolled.
+
     The parameters are the multipliers m_l, m_r and m_L, the ratio m_r / m_l, a scale that
     multiplies all lengths, and the fraction of each distance that the wheels lose by slip. The
     scale and the slip share one column. A parameter with a standard deviation of 0 has no column.
 
-    If `learned` is given, the last column is the error of the learned track. It is zero while the
-    configured track is in use.
+    If `learned` is not None, the last column is for the error of the learned track. The numbers in
+    this column are 0 while the configured track is in use.
     """
     used = learned or CONFIGURED
     track = kinematics.track * used.share
@@ -147,10 +151,10 @@ def columns(
         share = 0.0 if used.deviation else odometry.wheel_separation_multiplier_std / separation
         rows.append((0.0, 0.0, 0.0, -share))
     if odometry.wheel_radius_ratio_std:
-        # One side is larger by half of the ratio's error, and the other one is smaller by as much.
+        # One radius is larger by half of the ratio's error, and the other is smaller by that half.
         share = odometry.wheel_radius_ratio_std
         rows.append((0.0, share * track / 4, share / track, 0.0))
-    # The scale multiplies radii and track alike, so it does not change turns. Slip that lasts has
+    # The scale multiplies radii and track alike, so it does not change turns. Permanent slip has
     # the same effect on the distance.
     if scale := math.hypot(odometry.distance_scale_std, odometry.wheel_slip_std):
         rows.append((scale, 0.0, 0.0, 0.0))
@@ -170,7 +174,7 @@ class TwistUncertainty:
     - q is the quantization step of the wheel speeds. Each wheel has the variance q^2 / 12. a_v and
       a_w follow from the kinematics, with two wheels on each side.
     - T is the mean period of the feedback lines. A line reports the mean speed over one period.
-    - var(d) and var(dyaw) are the noise of one period, so that the integrated twists are as
+    - var(d) and var(dyaw) are the noise of one period. With them, the integrated twists are as
       uncertain as the pose.
     - The sums are over the uncertain parameters of the kinematics (c_1 to c_4: see `columns`).
 
@@ -179,7 +183,10 @@ class TwistUncertainty:
     """
 
     def __init__(self, model: ErrorModel, counts: int) -> None:
-        """Start. `counts` are the encoder counts per revolution of a wheel, 0 if unknown."""
+        """Start with a feedback period of `PERIOD`.
+
+        `counts` is the number of encoder counts per revolution of a wheel, 0 if unknown.
+        """
         self._model = model
         self._count = math.tau / counts if counts else 0.0
         # The errors of the four wheels are independent, and each side is the mean of two wheels.
@@ -233,7 +240,7 @@ class TwistUncertainty:
         )
 
     def slipping(self, variances: TwistVariances) -> TwistVariances:
-        """Return all variances times `SLIPPING`, because wheels may slip in any direction."""
+        """Return all variances times `SLIPPING`, because the wheels may slip in any direction."""
         return TwistVariances(
             min(SLIPPING * variances.linear, MOST),
             min(SLIPPING * variances.lateral, MOST),
@@ -241,5 +248,8 @@ class TwistUncertainty:
         )
 
     def with_gyro(self, variances: TwistVariances, angular: float) -> TwistVariances:
-        """Return the variances, but with `angular` (from a gyro, rad2/s2) for the turn rate."""
+        """Return `variances`, but with `angular` as the variance of the turn rate.
+
+        `angular` is the variance of a gyro's rate, rad2/s2.
+        """
         return TwistVariances(variances.linear, variances.lateral, min(max(LEAST, angular), MOST))

@@ -1,8 +1,8 @@
-"""Limits how many log lines the events of one name cause: at most one per second on average.
+"""Limits the log lines about events of the same name to one per second on average.
 
-A few lines of one name may be written at once, and after that one per second. Each line reports the
-number of events since the previous line. So neither a client that floods the bus nor a serial line
-with a loose contact can flood the log.
+A few lines of one name may follow each other without a delay, and after that one line per second.
+Each line reports the number of events since the previous line. So neither a client that floods the
+bus nor a serial line with a loose contact can flood the log.
 """
 
 from __future__ import annotations
@@ -14,11 +14,12 @@ from typing import get_args
 from acsard.core.values import NS_PER_S, Event, EventName, Level
 
 BURST = 5
-"""Log lines of one name that may be written at once: enough for a person who presses buttons."""
+"""Number of log lines of one name that may follow each other without a delay. A person who presses
+buttons does not need more."""
 
 MOST = 8
-"""Largest number of event kinds, and also of client names, that one log line lists. The line calls
-all further kinds or names "others"."""
+"""Largest number of event kinds that one log line lists, and also the largest number of client
+names. All further kinds or names appear as "others"."""
 
 LEVELS: tuple[Level, ...] = get_args(Level)
 
@@ -56,13 +57,16 @@ class EventThrottle:
     def __init__(self) -> None:
         self._held: dict[EventName, _Held] = {}
         self._number = 0
-        """Number of all events so far."""
+        """Number of events of all names so far."""
         self._free_ns: dict[EventName, int] = {}
-        """For each event name, the end of the time that its lines have used up, monotonic ns. Each
-        written line uses up one second. The lines of a burst use up seconds in advance."""
+        """For each event name, the monotonic time at which the next line would be on schedule, ns.
+        Each written line moves this time on by one second, so a burst moves it into the future."""
 
     def lines(self, events: list[Event], now_ns: int) -> tuple[Event, ...]:
-        """Add new events, and return the events to log now, which may combine several events."""
+        """Add `events`, and return the events to log now. One returned event may stand for several.
+
+        All other events are held, and a later call returns them.
+        """
         if not (events or self._held):
             return ()
         for event in events:
@@ -72,7 +76,8 @@ class EventThrottle:
             held.number = self._number
         told = [name for name, held in self._held.items() if self._may(name, held.news, now_ns)]
         if "stop" in told or "clear" in told:
-            # The log must not end with a `clear` that came before a stop, or the other way round.
+            # The lines of a stop and of a `clear` must be in the order of these events, so that the
+            # end of the log shows whether the robot is stopped.
             told += [name for name in ("stop", "clear") if name in self._held and name not in told]
             told.sort(key=lambda name: self._held[name].number)
         return tuple([self._held.pop(name).line() for name in told])
@@ -80,8 +85,9 @@ class EventThrottle:
     def _may(self, name: EventName, news: bool, now_ns: int) -> bool:
         """Return whether a line of this name may be written now; if so, count it as written.
 
-        If `news` is true, the line may be one of the `BURST` lines that are written at once. So may
-        a stop of a stopped robot, because its time matters too.
+        Only lines with news may be ahead of the schedule: up to `BURST` of them may be written at
+        once. The line of a stop may be ahead even if the robot is already stopped, because the time
+        of each stop matters.
         """
         free_ns, at_once = self._free_ns.get(name, now_ns), news or name == "stop"
         if free_ns > now_ns + (BURST - 1 if at_once else 0) * NS_PER_S:
@@ -95,7 +101,10 @@ NUMBERED = re.compile(r"\A\d+ (?:x [^:;]*|times)(?:; the last)?: ")
 
 
 def together(before: Event, line: Event) -> Event:
-    """Merge two lines of one name into one, with the total number of events and the later text."""
+    """Return one log line for two lines of the same event name, `before` and the later `line`.
+
+    The result has the total number of events, and the text of `line`.
+    """
     count, last = before.count + line.count, NUMBERED.sub("", line.text, count=1)
     level = max(before.level, line.level, key=LEVELS.index)
     names = dict.fromkeys(filter(None, [*before.by.split(", "), *line.by.split(", ")]))

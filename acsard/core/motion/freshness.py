@@ -8,24 +8,25 @@ than that of an accepted command. The clock of a sender is in one of two states:
 
     new      The minimum is not known. Delays fall while a backlog arrives. Therefore a test of
              several commands (the proof) must first show that the delays no longer fall.
-    known    The minimum is trusted until a proof shows another one.
+    known    The minimum is trusted until a proof shows another minimum.
 
 There are two kinds of clocks. A *steady* clock is never adjusted. Our client, tools and web page
-declare that with `"steady": true`. If a command with such a stamp looks late, the command is really
-late, and it stays refused.
+declare a steady clock with `"steady": true`. If a command with such a stamp looks late, the command
+is really late, and it stays refused.
 
 A *foreign* clock may be set or slewed, which looks like a change of the delay. If the new delay
-proves constant, it is trusted, and the sender must return to neutral. A congested network can look
-the same, so the sum of the delays that are trusted in this way is bounded by a budget:
-`FORGIVE_NS`, refilled by 1 s a minute. An adjustment is visible, and costs no budget, if stamps go
-back or stand still for more than one command, because no network can cause that. After a pause of
-the sender, a rise of the delay is trusted even beyond the budget, because the clock may have been
-set by any amount. A pause is longer than 2 s, and longer than the timeout of the source.
+proves constant, it is trusted, and the sender must send a zero again. A congested network can look
+the same. Therefore the sum of the rises of the delay that are trusted in this way is bounded by a
+budget: `FORGIVE_NS`, refilled by 1 s a minute. If the stamps of more than one command go back or
+stand still, the adjustment of the clock is visible and costs no budget, because no network can
+cause that. After a pause of the sender, a rise is trusted even beyond the budget, because the clock
+may have been set by any amount. A pause is longer than 2 s, and longer than the timeout of the
+source.
 
-Sequence numbers show which commands the network lost, repeated or delivered in another order. The
-daemon does not take lost commands for a pause, and a repeated command changes nothing.
+Sequence numbers show which commands the network lost, repeated or delivered in another order. Lost
+commands do not count as a pause, and a repeated command changes nothing.
 
-Arrivals are measured by the monotonic clock, because our own wall clock may be set.
+Times of arrival are measured by the monotonic clock, because our own wall clock may be set.
 """
 
 from __future__ import annotations
@@ -35,12 +36,13 @@ from typing import Literal
 from acsard.core.values import NS_PER_S, Command
 
 DRIFT = 5000
-"""Two clocks may drift apart by 1 s in this number of seconds: twice the error of a bad crystal."""
+"""Number of seconds in which two clocks may drift apart by 1 s. This is twice the drift of a bad
+crystal."""
 
 FORGET_NS = 250 * NS_PER_S
 """Pause of a sender, ns, after which its clock counts as new, because the clock may have drifted by
-50 ms. If the arrivals show the pause but the stamps do not, the network held commands back, and the
-clock stays known."""
+50 ms. If the arrival times show the pause but the stamps do not, the network held commands back,
+and the clock stays known."""
 
 KEEP_NS = 3600 * NS_PER_S
 """Silence of a sender, ns, after which its clock is forgotten to save memory."""
@@ -54,11 +56,11 @@ WAVER_NS = NS_PER_S
 commands back."""
 
 EVEN, CREPT = 200, 20
-"""A proof (a test whether the delay is constant) compares the minimum delays of its two halves.
-The minima may differ by the duration of the proof divided by `EVEN`, or by `CREPT` if the delay
-creeps (see `CREEP`). The centres of the halves are half the duration apart, so the delay may change
-by 10 ms per second, or by 100 ms per second if it creeps. NTP slews a clock by up to 83 ms per
-second."""
+"""Divisors. A proof (a test whether the delay is constant) compares the minimum delays of its two
+halves. The minima may differ by the duration of the proof divided by `EVEN`, or divided by `CREPT`
+if the delay creeps (see `CREEP`). The centers of the halves are half the duration apart, so the
+delay may change by 10 ms per second, or by 100 ms per second if it creeps. NTP slews a clock by up
+to 83 ms per second."""
 
 CREEP, JITTER_NS = 10, NS_PER_S // 200
 """A delay creeps if its change between two commands is at most the time between them divided by
@@ -69,19 +71,20 @@ LONGEST_PROOF_NS = 2 * NS_PER_S
 applies instead if it is shorter."""
 
 JUMP_PROOF_NS = 3 * NS_PER_S // 2
-"""Shortest time for which the delay must be constant after it has jumped, ns. The jump is more
-likely a backlog that arrives in bursts than a clock that was set."""
+"""Shortest time for which the delay must be constant after it has jumped, ns, before it is trusted.
+The cause of the jump is more likely a backlog that arrives in bursts than a clock that was set."""
 
 GAP_NS = 2 * NS_PER_S
-"""A longer silence of a sender, ns, is a pause, unless its source has a longer timeout. Then the
-silence must exceed the timeout, because the sender need not send more often. A pause ends a test of
-the delay. If stamps and arrivals show the pause, a foreign clock (one that may be adjusted) may
-have been set by any amount meanwhile."""
+"""A silence of a sender that is longer than this, ns, is a pause. If the timeout of the source is
+longer, only a silence longer than the timeout is a pause, because the sender need not send more
+often. A pause ends a test of the delay. If both stamps and arrival times show the pause, a foreign
+clock (one that may be adjusted) may have been set by any amount meanwhile."""
 
 STANDS_NS = 10_000
 """A clock was set back if two commands arrive more than `APART_NS` apart, but the second stamp is
-later by at most this, ns. Zenoh's own clock never goes back: it advances by a fraction of a
-microsecond for each message until the wall clock has caught up."""
+later than the first by at most this, ns. Zenoh's own clock never goes back. If the wall clock was
+set back, Zenoh's clock advances by a fraction of a microsecond for each message until the wall
+clock has caught up."""
 
 APART_NS = NS_PER_S // 500
 """Commands that arrive within this time of each other, ns, may have been sent together."""
@@ -94,11 +97,12 @@ waits for the last command of the queue, which has the smallest delay. No sender
 FORGIVE_NS, FORGIVE_RATE = NS_PER_S, 60
 """Budget, ns, for delay rises of a foreign clock (one that may be adjusted) that are trusted
 without a visible adjustment. It is refilled by one second in `FORGIVE_RATE` seconds. While commands
-are late, the budget may rise above `FORGIVE_NS`, so that no sender is refused for ever."""
+are late, the budget may rise above `FORGIVE_NS`, so that no sender is refused forever."""
 
 MAX_CLOCKS = 1024
-"""Largest number of clocks. If there are more, usually the longest silent one is forgotten. To make
-the daemon forget a sender at 20 Hz, a client would need this many names within 0.05 s."""
+"""Largest number of clocks that are kept. If there are more, the daemon usually forgets the clock
+that has been silent longest. To make it forget a sender that sends at 20 Hz, a client would have to
+use this many names within 0.05 s."""
 
 State = Literal["new", "known"]
 Verdict = Literal["fresh", "first", "unproven", "stale", "set"]
@@ -117,13 +121,14 @@ class _Proof:
     """A test whether the delays have become constant, starting with one command.
 
     The test compares the minimum delays of successive intervals. An interval is called a half,
-    because it lasts half of the nominal duration of the test, but a test may take more than two.
+    because it lasts half of the nominal duration of the test. A test may take more than two halves.
 
-    - For a known clock (`again`), the test restarts with the second half if the first two differ.
-    - For a new clock whose first two halves differ, the test compares the last eight halves in
-      four pairs. The minima of the pairs must agree within the same limit (`EVEN`), or differ by
-      at most `EARLY_NS` without a trend. A trend means that the minima only fall, as while a
-      backlog arrives, or only rise, as while a queue grows.
+    - For a known clock (`again`), the test restarts with the second half if the minima of the first
+      two halves differ too much.
+    - For a new clock in this case, the test compares the last eight halves in four pairs. The
+      minima of the pairs must agree within the same limit (`EVEN`), or differ by at most `EARLY_NS`
+      without a trend. A trend means that the minima only fall, as while a backlog arrives, or only
+      rise, as while a queue grows.
     """
 
     def __init__(
@@ -140,8 +145,9 @@ class _Proof:
     def add(self, delay: int, at_ns: int, timeout_ns: int) -> Literal["proven", "open", "failed"]:
         """Add a command, and return whether the delays are proven constant.
 
-        "failed" means that a new test must begin with this command. A command whose delay exceeds
-        the lowest delay by more than the timeout cannot complete the test.
+        "open" means that the test goes on. "failed" means that a new test must begin with this
+        command. A command whose delay exceeds the lowest delay by more than the timeout cannot
+        complete the test.
         """
         if not -EARLY_NS <= delay - self._first <= WAVER_NS:
             return "failed"
@@ -185,9 +191,9 @@ class _Clock:
         """Arrival of the last command, monotonic ns. Repeated commands do not count."""
         self.gap_ns = GAP_NS
         """Longest silence that is not a pause, ns: `GAP_NS`, or the longest timeout of the sources
-        that the sender has commanded."""
+        to which the sender has sent commands, if that is longer."""
         self.forgiven_ns = 0
-        """Part of the last trusted rise of the delay that no adjustment of stamps explains, ns."""
+        """Part of the last trusted rise of the delay that no visible adjustment explains, ns."""
         self._stamp_ns = 0
         self._delay = 0
         self._number = -1
@@ -197,18 +203,20 @@ class _Clock:
         self._early = 0
         """Recent fall of `_least`, ns. It decreases by a tenth of the time that passes."""
         self._floor: int | None = None
-        """Lowest delay, ns, plus the possible drift; None if the clock may be adjusted."""
+        """Lowest delay of a clock that is never adjusted, ns, plus the possible drift; None without
+        such a delay."""
         self._before: int | None = None
-        """Delay before the clock's first adjustment that stamps have shown, ns; None without one.
-        Adjustments before the last command that was on time do not count."""
+        """Delay before the first visible adjustment since the last command that was on time, ns;
+        None if there was no visible adjustment."""
         self._shown = 0
-        """Sum of the adjustments that stamps have shown since the last command on time, ns."""
+        """Sum of the visible adjustments since the last command that was on time, ns."""
         self._doubted: tuple[int, int, int] | None = None
         """An adjustment that the next command must confirm, because the network may have swapped or
         repeated a command. The tuple has the delay before the adjustment, the size of the
         adjustment, and the stamp before the adjustment, all in ns."""
         self._paused = False
-        """Whether the sender paused since its last timely command. Its clock may have been set."""
+        """Whether the sender has paused since its last command that was on time, so that its clock
+        may have been set."""
         self._budget, self._budget_at_ns = FORGIVE_NS, at_ns
         self._proof: _Proof | None = None
         self._accepted: tuple[int, int] | None = None
@@ -247,15 +255,16 @@ class _Clock:
         return verdict
 
     def _superseded(self, mark: tuple[int, int]) -> bool:
-        """Return whether a command newer than the one with this stamp and number was accepted."""
+        """Return whether a newer command was accepted. `mark` is a stamp, ns, and a number."""
         last = self._accepted
         return last is not None and (mark < last or (mark == last and mark[1] >= 0))
 
     def _repeats(self, stamp_ns: int, number: int, silence: int) -> bool:
         """Return whether the network repeated this command, or delivered a later one before it.
 
-        Such a command changes nothing. If its stamp is later than those before, its program has
-        restarted and counts from the beginning. After a pause, any number may be a restart.
+        Such a command changes nothing. A low number may also show that the program has restarted
+        and counts from the beginning. That is assumed if the stamp is later than all stamps before,
+        or after a pause.
         """
         if not 0 <= number <= self._number or silence > self.gap_ns:
             return False
@@ -263,7 +272,7 @@ class _Clock:
         return stamp_ns <= self._stamp_ns or (accepted is not None and stamp_ns <= accepted[0])
 
     def _later_than_lowest(self, delay: int, silence: int) -> int:
-        """Return by how much this delay of a steady clock exceeds the lowest one, ns."""
+        """Return by how much this delay of a steady clock exceeds its lowest delay, ns."""
         floor = delay if self._floor is None else self._floor + silence // DRIFT
         self._floor = min(floor, delay)
         return delay - self._floor
@@ -272,15 +281,15 @@ class _Clock:
         """Record a pause of the sender, or an adjustment of its clock.
 
         A stamp that goes back or stands still shows an adjustment. The next command must confirm
-        it: its stamp must also go back or stand still, or must not be later than the stamp before
-        the adjustment.
+        the adjustment: the stamp of that command must also go back or stand still, or must not be
+        later than the stamp before the adjustment.
 
         If the sequence numbers show that commands were lost, the network may have caused the
-        silence. The adjustment then counts by as much as the stamp is earlier than that of the last
-        accepted command, and a pause is not recorded.
+        silence, so no pause is recorded. The size of an adjustment is then the time by which the
+        stamp is earlier than that of the last accepted command.
         """
         lost = number - self._number - 1 if number >= 0 and self._number >= 0 else 0
-        if lost < 0:  # the numbers began again
+        if lost < 0:  # the sender has restarted its numbers
             return
         departed, accepted = stamp_ns - self._stamp_ns, self._accepted
         doubted, self._doubted = self._doubted, None
@@ -318,13 +327,13 @@ class _Clock:
         if late <= timeout_ns and early <= EARLY_NS:
             self._paused = False
             if proof is not None and late > proof.timeout_ns:
-                # This source has a longer timeout than the one whose commands are in doubt.
+                # This source has a longer timeout than the source whose commands are in doubt.
                 return "fresh"
             self._proof, self._early = None, early
             self._least = min(self._least, delay)
             self._forget_adjustments()
             return "fresh"
-        if steady:  # the known minimum was that of a backlog
+        if steady:  # the known minimum was measured while a backlog arrived
             self.state, self._proof = "new", None
             return self._prove(delay, at_ns, silence, timeout_ns)
         needed_ns, share = min(timeout_ns, LONGEST_PROOF_NS), CREPT
@@ -344,8 +353,8 @@ class _Clock:
     def _forgive(self, proof: _Proof, at_ns: int) -> bool:
         """Trust the proven delay if that is allowed, and return whether it is.
 
-        A rise of the delay is allowed after a pause of the sender, after an adjustment that stamps
-        have shown, or within the budget.
+        A fall of the delay is always allowed. A rise is allowed after a pause of the sender, within
+        the budget, or as far as a visible adjustment of the clock explains it.
         """
         self._accrue(at_ns, FORGET_NS)
         hidden = proof.least - self._least
@@ -359,7 +368,7 @@ class _Clock:
         return True
 
     def _accrue(self, at_ns: int, most_ns: int) -> None:
-        """Refill the budget for the time since the last call, up to `most_ns`."""
+        """Refill the budget for the time since the last call, to at most `most_ns`."""
         grown = (at_ns - self._budget_at_ns) // FORGIVE_RATE
         self._budget, self._budget_at_ns = min(self._budget + grown, most_ns), at_ns
 
@@ -373,19 +382,21 @@ class _Clock:
 
 
 class Freshness:
-    """Judges commands. It keeps a clock for each sender that stamps its commands."""
+    """Judges commands. The state is one `_Clock` for each clock that stamps commands."""
 
     def __init__(self) -> None:
         self._clocks: dict[str, _Clock] = {}
         self._newcomers: dict[str, _Clock] = {}
-        """Clocks that may be adjusted and have no accepted command, forgotten after a pause."""
+        """Clocks that may be adjusted and have stamped no accepted command yet. They are forgotten
+        after a pause."""
         self._unproved: dict[str, _Clock] = {}
-        """Clocks that are never adjusted and have no accepted command. They are kept for `KEEP_NS`
-        of silence, because their lowest delay is valid from the first command on."""
+        """Clocks that are never adjusted and have stamped no accepted command yet. They are kept
+        for `KEEP_NS` of silence, because their lowest delay is valid from the first command on."""
         self._numbers: dict[str, tuple[int, int]] = {}
-        """Last number and monotonic arrival, ns, of each sender with numbers but without stamps."""
+        """For each sender with sequence numbers but without stamps, the last number and its
+        monotonic time of arrival, ns."""
         self.forgiven_ns = 0
-        """Sum of the delay rises, ns, that were trusted although no stamp showed an adjustment."""
+        """Sum of the delay rises, ns, that were trusted without a visible adjustment."""
 
     def judge(self, command: Command, timeout_ns: int) -> Verdict:
         """Return the verdict on a command, and remember its stamp and sequence number.
@@ -410,7 +421,10 @@ class Freshness:
         return verdict
 
     def _in_order(self, command: Command, gap_ns: int) -> Verdict:
-        """Judge a command without a stamp by its number. After a pause, numbers may restart."""
+        """Judge a command without a stamp by its sequence number.
+
+        After a silence of more than `gap_ns` ns, the numbers of a sender may restart.
+        """
         number, at_ns = command.sequence, command.arrived_ns
         if number is None:
             return "fresh"
@@ -424,7 +438,7 @@ class Freshness:
         return "fresh"
 
     def _forget(self, now_ns: int) -> None:
-        """Forget clocks that were silent for long, and one more if over `MAX_CLOCKS` are left.
+        """Forget clocks that were silent for long, and one more if more than `MAX_CLOCKS` remain.
 
         The number is limited, because a recording begins with all clocks, and the control loop
         writes them in one step.
@@ -442,5 +456,8 @@ class Freshness:
 
 
 def _oldest(held: dict[str, _Clock]) -> _Clock:
-    """Return the clock that has been silent longest: each command moves its clock to the end."""
+    """Return the clock that has been silent longest.
+
+    It is the first one, because each command moves its clock to the end.
+    """
     return next(iter(held.values()))

@@ -1,12 +1,13 @@
 """Fills gaps in the feedback: estimates the motion of the wheels in a gap, and its uncertainty.
 
-`Rolling` computes the angles that the wheels rolled since the last plausible feedback line. It uses
-the first of these sources that exists: the encoder counts in the line, whole counts that are
-recovered from the speeds in the line, or these speeds times the time. It uses each moment and each
-count exactly once. In a gap that no line covers, it assumes the speed before the gap for the first
-half of the gap, and the speed after the gap for the second half. If the daemon commanded rest
-during the gap, it assumes the speed before the gap only until that command. The motion during
-implausible lines, and in the gaps before them, is computed with the next plausible line.
+`Rolling` computes the angles that the wheels rolled since the last plausible feedback line. (An
+implausible line is a line that `sanity.py` or `Confirmation` rejects.) `Rolling` uses the first of
+these sources that exists: the encoder counts in the line, whole counts that are recovered from the
+speeds in the line, or these speeds times the time. Each moment and each count is used exactly once.
+In a gap that no line covers, `Rolling` assumes the speed before the gap for the first half of the
+gap, and the speed after the gap for the second half. If the daemon commanded rest during the first
+half, the speed before the gap is assumed only until that command. The motion during implausible
+lines, and in the gaps before them, is computed with the next plausible line.
 
 A damaged line after a gap would falsify the motion of the whole gap. `Confirmation` therefore holds
 a line with a doubtful speed until other lines confirm this speed or refute it.
@@ -28,23 +29,23 @@ from acsard.core.motion.sanity import SLACK
 from acsard.core.values import REST, Twist, WheelSpeeds
 
 MAX_LOST_S, MAX_LOST = 0.05, 1
-"""Largest total duration, s, and largest number of implausible lines in a row. If these lines have
-no encoder counts and stay within one of these limits, the robot is assumed to have moved at the
-speed of the next plausible line. Otherwise, the motion during these lines is unknown."""
+"""Limits for consecutive implausible lines without encoder counts: `MAX_LOST_S` for their total
+duration, s, and `MAX_LOST` for their number. If one of the limits is kept, the robot is assumed to
+have moved at the speed of the next plausible line. Otherwise, its motion during these lines is
+unknown."""
 
 NOWHERE = (0.0, 0.0, 0.0, 0.0)
 
 GUESS = Twist(0.125, 0.5)
-"""Standard deviation of the acceleration that is assumed until the acceleration is measured, m/s2
-and rad/s2. It is an eighth of the default acceleration limits. Random driving rarely exceeds it."""
+"""Standard deviation of the acceleration, m/s2 and rad/s2, until it is measured. It is an eighth of
+the default acceleration limits. Random driving rarely exceeds it."""
 
 SPAN = 0.2
 """Time over which the deviation from constant acceleration is measured, s."""
 
 FIRST, MOST = 4.0, 300.0
-"""Weights in the mean of the squared deviations, in which each measured span of `SPAN` s has the
-weight 1. `GUESS` has the weight `FIRST`. All values together have at most the weight `MOST` (a
-minute of driving)."""
+"""Weights in the mean of the squared deviations. Each measured span of `SPAN` s has the weight 1,
+and `GUESS` has the weight `FIRST`. The total weight is limited to `MOST` (a minute of driving)."""
 
 GROWTH = 5
 """Exponent in the growth of a gap's variance with the duration of the gap (`Gaps`)."""
@@ -57,13 +58,14 @@ class Rolled(Struct, frozen=True, gc=False):
     """Angles from the speeds, rad, in the order of time. Each item is one arc of the path, and has
     at least one angle that is not zero."""
     turned: Motors
-    """Angles from encoder counts, rad. This motion came before that of `pieces`."""
+    """Angles from encoder counts, rad. This motion came before the motion in `pieces`."""
     seen: Motors
-    """Angles in the last `seconds` s, rad. They have the rounding errors of the last line."""
+    """Angles in the last `seconds` s, rad. If they come from speeds, they have the rounding errors
+    of these speeds."""
     seconds: float
     """Duration of the motion `seen`, s."""
     bridged: float
-    """Part of `seconds`, s, that no line covers, so that the wheel speeds in it were assumed."""
+    """Part of `seconds`, s, that no line covers, so that the speeds in this part were assumed."""
     unknown: float
     """Time in addition to `seconds` in which the motion of the robot is unknown, s."""
     known: float
@@ -74,28 +76,31 @@ class Rolling:
     """Computes the angles that the wheels rolled from one plausible line to the next."""
 
     def __init__(self, quiet: float = math.inf) -> None:
-        """Start. The daemon commands rest after `quiet` s without feedback."""
+        """Start without implausible lines.
+
+        `quiet` is the time without feedback after which the daemon commands rest, s.
+        """
         self._quiet = quiet
         self.forget()
 
     def forget(self) -> None:
         """Forget the implausible lines since the last plausible one."""
         self._lost = self._gap = self._bridged = self._counted = 0.0
-        """Times, s, covered by implausible lines without counts (`_lost`), by the gaps before these
-        lines (`_bridged` if they can be filled, else `_gap`), and by implausible lines with counts
-        (`_counted`)."""
+        """Times, s. `_lost` is covered by implausible lines without counts, and `_counted` by
+        implausible lines with counts. `_bridged` and `_gap` are the gaps before the lines without
+        counts: those that can be filled, and those that cannot."""
         self._turned, self._skipped = NOWHERE, 0
 
     @property
     def skipped(self) -> float:
-        """Time that the last implausible lines without counts cover, s, with the gaps before them.
+        """Total time of the implausible lines without counts since the last plausible line, s.
 
-        It is 0 after a plausible line.
+        It includes the gaps before these lines.
         """
         return self._lost + self._gap + self._bridged
 
     def skip(self, line: Feedback) -> None:
-        """Remember an implausible line: its counts, or its duration if it has no counts."""
+        """Record the counts of an implausible line, or its duration if it has no counts."""
         self._skipped += 1
         if line.turned is None:
             self._lost += line.dt - line.bridged
@@ -112,7 +117,7 @@ class Rolling:
         """
         speeds, dt, bridged = line.speeds.as_tuple(), line.dt, line.bridged + self._bridged
         if not (self._skipped or bridged or line.gap or line.turned is not None):
-            # Nearly every line takes this shortcut. The code below gives the same result for it.
+            # Nearly every line takes this shortcut. The code below would give the same result.
             seen = times(speeds, dt)
             pieces = _some(seen if line.counted is None else line.counted)
             return Rolled(pieces, NOWHERE, seen, dt, 0.0, 0.0, dt)
@@ -157,30 +162,35 @@ def times(a: Motors, factor: float) -> Motors:
 class Confirmation:
     """Holds back a line with a doubtful speed that counts for longer than usual.
 
-    After a gap, one damaged line would falsify the motion of the whole gap. Such damage shows,
-    because it changes one wheel alone, and both wheels of a side change their speeds alike. Let A
-    be the largest angle by which a damaged line of the usual duration can falsify the motion of a
-    wheel. A line is used at once if no wheel has changed alone by a speed that could falsify the
-    motion by more than A. Otherwise it is held, and the next line decides:
+    After a gap, one damaged line would falsify the motion of the whole gap. Damage can be detected,
+    because it changes one wheel alone, while motion changes the speeds of both wheels of a side
+    alike. Let A be the largest angle by which a damaged line of the usual duration can falsify the
+    motion of a wheel. Two lines agree if no wheel alone has changed its speed so much that this
+    change could falsify the motion by more than A.
 
-    - If it agrees with the held line to that degree, both are used. A wheel did change alone.
-    - If it agrees with the last line that was used, the held line is dropped.
+    A line of the usual duration is used immediately. A line that counts for longer is used
+    immediately if it agrees with the last line that was used. Otherwise it is held, and the next
+    line decides:
 
-    If it agrees with neither, the third line decides: a line that differs much more from the other
-    two than they do from each other is dropped. The time of a dropped line counts as a gap.
+    - If the next line agrees with the held line, both are used, because a wheel did change alone.
+    - If the next line agrees with the last line that was used, the held line is dropped.
+    - If the next line agrees with neither, both are held, and the third line decides: a line that
+      differs much more from the other two than they do from each other is dropped.
+
+    The time of a dropped line counts as a gap.
     """
 
     def __init__(self, feedback: FeedbackConfig) -> None:
         self._acceleration = feedback.wheel_acceleration
         self._period = 0.0
-        """Usual time between two lines, s, 0 before the first one."""
+        """Usual time between two lines, s; 0 before the first line."""
         self.forget()
 
     def forget(self) -> None:
         """Forget the lines that are held."""
         self._held: list[Feedback] = []
         self._seconds = 0.0
-        """Time that the held lines cover, s, with the gaps before them."""
+        """Time that the held lines and the gaps before them cover, s."""
 
     def look(
         self,
@@ -189,18 +199,18 @@ class Confirmation:
         before: WheelSpeeds,
         believed: Callable[[Motors], Motors],
     ) -> tuple[list[Feedback], list[Feedback]]:
-        """Return the lines to use now, the oldest first, and the lines to drop.
+        """Return a pair: the lines to use now, the oldest first, and the lines to drop.
 
         Args:
             line: The next plausible line.
-            skipped: The time that the implausible lines directly before it cover, s, with the gaps
-                before them.
+            skipped: The time that the implausible lines directly before `line` cover, s, including
+                the gaps before them.
             before: The wheel speeds of the last line that was used, rad/s.
             believed: The function that replaces the speeds of wheels that are known to be faulty.
         """
         period, held, seconds = self._period, self._held, line.dt + line.gap + skipped
-        # A long time counts as two periods, so that a gap changes the mean little, but a slower
-        # board changes it in the end.
+        # A long time counts as two periods, so that a single gap changes the mean only a little.
+        # A board with a longer period still changes it in the long run.
         self._period += SMOOTHED * (min(seconds, 2 * period) - period) if period else seconds
         if not held and (seconds <= 2 * period or not period or line.turned is not None):
             return [line], []
@@ -223,10 +233,10 @@ class Confirmation:
 
 
 def _alone(a: Motors, b: Motors, steps: Motors) -> float:
-    """Return the largest change of one wheel that the other wheel of its side does not share.
+    """Return the largest speed change of one wheel that the other wheel of its side did not make.
 
-    `a` and `b` are wheel speeds, rad/s. A change by one of the known quantization `steps` of the
-    speeds does not count.
+    The speeds change from `b` to `a`, rad/s. `steps` are the quantization steps of the speeds,
+    rad/s. A change by one known step does not count.
     """
     changes, largest = tuple(map(sub, a, b)), 0.0
     # The wheels i and 3 - i in `WHEELS` order are those of one side.
@@ -241,15 +251,15 @@ class Gaps:
 
     Let s be the standard deviation of the acceleration, m/s2 or rad/s2. After t s without lines,
     the true motion deviates by s t^2 / 2 from the motion at the known speeds, so the variance of
-    the motion is s^2 t^4 / 4. The robot may change its acceleration at any time, so s^2 itself
-    grows with t, and the variance grows with t^5 (`GROWTH`).
+    the motion is s^2 t^4 / 4. The robot may change its acceleration at any time. Therefore s^2
+    itself grows with t, and the variance grows with t^5 (`GROWTH`).
 
     `follow` measures s while lines arrive without gaps. In each span of a fifth of a second, it
     compares the motion with the motion at the mean of the first and the last speed. The configured
     acceleration limits are not used, because robots seldom accelerate that much.
 
-    The deviation is at most the motion at the higher one of the speeds before and after the gap.
-    Therefore a robot that stood before and after a gap counts as not moved.
+    The deviation is limited to the motion at the higher of the two speeds before and after the gap.
+    Therefore a robot that stood before and after a gap is assumed not to have moved in the gap.
     """
 
     def __init__(self) -> None:
@@ -270,7 +280,7 @@ class Gaps:
         self._seconds += dt
         self._distance += linear * dt
         self._turn += angular * dt
-        span = self._seconds - dt  # the time between the two lines whose speeds are taken as known
+        span = self._seconds - dt  # the time between the first and the last line of the span
         if span < SPAN:
             return
         first = self._first
@@ -284,10 +294,11 @@ class Gaps:
         self._first, self._seconds, self._distance, self._turn = twist, 0.0, 0.0, 0.0
 
     def bridge(self, seconds: float, before: Twist, after: Twist) -> tuple[float, float]:
-        """Return the variances of distance (m2) and turn (rad2) that a filled gap adds.
+        """Return a pair: the variances of distance (m2) and turn (rad2) that a filled gap adds.
 
         The gap lasts `seconds` s. If it directly follows another gap, both count as one longer gap,
-        and the result is the increase of the variances since the earlier gap.
+        and the result is the increase of the variances since the earlier gap. `before` and `after`
+        are the twists before and after this gap.
         """
         bridged, given = self._bridged + seconds, self._given
         along, yaw = self.unseen(bridged, before, after)
@@ -296,7 +307,10 @@ class Gaps:
         return max(0.0, along - given[0]), max(0.0, yaw - given[1])
 
     def unseen(self, seconds: float, before: Twist, after: Twist) -> tuple[float, float]:
-        """Return the variances of the distance (m2) and the turn (rad2) in a gap of `seconds` s."""
+        """Return the variances of the distance (m2) and the turn (rad2) in a gap of `seconds` s.
+
+        `before` and `after` are the twists before and after the gap.
+        """
         scale = (seconds / SPAN) ** GROWTH
         fastest = max(abs(before.linear), abs(after.linear)) * seconds
         turning = max(abs(before.angular), abs(after.angular)) * seconds

@@ -3,12 +3,12 @@
 The method is gyrodometry (Borenstein & Feng, Gyrodometry: a new method for combining data from
 gyros and odometry in mobile robots, 1996): skidding wheels do not affect a gyro, and a gyro's bias
 does not affect the wheels. The gyro's reading at rest is its bias (`gyro_bias.py`). A comparison
-with the wheels gives its delay and the effective track (`gyro_match.py`).
+of gyro and wheels gives the gyro's delay and the effective track (`gyro_match.py`).
 
-Until gyro and wheels have agreed in a turn, the heading comes from the wheels, and the gyro
-corrects it afterwards. A gyro that reads the opposite sign, degrees or zero is reported and not
-used (`gyro_trial.py`). If a gyro is silent, or its rate is out of all proportion to the wheels, the
-heading comes from the wheels.
+Until gyro and wheels have agreed in a turn, the heading comes from the wheels. After that turn, the
+heading is corrected by the difference to the gyro. A gyro that reads the opposite sign, degrees or
+zero is reported and not used (`gyro_trial.py`). If a gyro is silent, or if its rate does not match
+the wheels at all, the heading comes from the wheels.
 
 A sample that arrives late is included in the turn of the next line, so no turn is lost.
 """
@@ -31,8 +31,8 @@ REST_S = 0.2
 """Time for which all four wheels must report zero speed before the robot counts as standing, s."""
 
 SILENT_NS = NS_PER_S // 5
-"""Age of the last sample, ns, at which the gyro counts as silent. Up to this age, the robot is
-assumed to go on turning at the rate of the sample."""
+"""Age of the last sample, ns, from which the gyro counts as silent. Up to this age, the robot is
+assumed to continue turning at the rate of this sample."""
 
 LATEST_NS = NS_PER_S // 4
 """If the delay of a sample exceeds the smallest delay of earlier samples by more than this, ns, the
@@ -53,11 +53,12 @@ SLIP_S = 0.5
 """Seconds for which the wheels count as slipping after they last contradicted the gyro."""
 
 MOST_SLIP_S = 5.0
-"""Longest slip of the wheels, s. A gyro that contradicts the wheels for longer is not believed."""
+"""Longest plausible slip, s. If gyro and wheels contradict each other for longer, the gyro is not
+believed."""
 
 ENOUGH_BLOCKS = 20.0
-"""Number of blocks of turning, 0.1 s each, after which the measured ratio of the gyro's turn to the
-wheels' turn is trusted."""
+"""Number of blocks of 0.1 s in which the robot must turn before the measured ratio of the gyro's
+turn to the wheels' turn is trusted."""
 
 WORDS: dict[GyroDoes, str] = {
     "off": "",
@@ -91,8 +92,8 @@ class Turn(Struct, frozen=True, gc=False):
     may include samples that arrived late."""
     rate_variance: float
     wheels: float | None = None
-    """Turn that wheels without a fault would report, rad: `angle` divided by the learned ratio of
-    the configured to the true effective track."""
+    """Turn that wheels without a fault would report, rad. It is `angle` divided by the learned
+    ratio of the gyro's turn to the wheels' turn."""
     slips: bool = False
     """Whether the turns of wheels and gyro have contradicted each other in the last `SLIP_S` s."""
 
@@ -105,8 +106,8 @@ class Gyro:
         self._learned: Track | None = None
         """The effective track that was learned with an earlier gyro, None without one."""
         self.owes = False
-        """Whether the wheels provided the turn of the last line because the gyro is not proven. The
-        heading is corrected later by the difference to the gyro's turn."""
+        """Whether the wheels provided the turn of the last line because the gyro is not proven. If
+        the gyro is proven later, the heading is corrected by the difference to the gyro's turn."""
         self._does: GyroDoes = "silent"
         self.events: list[Event] = []
         """Events of the last `turn`, for the log."""
@@ -124,9 +125,10 @@ class Gyro:
         """Monotonic time of the last sample in `_angle`, ns; None before the first one."""
         self._rate = 0.0
         self._angle = self._given = 0.0
-        """Turn of all samples that were used, and the part that `turn` has returned so far, rad."""
+        """`_angle` is the turn according to all samples that were used, rad. `_given` is the turn
+        that `turn` has returned so far, rad."""
         self._variance = 0.0
-        """Variance of the angle that `turn` has not returned yet, rad2."""
+        """Variance of the part of `_angle` that `turn` has not returned yet, rad2."""
         self._slip_s = self._slipped_s = 0.0
         self._noise = 0.0
         """Variance of the present rate, rad2/s2."""
@@ -160,11 +162,11 @@ class Gyro:
             self._heard.append((self._time_of(sample), sample))
 
     def turn(self, at_ns: int, dt: float, wheels: float, still: bool) -> Turn | None:
-        """Return the robot's turn since the line before; None if the wheels must provide it.
+        """Return the robot's turn since the line before; None if the wheels must provide the turn.
 
         Args:
             at_ns: Monotonic time of this line, ns.
-            dt: Time since the line before, s; 0 after a gap. The result then covers the whole gap.
+            dt: Time since the line before, s. It is 0 after a gap, but the result covers the gap.
             wheels: The turn in `dt` according to the wheels, rad.
             still: Whether all wheels that are not ignored report zero speed.
         """
@@ -181,7 +183,7 @@ class Gyro:
         # cover that turn again, so the wheels also provide the turn of the line after it.
         lost, self._hole = silent or self._hole, silent
         self._since_rest_s = 0.0 if resting else self._since_rest_s + dt
-        # The error of the bias does not average out.
+        # The error of the bias is the same in each line, so it does not average out.
         variance += 2.0 * self._bias.variance * self._since_rest_s * dt
         tried = False if lost else self._try(wheels, angle, variance, dt, resting)
         if not lost and self._bias.known and dt > 0.0 and not self._trial.open:
@@ -199,17 +201,19 @@ class Gyro:
         return Turn(angle, variance, self._rate, noise, rolled, self._does == "disagrees")
 
     def forgive(self) -> None:
-        """Drop the correction that the gyro owes to the heading, because a new pose was set."""
+        """Drop the pending correction of the heading, for example because a new pose was set."""
         self._owed = self._owed_variance = 0.0
-        """The gyro's turn minus the wheels' turn while the gyro was not proven, rad, and its
-        variance, rad2. The difference is added to the heading once the gyro is proven."""
+        """`_owed` is the pending correction of the heading: the gyro's turn minus the wheels' turn
+        while the gyro was not proven, rad. It is added to the heading when the gyro is proven.
+        `_owed_variance` is its variance, rad2."""
 
     def taken_back(self, turn: float) -> float:
-        """Record that recomputing lines with `owes` has changed their total turn by `turn` rad.
+        """Record that the turn in the pose has changed for one or more lines with `owes`.
 
-        Return the angle that the caller must subtract from the heading, rad. If the gyro is proven
-        by now, the heading of these lines is already that of the gyro. The change must then be
-        undone, so the result is `turn`. Otherwise the result is 0.
+        `turn` is the sum of the changes, rad. Return the angle that the caller must subtract from
+        the heading, rad. If the gyro is proven by now, the heading has already been corrected to
+        the gyro's turn of these lines. The change must then be undone, so the result is `turn`.
+        Otherwise the result is 0.
         """
         verdict = self._trial.verdict
         if verdict == "none yet":
@@ -219,7 +223,10 @@ class Gyro:
     # Samples.
 
     def _time_of(self, sample: GyroSample) -> int:
-        """Return the monotonic arrival of a sample, ns, minus the jitter that its stamp reveals."""
+        """Return the monotonic time of arrival of a sample, ns, minus the jitter of that time.
+
+        The stamps show the jitter. Without stamps, the jitter counts as 0.
+        """
         last, self._last = self._last, sample
         if last is None or sample.stamp_ns is None or last.stamp_ns is None:
             return sample.at_ns
@@ -230,7 +237,10 @@ class Gyro:
         return sample.at_ns - max(0, int(late))
 
     def _take(self, until_ns: int, resting: bool) -> None:
-        """Process the samples until `until_ns`: learn the bias at rest, or add to the angle."""
+        """Process the samples until the monotonic time `until_ns`.
+
+        At rest, learn the bias from them. Otherwise, add their turn to `_angle`.
+        """
         bias, heard = self._bias, self._heard
         until_ns += self._delay_ns
         while heard and heard[0][0] <= until_ns:
@@ -252,7 +262,7 @@ class Gyro:
     # Comparison with the wheels.
 
     def _try(self, wheels: float, angle: float, variance: float, dt: float, resting: bool) -> bool:
-        """Test the gyro if it is not proven yet, and return whether the wheels provide this turn.
+        """Test a gyro that is not proven yet, and return whether the wheels must provide this turn.
 
         While the wheels rest, the gyro provides the turn, because a person may turn the robot.
         """
@@ -281,7 +291,10 @@ class Gyro:
         self._slipped_s = self._slipped_s + dt if self._slip_s > 0.0 else 0.0
 
     def _shift(self) -> None:
-        """Correct the assumed delay of the gyro. Call this only at rest, or the heading jumps."""
+        """Correct the assumed delay of the gyro.
+
+        The caller must call this only while the robot rests. Otherwise the heading would jump.
+        """
         delay = self._match.delay()
         if delay is not None and abs(delay) >= LEAST_DELAY_S:
             earliest, latest = DELAYS_NS

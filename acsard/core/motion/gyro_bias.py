@@ -1,7 +1,8 @@
 """Learns the bias of a gyro, which is its reading while the robot stands (zero-velocity update).
 
-The bias drifts between rests. A scalar Kalman filter estimates it as a random walk, so a rest has
-more weight if the previous rest was long ago. The first estimate is the mean of the samples.
+The first estimate is the mean of the samples in `KNOWN_S`. The bias drifts between rests. Therefore
+a scalar Kalman filter models it as a random walk, and a rest has more weight if the previous rest
+was long ago.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ WALK = 1e-4
 
 UNLIKELY = 5.0
 """Largest difference of a sample at rest from the bias that counts as noise, in standard
-deviations. `SLACK` comes in addition."""
+deviations. `SLACK` is added to it."""
 
 SLACK = 0.01
 """Difference of a sample from the bias, rad/s, that is allowed in addition to `UNLIKELY` standard
@@ -29,7 +30,7 @@ LEAST_NOISE = 1e-5
 """Smallest assumed standard deviation of a sample, rad/s. Coarse gyros may repeat one value."""
 
 ANEW_S = 1.0
-"""If the reading at rest differs from the bias but stays constant for this time, s, the reading
+"""If the reading at rest differs from the bias but stays constant for this time, s, this reading
 becomes the new bias. The gyro may have restarted or warmed up, or the robot may have turned while
 the first bias was learned."""
 
@@ -64,7 +65,7 @@ class Bias:
         """Learn from a sample while the wheels stand; return False if it shows a turning robot.
 
         `rate` is in rad/s, and `dt` is the time since the sample before, s. `variance` is the
-        variance of the rate that the gyro declares, rad2/s2; 0 if it declares none.
+        variance of `rate` according to the gyro, rad2/s2; 0 if the gyro declares no variance.
         """
         if not self.known:
             return self._average(rate, variance, dt)
@@ -82,7 +83,7 @@ class Bias:
         return True
 
     def _doubt(self, rate: float, variance: float, dt: float, noise: float) -> bool:
-        """Process a sample that contradicts the bias; return True if it changes the bias."""
+        """Process a sample that contradicts the bias; return True if the bias changes."""
         other = self._other = self._other or Bias()
         if not other.rest(rate, variance, dt) or other._rested_s < ANEW_S:
             return False
@@ -93,7 +94,7 @@ class Bias:
         return True
 
     def _average(self, rate: float, variance: float, dt: float) -> bool:
-        """Update mean and variance by Welford's method; return False if the sample shows a turn."""
+        """Update bias and noise by Welford's method; return False if the sample shows a turn."""
         if abs(rate) > MAX_BIAS:
             return False
         self._rested_s += dt

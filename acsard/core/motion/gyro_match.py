@@ -36,16 +36,18 @@ MEMORY = 0.995
 remembers 200 blocks (20 s of turning)."""
 
 ROUGH, FINE = 0.5, 0.1
-"""Standard deviation of the ratio of the gyro's turn to the wheels' turn. `ROUGH` is assumed before
-any data. `FINE` is the smallest one assumed, because floor and turn rate change the ratio."""
+"""Standard deviations of the ratio of the gyro's turn to the wheels' turn. `ROUGH` is the value
+that is assumed before any data. `FINE` is the smallest value that is assumed, because floor and
+turn rate change the ratio."""
 
 STRETCH = 1.0
-"""Size of a stretch: a turn of the robot to the left or to the right, rad. Each stretch measures
-once how far the ratio is wrong. The delay of the gyro hardly matters over such a turn."""
+"""Size of a stretch, which is a turn of the robot to the left or to the right, rad. Each stretch
+yields one measurement of the error of the ratio. The delay of the gyro hardly matters over such a
+turn."""
 
 KEPT, PRIOR = 0.9, 0.1
 """`KEPT` is the factor by which each new stretch (a turn of `STRETCH`) reduces the weight of the
-earlier ones. `PRIOR` is the initial weight of `ROUGH`, as a number of stretches."""
+earlier stretches. `PRIOR` is the initial weight of `ROUGH`, as a number of stretches."""
 
 DELAY_S = 0.2
 """Standard deviation of the gyro's delay before any data, s."""
@@ -55,10 +57,11 @@ NO_DELAY = 0.0, 0.0, 1.0 / DELAY_S**2
 
 BEFORE, BEHIND = 2, 3
 """If the wheels' rate changes in a block, the gyro may show that change up to `BEFORE` blocks
-earlier or `BEHIND` blocks later. This covers every delay in `gyro.DELAYS_NS`."""
+earlier and up to `BEHIND` blocks later. This covers every delay in `gyro.DELAYS_NS`."""
 
 BLOCK_NOISE, BLOCK_SHARE = 0.01, 0.03
-"""Standard deviation of a block's mean rate: a constant, rad/s, plus a fraction of the rate."""
+"""The standard deviation of a block's mean rate is `BLOCK_NOISE` rad/s plus `BLOCK_SHARE` times the
+rate."""
 
 LAG_S = 0.05
 """Standard deviation of the gyro's delay that `contradiction` assumes before the delay is known,
@@ -80,7 +83,8 @@ deviations, gyro and wheels contradict each other."""
 
 
 class Block(Struct, frozen=True, gc=False):
-    """One block: turns by wheels and by gyro, rad, and change of the wheels' turn rate, rad/s2."""
+    """One block: the turns according to the wheels and to the gyro, rad, and the change of the turn
+    rate according to the wheels, rad/s2."""
 
     wheels: float
     gyro: float
@@ -96,11 +100,11 @@ class Match:
 
     def __init__(self) -> None:
         self._ww, self._wg = 1.0 / ROUGH**2, 1.0 / ROUGH**2
-        """Least-squares sums. They start with a ratio of 1 and its standard deviation `ROUGH`."""
+        """Least-squares sums. They start with the ratio 1 and the standard deviation `ROUGH`."""
         self._wd, self._dg, self._dd = NO_DELAY
         self._off = self._way = 0.0
-        """Sums over the present stretch, rad: the gyro's turn minus the turn that the fit expects
-        of the gyro, and the turn of the wheels."""
+        """Sums over the present stretch, rad. `_way` is the turn of the wheels. `_off` is the
+        gyro's turn minus the turn that the fit predicts for the gyro."""
         self._ways = PRIOR * STRETCH**2
         """Weighted sum of `_way` squared over the completed stretches, rad2."""
         self._offs = ROUGH**2 * self._ways
@@ -118,14 +122,17 @@ class Match:
 
     @property
     def spread(self) -> float:
-        """Standard deviation of the ratio of the gyro's turn to the wheels' turn, measured from the
-        differences between turns of about `STRETCH` rad."""
+        """Standard deviation of the ratio of the gyro's turn to the wheels' turn.
+
+        It is measured from the errors of the fit over turns of about `STRETCH` rad each.
+        """
         return math.sqrt(self._offs / self._ways)
 
     def delay(self) -> float | None:
         """Return the delay of the gyro minus the assumed delay, s, or None if it is uncertain.
 
-        The caller must add this delay to the assumed one, because the measurement starts over.
+        If it is certain, the measurement starts over, so the caller must add the result to the
+        assumed delay.
         """
         ratio, slope = self.ratio, self._slope
         spread = self._dd - self._wd * self._wd / self._ww
@@ -138,7 +145,11 @@ class Match:
         return -slope / ratio
 
     def add(self, wheels: float, gyro: float, dt: float, slips: bool) -> None:
-        """Add a feedback line (turns in rad, `dt` in s). If `slips` is true, nothing is learned."""
+        """Add a feedback line. When a block is complete, learn from the blocks so far.
+
+        `wheels` and `gyro` are the turns in the last `dt` s according to wheels and gyro, rad. If
+        `slips` is true in the last line of a block, nothing is learned from this block.
+        """
         self._slide(wheels, gyro, dt)
         rate = wheels / dt
         # Use the mean of two lines, because the rate of one line jumps with each encoder count.
@@ -155,9 +166,9 @@ class Match:
             self._began = smooth
 
     def contradiction(self, variance: float) -> bool:
-        """Return whether gyro and wheels contradict each other in the last `WINDOW_S` s.
+        """Return whether gyro and wheels have contradicted each other over the last `WINDOW_S` s.
 
-        `variance` is the variance of the gyro's turn in this time, rad2.
+        `variance` is the variance of the gyro's turn over this time, rad2.
         """
         wheels, gyro, time = self._sums
         if time < WINDOW_S * 0.95:

@@ -1,9 +1,9 @@
 """Tests in the first turn whether a gyro measures rad/s about an axis that points up.
 
 A gyro that is mounted upside down, reads degrees or is disconnected reports another turn than the
-wheels. So does a sound gyro if the wheels slip. Therefore a gyro is not believed until it has
-agreed with the wheels in a turn once. It needs to agree only within wide bounds, because wheels
-that skid turn the robot by less than they roll.
+wheels. A sound gyro also reports another turn if the wheels slip. Therefore a gyro is not believed
+until it has agreed with the wheels in a turn once. The bounds for this agreement are wide, because
+wheels that skid turn the robot by less than they roll.
 """
 
 from __future__ import annotations
@@ -11,21 +11,21 @@ from __future__ import annotations
 from typing import Literal
 
 LEAST_RATE = 0.1
-"""Turn rate according to the wheels, rad/s. A feedback line in the opposite direction begins a new
-turn only from this rate on, because a lower rate may come from a single encoder count. A gyro that
-reads zero is called dead only from this rate on, because wheels with unequal tyres report a slow
-turn while the robot drives straight."""
+"""Smallest turn rate according to the wheels, rad/s, at which a feedback line in the opposite
+direction begins a new turn. A lower rate may come from a single encoder count. It is also the
+smallest rate at which a gyro that reads zero is called dead. Wheels with unequal tires report a
+lower rate while the robot drives straight."""
 
 SLOWEST, STRETCH_S = 0.05, 0.5
-"""Smallest mean turn rate according to the wheels that counts as a turn, rad/s, and the time over
-which the mean is taken, s."""
+"""`SLOWEST` is the smallest mean turn rate according to the wheels that counts as a turn, rad/s.
+`STRETCH_S` is the time for this mean, s."""
 
 PROPORTIONS = (0.25, 2.5)
 """Range of the robot's true turn divided by the turn according to the wheels, on any floor."""
 
 PROVED, REFUTED = 0.1, 0.4
-"""Turns to the left or to the right according to the wheels, rad, after which a gyro is proven
-(`PROVED`) or refuted (`REFUTED`). Refuting takes a larger turn, because the gyro may be late."""
+"""Smallest turn to the left or to the right according to the wheels, rad, that proves a gyro
+(`PROVED`) or refutes it (`REFUTED`). Refuting takes a larger turn, because the gyro may be late."""
 
 REFUTED_S = 0.3
 """Shortest time for which the robot must turn before a gyro is refuted, s. No gyro has a delay as
@@ -48,19 +48,20 @@ class Trial:
         """Values of the present interval of `STRETCH_S`: the turn according to the wheels, rad; the
         duration, s; and the turn according to the gyro, rad."""
         self._fast = self._fast_gyro = 0.0
-        """Turns according to wheels and gyro, rad, over the intervals faster than `LEAST_RATE`."""
+        """Turns according to wheels and gyro, rad, over all intervals in which the mean turn rate
+        was at least `LEAST_RATE`."""
 
     @property
     def open(self) -> bool:
-        """Whether the gyro is not proven to work yet."""
+        """Whether the trial goes on, because the gyro is not proven yet."""
         return self.verdict != "good"
 
     def add(self, wheels: float, gyro: float, dt: float, certain: bool = True) -> None:
         """Add a feedback line of `dt` s, and update the verdict.
 
         `wheels` and `gyro` are the turns of the robot in this line according to wheels and gyro,
-        rad. If `certain` is false, the bias of the gyro is unknown. Then the verdict can only
-        change to "in degrees".
+        rad. If the bias of the gyro is unknown, `certain` is false, and the verdict can only change
+        to "in degrees".
         """
         self._stretch += wheels
         self._stretch_gyro += gyro

@@ -63,11 +63,11 @@ class Kinematics:
         return (right + left) / 2, (right - left) / self.track
 
     def opposite(self, left: float, right: float, turn: float) -> tuple[float, float]:
-        """Return the angles that the left and the right wheels rolled, rad (from equation (3)).
+        """Return the angles of the left and the right wheels, each computed from the other side.
 
-        The left angle follows from `right` and `turn`, and the right angle from `left` and `turn`.
-        `left` and `right` are the means of the two wheels on each side, and `turn` is the turn of
-        the base, all in rad.
+        `left` and `right` are the measured angles, rad: the means of the two wheels of each side.
+        `turn` is the turn of the base, rad. By equation (3), the returned left angle follows from
+        `right` and `turn`, and the returned right angle from `left` and `turn`.
         """
         across = turn * self.track
         return (

@@ -2,8 +2,8 @@
 
 While a gyro measures the heading, each turn shows the true effective track (`gyro_match.py`). When
 the gyro is silent, this learned track is better than the configured one, which may come from
-another floor. The learned track is used if `[odometry] learned_track` is true, if it is certain
-enough, and if it is within bounds. It affects only later turns, so the pose does not jump.
+another floor. The learned track is used if `[odometry] learned_track` is true, and if the learned
+value is certain enough and within bounds. It affects only later turns, so the pose does not jump.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from acsard.core.values import Event, GyroStatus, Level, TrackUse
 
 LEAST = 0.05
 """Smallest relative standard deviation of a learned track, because floor and turn rate may change.
-It is half of `gyro_match.FINE`, because the mean error over a whole drive is smaller than the error
-at one moment."""
+The value is half of `gyro_match.FINE`, because the mean error over a whole drive is smaller than
+the error at one moment."""
 
 CERTAIN, UNCERTAIN = 0.1, 0.2
 """Limits of the learned track's relative standard deviation. An uncertain track becomes certain
@@ -26,9 +26,9 @@ BOUNDS = (0.5, 2.5)
 times the wheel separation on most floors, and 2.5 times on slippery ones."""
 
 INWARDS = 1.05
-"""Margin for a learned track that is not in use. It comes into use only above the lower bound times
-this factor and below the upper bound divided by this factor. Without the margin, a track near a
-bound could go in and out of use again and again."""
+"""Factor that narrows `BOUNDS` for a learned track that is not in use: such a track comes into use
+only above the lower bound times this factor and below the upper bound divided by this factor.
+Without this margin, a track near a bound could go in and out of use again and again."""
 
 NOTES: dict[TrackUse, str] = {
     "shown": "(only shown)",
@@ -54,7 +54,7 @@ class LearnedTrack:
     """Decides between the configured and the learned effective track."""
 
     def __init__(self, multiplier: float) -> None:
-        """Start. `multiplier` is the configured track divided by the wheel separation."""
+        """Start with the configured track, which is `multiplier` times the wheel separation."""
         self._multiplier = multiplier
         self.use: TrackUse = "uncertain"
         """Whether the learned track is in use, or why it is not."""
@@ -64,7 +64,7 @@ class LearnedTrack:
         """The event if the last `look` changed `use`, otherwise None."""
 
     def look(self, learned: Track | None) -> None:
-        """Choose the track to use. `learned` is the track learned so far, None without one."""
+        """Choose the track to use. `learned` is the track learned so far, or None."""
         before, self.event = self.use, None
         self.use = _use(learned, before)
         self.used = learned if learned is not None and self.use == "used" else CONFIGURED
@@ -87,10 +87,10 @@ def _use(learned: Track | None, before: TrackUse) -> TrackUse:
 
 
 def beside(learned: Track, multiplier: float, use: TrackUse) -> str:
-    """Return the learned and the configured track in words, and which of them is in use.
+    """Return words that state the learned track, the configured track, and which of them is used.
 
-    The text gives both tracks as multiples of the wheel separation. `multiplier` is the multiple of
-    the configured track.
+    The text gives both tracks as multiples of the wheel separation. `multiplier` is the multiple
+    for the configured track.
     """
     value = learned.share * multiplier
     configured = "" if use == "used" else " (in use)"
@@ -101,7 +101,7 @@ def beside(learned: Track, multiplier: float, use: TrackUse) -> str:
 
 
 def tracks(gyro: GyroStatus, multiplier: float) -> str:
-    """Return words with the learned and the configured track, "" if no track is learned yet."""
+    """Return words that state both tracks (see `beside`); "" if no track is learned yet."""
     if gyro.track is None:
         return ""
     return beside(Track(gyro.track, gyro.track_deviation), multiplier, gyro.track_use)

@@ -10,11 +10,12 @@ or a `deactivate` that its sender has not seen, even if the network delivers the
   has not seen, because a fault that persists latches again.
 - A request that arrived before the latch was set never releases it.
 
-A pressed emergency stop at the robot, a pressed bumper and an empty battery latch a stop too, and a
-fault of a motor driver latches a fault. `clear` releases nothing while one of these causes lasts.
+A pressed emergency stop at the robot, a pressed bumper (with `safety.bumper = "stop"`) and an empty
+battery latch a stop too, and a fault of a motor driver latches a fault. `clear` releases nothing
+while one of these causes lasts.
 
-There is one latch for all causes of a stop. Each new cause gives it a new number, and the latch
-keeps the earlier causes, so that the operator reads all of them before `clear` releases the latch.
+There is one latch for all causes of a stop. Each new cause gives this latch a new number. The latch
+keeps the earlier causes, so that the operator reads all of them before `clear` releases it.
 """
 
 from __future__ import annotations
@@ -28,25 +29,26 @@ from acsard.core.motion.modes import GOING_DOWN, Mode, RefusedError, mode_of, re
 from acsard.core.values import NS_PER_S, Instant, Latch, Latches
 
 LOOK_FIRST_S = 2.0
-"""For this many seconds after a stop, a `deactivate` or the start of the daemon, a request must
-name the number of the latch. The network seldom takes longer to deliver a packet."""
+"""Time after a stop, a `deactivate` or the start of the daemon in which a request must name the
+number of the latch, s. The network seldom takes longer to deliver a packet."""
 
 MAX_CLIENTS = 4
-"""Largest number of clients among the earlier causes of a stop. Of more clients, the first ones are
-kept, so that a flood of stops neither fills the reason in `state` nor hides who stopped first. The
-board has only a few causes."""
+"""Largest number of clients among the earlier causes of a stop. If more clients stop the robot, the
+first ones are kept, so that a flood of stops neither fills the reason in `state` nor hides the
+first client. The causes from the board need no limit, because there are only a few."""
 
 LONG_AGO_NS = -(2**62)
 """A monotonic time that is earlier than every real one, ns. It stands for "never"."""
 
 _DAYS_TO_1970 = 719_468
-"""Days from 0000-03-01 to 1970-01-01. Years start in March, so they end with the leap day."""
+"""Days from 0000-03-01 to 1970-01-01. `utc` counts years from March, so that the leap day is the
+last day of a year."""
 
 _DAYS_PER_400_YEARS = 146_097
 
 
 class Lifecycle:
-    """Latches and mode of one robot. A request that is not allowed raises `RefusedError`."""
+    """The latches and the mode of one robot. A request that is refused raises `RefusedError`."""
 
     def __init__(self, active: bool, latches: Latches = Latches()) -> None:  # noqa: B008
         """Start with these latches. If `active` is false, the robot waits for a call `activate`."""
@@ -58,7 +60,8 @@ class Lifecycle:
         found = (latches.stop, latches.fault, latches.inactive)
         self._number = max([latch.number for latch in found if latch is not None], default=0)
         self._numbered = False
-        """Whether this run has set a latch (see `number_after_restart` for its first number)."""
+        """Whether this run of the daemon has numbered a latch. `number_after_restart` returns the
+        first number of a run."""
         self._stopped_ns = self._faulted_ns = LONG_AGO_NS
         """Monotonic times at which the last stop and the last fault were latched, ns."""
         self._cleared_ns = LONG_AGO_NS
@@ -68,10 +71,11 @@ class Lifecycle:
         self._off_ns = LONG_AGO_NS
         """Monotonic time at which the robot was last switched off, ns."""
         self._held = self._mend = ""
-        """Why the call `clear` is refused, and what to do about it; "" while it is permitted."""
+        """`_held` is the reason why `clear` is refused now, and `_mend` is the advice to the
+        operator about it. Both are "" while `clear` is permitted."""
         self._freed_ns = LONG_AGO_NS
-        """Monotonic time, ns, of the last step in which the cause of a latch ended or came again. A
-        call `clear` from before that step is refused."""
+        """Monotonic time of the last step in which the cause of a latch ended or came again, ns. A
+        call `clear` that arrived before that step is refused."""
         self._began_ns: int | None = None
         """Monotonic time of the first step, ns; None before that step."""
         self._derive()
@@ -99,21 +103,24 @@ class Lifecycle:
             self._derive()
 
     def press(self, why: str, now: Instant) -> None:
-        """Latch a stop that the board causes, under a new number. `why` names the cause."""
+        """Latch a stop, with a new number, because of `why`, a cause that the board reports."""
         self._stopped_ns = now.mono_ns
         self._latch(stop=self._stop(now, "", why))
 
     def hold(self, why: str, mend: str, now_ns: int) -> None:
-        """Record why the state of the board forbids the call `clear` now.
+        """Record why the board's reports forbid the call `clear` now, and the advice `mend`.
 
-        `mend` tells the operator what to do about it. Both texts are "" if the call is allowed.
+        `mend` tells the operator what to do about `why`. Both are "" if the call is allowed.
         """
         if self._held and not why:
             self._freed_ns = now_ns
         self._held, self._mend = why, mend
 
     def caused_again(self, now_ns: int) -> None:
-        """Record that the cause of the fault came again. Refuse calls `clear` from before that."""
+        """Record that the cause of the fault came again, so that earlier calls `clear` are refused.
+
+        These are the calls that arrived at the monotonic time `now_ns` or before.
+        """
         self._freed_ns = now_ns
 
     def leave(self) -> None:
@@ -122,7 +129,7 @@ class Lifecycle:
         self._derive()
 
     def fault(self, why: str, now: Instant) -> bool:
-        """Latch a fault and return True, or keep a fault that is latched and return False."""
+        """Latch a fault and return True. If a fault is already latched, only return False."""
         if self.latches.fault is not None:
             return False
         self._faulted_ns = now.mono_ns
@@ -132,11 +139,11 @@ class Lifecycle:
     # requests
 
     def stop(self, by: str, asked_ns: int, now: Instant) -> str:
-        """Latch a stop under a new number, and return a text for the client.
+        """Latch a stop with a new number, and return a text for the client.
 
-        If the latch already names this client and a stop that arrived at the same time as this one
-        or later, keep that latch. `asked_ns` is the monotonic time at which the request arrived.
-        `by` is "" if the client is unknown.
+        The latch does not change if it already names this client, and if the daemon has already
+        processed a request for a stop with the same or a later time of arrival. `asked_ns` is the
+        monotonic time of arrival of this request. `by` is "" if the client is unknown.
         """
         latch, why = self.latches.stop, f"stopped by {by or 'request'}"
         named = latch is not None and any(cause.why == why for cause in latch.causes)
@@ -154,9 +161,8 @@ class Lifecycle:
         """Release the fault if one is latched, otherwise the stop; return a text for the client.
 
         The text is "" if neither a fault nor a stop is latched. `number` is the number of the latch
-        that the client has seen; None if the request names none. `asked_ns` is the monotonic time
-        at which the request arrived.
-        Raises `RefusedError`.
+        that the client has seen; None if the request names no number. `asked_ns` is the monotonic
+        time at which the request arrived. Raises `RefusedError`.
         """
         require_allowed(self.mode, "clear")
         if self._held:
@@ -196,9 +202,10 @@ class Lifecycle:
     def activate(self, number: int | None, asked_ns: int, now: Instant) -> bool:
         """Switch the robot on; return True if it was off.
 
-        `number` is the number of the latch that the client has seen; None if the request names
-        none. 0 stands for a robot that is off only because `auto_activate` is False. Raises
-        `RefusedError` if the mode refuses the request, or if the client may not know the latch.
+        `number` is the number of the latch that the client has seen; None if the request names no
+        number. The number 0 means that the client has seen no latch: the robot is off only because
+        `auto_activate` is False. Raises `RefusedError` if the mode refuses the request, or if the
+        client may not know the latch.
         """
         require_allowed(self.mode, "activate")
         if not self._off:
@@ -230,21 +237,21 @@ class Lifecycle:
         return "inactive: the robot ramps to zero; srv/activate switches it on"
 
     def lower(self, limits: dict[str, float]) -> None:
-        """Store the settings of `[limits]` that `set` has lowered. They must survive a restart."""
+        """Store the settings of `[limits]` that `set` has lowered. A restart must keep them."""
         if limits != self.latches.lowered:
             self.latches = replace(self.latches, lowered=limits)
 
     @property
     def why(self) -> str:
-        """The reason of the mode `fault`, `stopped` or `inactive`, with the call that ends it."""
+        """The reason of the mode `fault`, `stopped` or `inactive`, and the call that ends it."""
         latches, held = self.latches, self._held
         if latches.next is not None:
             fault, stop = latches.fault, latches.stop
             parts = [] if fault is None else [f"{fault.why}, latched {_when(fault)}"]
             causes = () if stop is None else stop.causes
             if held and held not in [latch.why for latch in (fault, *causes) if latch]:
-                # The cause that lasts is not a latched one: the board reports another cause now, as
-                # when one of two pressed bumpers is released.
+                # The cause that lasts differs from all latched causes. For example, one of two
+                # pressed bumpers has been released.
                 parts.append(held)
             parts += [_said(cause) for cause in causes]
             before = f"{self._mend}, then " if held else ""
@@ -322,9 +329,10 @@ class Lifecycle:
 
 
 def with_causes(latch: Latch, before: Latch | None) -> Latch:
-    """Return the new `latch` of a stop, with the causes of the stop `before` that it replaces.
+    """Return `latch`, a new latch of a stop, with the causes of `before` as its earlier causes.
 
-    A cause that has come again is named once, as the new latch. See `MAX_CLIENTS` for its bound.
+    `before` is the latch that the new one replaces. A cause that has come again appears only once,
+    as the new latch. `MAX_CLIENTS` limits how many earlier causes come from clients.
     """
     causes = () if before is None else before.causes
     earlier = [replace(cause, earlier=()) for cause in causes if cause.why != latch.why]
@@ -337,8 +345,8 @@ def number_after_restart(kept: int, now: Instant) -> int:
 
     `kept` is the largest number in the latch file. The result is the wall-clock time in ms if that
     is above `kept`. Otherwise the wall clock was set back, and the result is `kept` + 1 plus the
-    time since the computer started, ms. `kept` + 1 alone is not safe: a latch that was released
-    may have had that number, although the file has it no longer, and a late `clear` may carry it.
+    time since the computer started, ms. `kept` + 1 alone is not safe: an earlier latch, which is
+    not in the file any more, may have had that number, and a late `clear` may still name it.
     """
     number = now.wall_ns // 1_000_000
     return number if number > kept else kept + 1 + now.mono_ns // 1_000_000
@@ -366,7 +374,7 @@ def _when(latch: Latch) -> str:
 
 
 def _asked_for(latch: Latch) -> bool:
-    """Return whether a client asked for the latch. Otherwise its `why` names another cause."""
+    """Return whether a client asked for the latch. Otherwise, it has a cause such as a fault."""
     return latch.why.endswith(f" by {latch.by or 'request'}")
 
 

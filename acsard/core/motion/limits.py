@@ -1,9 +1,9 @@
 """Limits a requested twist: speed, wheel saturation, acceleration, deceleration and jerk.
 
-There are two ways to move. `follow` obeys a command and limits the linear and the angular axis
-separately. `coast` brings the robot to rest without a command. It reduces both axes in the same
-proportion, so that no wheel speeds up in the process (rule 2 of `acsard/README.md`). The jerk limit
-applies only to speeding up, because comfort must not delay braking.
+`follow` moves towards a command and limits the linear and the angular axis separately. `coast`
+brings the robot to rest without a command. It reduces both axes in the same proportion, because
+otherwise a wheel could speed up meanwhile (rule 2 of `acsard/README.md`). The jerk limit applies
+only to speeding up, because comfort must not delay braking.
 """
 
 from __future__ import annotations
@@ -32,19 +32,23 @@ class _State(Struct, frozen=True):
 
 
 class Limiter:
-    """Moves the allowed twist step by step towards a requested one, within the `[limits]`."""
+    """Moves the allowed twist step by step towards a requested twist, within the `[limits]`."""
 
     def __init__(self, limits: LimitsConfig, kinematics: Kinematics) -> None:
         self._kinematics = kinematics
         self.state = _State(REST, 0.0, 0.0)
-        """State from earlier steps. `Robot` restores it if a line was not written to the port."""
+        """The allowed twist and the accelerations of the last step.
+
+        If a line was not written to the port, `Robot` restores the state of the last written one.
+        """
         self.use(limits)
 
     def use(self, limits: LimitsConfig) -> None:
-        """Use these limits from now on, and brake to them at the configured deceleration.
+        """Use these limits from now on.
 
-        A lower limit of the wheel speed takes effect at once, so the caller may lower it only at
-        rest.
+        If the robot moves faster than the new speed limits allow, it slows down at the configured
+        deceleration. The wheel-speed limit is an exception: a lower one takes effect without a
+        ramp, so the caller may lower it only at rest.
         """
         self._linear = _Axis(
             limits.linear_speed,
@@ -62,7 +66,8 @@ class Limiter:
         )
         self._wheel_speed = limits.wheel_speed
         self._wished = self._goal = REST
-        """The last requested twist, and that twist scaled down to the speed limits."""
+        """`_wished` is the last requested twist. `_goal` is the same twist, scaled down to the
+        speed limits."""
 
     @property
     def twist(self) -> Twist:
@@ -70,8 +75,11 @@ class Limiter:
         return self.state.twist
 
     def follow(self, wished: Twist, dt: float) -> Twist:
-        """Move the allowed twist towards `wished`, which must be finite, for `dt` s; return it."""
-        if wished is not self._wished:  # the daemon steps more often than a sender sends
+        """Move the allowed twist towards `wished` for `dt` s, and return the new allowed twist.
+
+        `wished` must be finite.
+        """
+        if wished is not self._wished:  # most steps have the same command as the step before
             self._wished = wished
             self._goal = self._kinematics.saturate(self._within_speed(wished), self._wheel_speed)
         goal, now = self._goal, self.state
@@ -105,12 +113,12 @@ class Limiter:
         return fallen
 
     def cut(self) -> Twist:
-        """Set the twist to rest at once, without a ramp, and return it."""
+        """Set the allowed twist to zero without a ramp, and return it."""
         self.state = _State(REST, 0.0, 0.0)
         return REST
 
     def _within_speed(self, wished: Twist) -> Twist:
-        """Return the twist scaled down to the limits. An axis with the limit 0 is set to 0."""
+        """Return `wished`, scaled down to the speed limits. An axis with the limit 0 becomes 0."""
         linear = wished.linear if self._linear.speed else 0.0
         angular = wished.angular if self._angular.speed else 0.0
         scale = 1.0
@@ -128,10 +136,10 @@ def _braking(axis: _Axis, stop: bool) -> float:
 def _approach(
     speed: float, goal: float, slope: float, dt: float, axis: _Axis
 ) -> tuple[float, float]:
-    """Move `speed` towards `goal` for `dt` s; return the new speed and the acceleration used.
+    """Move `speed` towards `goal` for `dt` s. Return a pair: the new speed, and the acceleration.
 
     `slope` is the acceleration in the step before. The units are m/s and m/s2 for the linear axis,
-    and rad/s and rad/s2 for the angular one.
+    and rad/s and rad/s2 for the angular axis.
     """
     if dt <= 0.0:
         return speed, slope
@@ -141,7 +149,7 @@ def _approach(
     most = axis.acceleration if abs(target) > abs(speed) else axis.deceleration
     wanted = (target - speed) / dt
     if axis.jerk and abs(target) > abs(speed):
-        slope = slope if slope * wanted > 0 else 0.0  # the other sign is left over from braking
+        slope = slope if slope * wanted > 0 else 0.0  # otherwise it is left over from braking
         step = axis.jerk * dt
         most = min(most, abs(slope) + step, _flattenable(abs(target - speed), step, dt))
         # The slope may fall faster than the jerk limit allows only if the speed would pass the goal

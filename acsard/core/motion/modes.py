@@ -1,15 +1,16 @@
-"""The robot's mode, derived from latches and facts by one ordered list.
+"""Derives the robot's mode from the latches, the link and the commands, by one ordered list.
 
     shutdown  the daemon is going down
     fault     a fault is latched until `clear`
     stopped   a stop is latched until `clear`
     inactive  the robot is switched off until `activate`
-    waiting   the robot is active, but its board is not linked or does not report a required input
+    waiting   the robot is active, but it has no link to the board, or the board does not report a
+              required input
     driving   the robot follows a fresh command
     ready     the robot could drive, but there is no command to follow
 
-The first mode of this list whose condition holds is the robot's mode. It follows from the latches,
-the link and the commands alone, so no transition can be forgotten.
+The first mode of this list whose condition holds is the robot's mode. The mode depends on nothing
+else, not even on the previous mode, so no transition can be forgotten.
 """
 
 from __future__ import annotations

@@ -3,21 +3,22 @@
 A sender may drive if it is armed. Only a zero, which is a command to rest, arms a sender. Silence
 does not. The sender stays armed until `require_neutral`, `disarm` or `unlearn` is called.
 
-- If no other program shares the sender's identity, a zero arms the sender at once, even directly
-  after speeds.
-- Programs without a sender id or a GID may share an identity. A zero arms a shared identity only if
-  no speed of any shared identity of the source follows for `commands.neutral_pause`. Further zeros
-  and silence do not restart this time. Without the pause, the zero of one program would arm another
-  program that never stopped.
-- While the daemon stands still, it sees no speed. Therefore a stall does not count as a pause.
+- If no other program shares the sender's identity, a zero arms the sender immediately, even
+  directly after speeds.
+- Programs without a sender id and without a GID may share an identity. A zero arms a shared
+  identity only if no speed of any shared identity of the source follows for
+  `commands.neutral_pause`. Further zeros and silence do not restart this time. Without the pause,
+  the zero of one program would arm another program that never stopped.
+- While the daemon stands still, it receives no speeds. Therefore the time of a stall does not count
+  towards the pause.
 - One program without a sender id may have several shared identities in turn, because its identity
-  depends on the Zenoh session that stamps its commands. Therefore a speed of one identity cancels
-  the zeros of all.
+  depends on the Zenoh session that stamps its commands. Therefore a speed of one shared identity
+  cancels the zeros of all shared identities.
 
-A sender keeps its place before other senders while it is live. It also keeps its place for at most
-`PLACE_NS` after its last accepted command if its commands go on but their stamps are in doubt, for
-example because its clock was set, or if the daemon stood still. Otherwise a sender that holds the
-robot still would lose it to a moving one.
+A live sender keeps its place before other senders. Two events must not cost it this place: a stall
+of the daemon, and doubtful stamps, for example because the sender's clock was set. Otherwise a
+sender that holds the robot still would lose the robot to a sender of speeds. In these cases, the
+sender keeps its place for at most `PLACE_NS` after its last accepted command.
 """
 
 from __future__ import annotations
@@ -27,9 +28,9 @@ from acsard.core.motion.freshness import LONGEST_PROOF_NS, Verdict
 from acsard.core.values import REST, Command
 
 PLACE_NS = 2 * LONGEST_PROOF_NS
-"""Longest time for which a sender keeps its place without an accepted command, ns, if its commands
-go on but their stamps are in doubt, and then for which it keeps the robot without being armed. A
-longest proof that restarts with its second half ends within this time."""
+"""Longest time for which a sender keeps its place without an accepted command, ns, and longest time
+for which it keeps the robot without being armed after its clock was set. A proof of its clock ends
+within this time, even if the proof has the longest duration and restarts with its second half."""
 
 
 class Sender:
@@ -52,15 +53,16 @@ class Sender:
         self._number: int | None = None
         """Sequence number of the last accepted command, or None."""
         self._ended: Command | None = None
-        """The last zero in doubt that ended a speed, or None. A speed that this zero has overtaken
-        on its way must not begin again."""
+        """The last zero with a doubtful stamp that ended a speed, or None. An older speed that
+        arrives after this zero must not move the robot again."""
         self.clock = ""
         """Name of the clock that stamped the last command that was not refused."""
         self.twist = REST
         self.arrived_ns: int | None = None
         """Arrival of the last accepted command since `require_neutral`, monotonic ns."""
         self._present_ns = 0
-        """Arrival of the last command that kept the sender's place, monotonic ns."""
+        """Arrival of the last command for which the sender keeps its place, monotonic ns. A stall
+        of the daemon moves this time to the end of the stall."""
         self.came_ns = 0
         """Arrival of the command that ended the sender's last silence, monotonic ns."""
         self.zeros_ns: int | None = None
@@ -68,9 +70,9 @@ class Sender:
         self.speeds_ns: int | None = None
         """Arrival of the first speed since the last zero or silence, monotonic ns, or None."""
         self.disarmed_ns: int | None = None
-        """Monotonic time of the last `disarm`, ns, or None."""
+        """Monotonic time at which `disarm` last disarmed the sender, ns, or None."""
         self.ros = False
-        """Whether the last command came from ROS, whose tools send no zero by themselves."""
+        """Whether the last command came from ROS. ROS tools do not send a zero by themselves."""
         self.shared = False
         """Whether several programs may share this identity."""
         self.noticed_ns = 0
@@ -88,10 +90,11 @@ class Sender:
         return self.arrived_ns is not None and now_ns - self.arrived_ns <= self._timeout_ns
 
     def present(self, now_ns: int) -> bool:
-        """Return whether the sender keeps its place before others.
+        """Return whether the sender keeps its place before other senders.
 
-        That is so while it is live, and for at most `PLACE_NS` after its last accepted command
-        while commands in doubt follow without a silence longer than the timeout.
+        It does while it is live. It also does in two other cases, for at most `PLACE_NS` after its
+        last accepted command: while it goes on sending commands with doubtful stamps, without a
+        silence longer than the timeout, and for one timeout after a stall of the daemon.
         """
         return self.live(now_ns) or (
             self.arrived_ns is not None
@@ -100,7 +103,10 @@ class Sender:
         )
 
     def rank(self, now_ns: int) -> tuple[bool, int]:
-        """Return the order among armed senders of one priority: live ones first, then by time."""
+        """Return the sort key of the sender among equally armed senders of one priority.
+
+        Live senders come first, and then those that began to send first.
+        """
         return not self.live(now_ns), self.came_ns
 
     def doubtful(self, now_ns: int) -> bool:
@@ -125,9 +131,11 @@ class Sender:
         self._armed = self._proven_armed = not self._neutral_first
 
     def holds(self, now_ns: int) -> bool:
-        """Return whether the sender may keep a robot that it controls.
+        """Return whether the sender may keep the robot if it controls the robot already.
 
-        After `disarm`, that is so for `PLACE_NS`, and while `commands.neutral_pause` runs.
+        It may if it keeps its place (`present`) and one of these conditions holds: it is armed,
+        `disarm` disarmed it at most `PLACE_NS` ago, or `commands.neutral_pause` runs after its
+        zero.
         """
         just_set = self.disarmed_ns is not None and now_ns - self.disarmed_ns <= PLACE_NS
         waits = just_set or self._zero_ns is not None
@@ -138,11 +146,12 @@ class Sender:
         self._armed, self._zero_ns = self._proven_armed, self._proven_zero_ns
 
     def resume(self, before_ns: int, now_ns: int) -> None:
-        """Continue after the daemon stood still between these monotonic times.
+        """Continue after the daemon stood still from `before_ns` to `now_ns` (monotonic times).
 
-        The commands that arrived meanwhile may come after this step. Therefore the sender keeps its
-        place for one timeout more, at most until `PLACE_NS` after its last accepted command. The
-        stall does not count as `commands.neutral_pause`, and at least `EXCUSE_NS` of it remains.
+        The bus may deliver the commands of that time only after this step. Therefore the sender
+        keeps its place for one timeout more, at most until `PLACE_NS` after its last accepted
+        command. A running `commands.neutral_pause` does not advance during the stall, and lasts for
+        at least `EXCUSE_NS` after it.
         """
         if self.present(before_ns):
             self._present_ns = now_ns
@@ -154,10 +163,11 @@ class Sender:
             self._proven_zero_ns = self._zero_ns if proven else None
 
     def cancel_zero(self, at_ns: int) -> None:
-        """Record that a program with a shared identity may have sent a speed at `at_ns`.
+        """Record that a program with a shared identity may have sent a speed.
 
-        If this identity is shared, and `commands.neutral_pause` after its zero was not over at this
-        monotonic time, the zero no longer arms the sender.
+        `at_ns` is the monotonic time of the speed. If this sender's identity is shared, and
+        `commands.neutral_pause` after its zero was not over at that time, the zero no longer arms
+        the sender.
         """
         self._settle(at_ns)
         self._zero_ns = self._proven_zero_ns = None
@@ -172,13 +182,14 @@ class Sender:
     ) -> None:
         """Process a command that was not refused. `verdict` is the verdict on its stamp.
 
-        Before a speed of a shared identity, call `cancel_zero` of each sender of the source.
+        If the command is a speed of a shared identity, the caller must first call `cancel_zero` of
+        each sender of the source.
 
         A command from an unproven clock ("first", "unproven") does not drive the robot yet, but a
         zero with such a verdict arms the sender until `unlearn`. A zero that arrived before the
-        monotonic time `since_ns` does not arm the sender (see `Arbiter.require_neutral`). The
-        daemon has not stood still since the monotonic time `watched_ns`, so
-        `commands.neutral_pause` does not begin earlier.
+        monotonic time `since_ns` does not arm the sender (see `Arbiter.require_neutral`).
+        `watched_ns` is the monotonic time at which the daemon's last stall ended.
+        `commands.neutral_pause` does not begin before that time.
         """
         now_ns, zero = command.arrived_ns, is_zero(command)
         self._settle(now_ns)
@@ -221,7 +232,7 @@ class Sender:
         """Return whether this command was sent before `zero` but arrived after it.
 
         The network delays an accepted command by at most about the timeout. If the stamp of `zero`
-        is later by more than that, it was wrong, and must not keep the robot at rest.
+        is later by more than that, this stamp was wrong, and must not keep the robot at rest.
         """
         if command.stamp_ns is None or zero.stamp_ns is None or command.clock != zero.clock:
             return False
@@ -231,7 +242,7 @@ class Sender:
         if is_zero(command) and (
             _later(command.stamp_ns, self._stamp_ns) or _later(command.sequence, self._number)
         ):
-            # The sender stopped wishing for its last speed, however late this zero may be.
+            # The sender does not want its last speed any more, however late this zero may be.
             self.twist, self._ended = REST, command
         present = self.present(command.arrived_ns)
         if present:
@@ -248,10 +259,14 @@ class Sender:
 
 
 def _later(mark: int | None, last: int | None) -> bool:
-    """Return whether a stamp or number is higher than the last one, if there are both."""
+    """Return whether a stamp or number is higher than the last one; False if one is missing."""
     return mark is not None and last is not None and mark > last
 
 
 def is_zero(command: Command) -> bool:
-    """Return whether the command asks for rest. Wheel speeds that cancel out are not rest."""
+    """Return whether the command asks for rest.
+
+    A motion that the robot cannot perform, such as a sideways speed, does not ask for rest, even
+    though its `twist` is zero (see `Command.cancelled`).
+    """
     return command.twist == REST and not command.cancelled

@@ -54,21 +54,21 @@ TAKEN_BACK = 128
 
 
 class Step(Struct, frozen=True, gc=False):
-    """The motion that one feedback line added to the pose, kept to recompute the pose."""
+    """The motion that one feedback line added to the pose. It is kept to recompute the pose."""
 
     pose: Pose
     """The pose before the line."""
     pieces: tuple[Motors, ...]
-    """Angles that the wheels rolled since the line before, rad, one set for each arc."""
+    """Angles that the wheels rolled since the line before, rad, one item for each arc."""
     gyro: Turn | None
-    """The turn that a gyro measured, None if the wheels provided it."""
+    """The turn that a gyro measured, None if the wheels provided the turn."""
     speeds: WheelSpeeds
     turn: float
     """Change of the heading by the line, rad."""
     on_trial: bool
     """Whether the turn came from the wheels because the gyro was not proven yet."""
     share: float = 1.0
-    """The effective track in use, divided by the configured one."""
+    """The effective track that was used for this line, divided by the configured track."""
 
 
 class Odometry:
@@ -84,8 +84,8 @@ class Odometry:
     ) -> None:
         """Start at the origin.
 
-        `encoder_counts` is the number per revolution of a wheel, 0 if unknown. After `quiet` s
-        without feedback, the daemon commands rest.
+        `encoder_counts` is the number of counts per revolution of a wheel, 0 if unknown. `quiet` is
+        the time without feedback after which the daemon commands rest, s.
         """
         self._kinematics, self._track = kinematics, CONFIGURED
         self._positions = NOWHERE
@@ -93,9 +93,10 @@ class Odometry:
         self._confirmation = Confirmation(feedback)
         self._held = NOWHERE
         """Angles that the wheels have rolled at rest, rad. They are not added to the pose until
-        they exceed two encoder counts or the robot drives (see `_unsettled`)."""
+        they exceed two encoder counts (`_unsettled`) or the robot drives."""
         self._steps_of, self._coarsest = NOWHERE, 0.0
-        """Quantization steps of the speeds in the last line, and the largest known one, rad/s."""
+        """`_steps_of` are the quantization steps of the speeds in the last line, rad/s. `_coarsest`
+        is the largest known step among them, rad/s."""
         self._path = Path()
         self._errors = ErrorModel(odometry, kinematics)
         self._uncertainty = PoseUncertainty(self._errors, encoder_counts)
@@ -113,8 +114,9 @@ class Odometry:
         self.speeds = STILL
         """Wheel speeds in the last feedback line, rad/s."""
         self.gaps, self.unseen, self.bridged = 0, 0.0, 0.0
-        """Number and duration, s, of the gaps in the feedback in which the robot moved but the pose
-        could not follow, and the duration, s, of the gaps that were filled."""
+        """`gaps` and `unseen` are the number and the total duration, s, of the gaps in the feedback
+        in which the robot moved but the pose could not follow. `bridged` is the total duration of
+        the gaps that were filled, s."""
         self.travelled = 0.0
         """Distance driven since the start of the daemon, forwards plus backwards, m."""
 
@@ -136,8 +138,8 @@ class Odometry:
     def set_pose(self, pose: Pose) -> None:
         """Set the pose of base_link in odom, with the uncertainty of an initial pose.
 
-        The angles of the wheels do not change. Motion that is not in the pose yet, of lines that
-        are held or were impossible, is forgotten, because it came before.
+        The angles of the wheels do not change. The motion in held and in implausible lines, which
+        is not in the pose yet, is dropped, because it happened before this call.
         """
         self._confirmation.forget()
         self._rolling.forget()
@@ -161,17 +163,17 @@ class Odometry:
         return {name: count for name, count in ({"gaps": self.gaps} | ms).items() if count}
 
     def skip(self, feedback: Feedback) -> None:
-        """Ignore the speeds of an impossible feedback line.
+        """Ignore the speeds of an implausible feedback line (see `sanity.py`).
 
-        The next possible line adds the motion of both lines to the pose. If the impossible line has
-        encoder counts, these counts are used.
+        The next plausible line adds the motion of both lines to the pose. If the implausible line
+        has encoder counts, its motion comes from these counts.
         """
         self._rolling.skip(feedback)
 
     def confirmed(self, feedback: Feedback) -> tuple[list[Feedback], int]:
-        """Return the lines for `fold`, the oldest first, and the number of lines that were dropped.
+        """Return a pair: the lines for `fold`, the oldest first, and the number of dropped lines.
 
-        `feedback` is the next possible line. It is held if it covers a long time with a speed that
+        `feedback` is the next plausible line. It is held if it covers a long time with a speed that
         no other wheel and no other line confirms yet.
         """
         rolling, believed = self._rolling, self.checks.wheels.believed
@@ -185,7 +187,7 @@ class Odometry:
 
         - The angles that the wheels rolled come from the encoder counts of the line. Without counts
           they are the speeds times dt. After a gap without counts, only the uncertainty grows.
-        - While the robot rests, motion of up to two encoder counts does not change the pose yet.
+        - While the robot rests, a motion of up to two encoder counts does not change the pose yet.
         - If a gyro provides the turn since the line before, the wheels provide only the distance.
         - If a wheel proves faulty, the other wheel of its side replaces it, also in the earlier
           lines in which the faulty wheel was wrong.
@@ -228,12 +230,15 @@ class Odometry:
         )
 
     def _settled(self, rolled: Rolled, at_rest: bool) -> tuple[Motors, ...]:
-        """Return the angles of the wheels by which to advance the pose, rad, a set for each arc."""
+        """Return the wheel angles by which to advance the pose, rad, one item for each arc.
+
+        Small motions at rest are held back in `_held`.
+        """
         turned = rolled.turned
         if self._held != NOWHERE:
             turned = plus(self._held, turned)
         if turned == NOWHERE:
-            self._held = NOWHERE  # the wheel has turned back
+            self._held = NOWHERE  # the held motion has turned back
             return rolled.pieces
         if at_rest and max(map(abs, turned)) <= self._unsettled:
             self._held = turned
@@ -242,9 +247,9 @@ class Odometry:
         return (turned, *rolled.pieces)
 
     def _take_back(self) -> None:
-        """Recompute the pose from the recent lines in which the newly faulty wheel was wrong.
+        """Recompute the pose over the recent lines in which the newly faulty wheel was wrong.
 
-        If a gyro on trial has already corrected the turns, the heading keeps that correction.
+        If a gyro has corrected the heading at the end of its trial, the heading does not change.
         """
         was_faulty = self.checks.wheels.was_faulty
         wrong = list(takewhile(lambda step: was_faulty(step.speeds), reversed(self._steps)))
@@ -265,7 +270,7 @@ class Odometry:
     def _arcs(
         self, pieces: tuple[Motors, ...], gyro: Turn | None, share: float
     ) -> list[tuple[float, float]]:
-        """Return the arcs, each as distance (m) and turn (rad), for these angles of the wheels.
+        """Return the arcs for these wheel angles. An arc is a pair of distance (m) and turn (rad).
 
         If a gyro provides the turn, the result is one arc for all pieces. Otherwise it is one arc
         for each piece, with an effective track of `share` times the configured one.
@@ -298,7 +303,10 @@ class Odometry:
         return turned
 
     def _go_on(self, bridged: float, feedback: Feedback, before: Twist, twist: Twist) -> None:
-        """Add the uncertainty of a filled gap. Without a gap, measure how the twist changes."""
+        """Add the uncertainty of a filled gap. Without a gap, measure how the twist changes.
+
+        A gap that was not filled restarts the measurement.
+        """
         if bridged > 0.0:
             self.bridged += bridged
             self._uncertainty.doubt(*self._gaps.bridge(bridged, before, twist))

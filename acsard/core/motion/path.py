@@ -34,7 +34,7 @@ class Path:
     def advance(self, distance: float, turn: float) -> tuple[float, float, float]:
         """Add an arc of length `distance` m through `turn` rad.
 
-        Return the chord of the arc: its components along x and y, m, and its direction, rad.
+        Return the chord of the arc in odom as a tuple: its x and y, m, and its direction, rad.
         """
         half = turn / 2
         # sin(h)/h is accurate in doubles down to tiny h. Only h = 0 needs its limit.
@@ -48,7 +48,7 @@ class Path:
         return dx, dy, heading
 
     def turn(self, turn: float) -> None:
-        """Add a turn on the spot by `turn` rad."""
+        """Add a turn in place by `turn` rad."""
         self._turn(turn)
         self.pose = Pose(self._x, self._y, self._yaw)
 
@@ -58,7 +58,7 @@ class Path:
 
 
 def plus(a: float, b: float) -> tuple[float, float]:
-    """Return the double nearest to a + b, and the exact rounding error of this sum (Knuth)."""
+    """Return a pair: the double nearest to a + b, and its exact rounding error (Knuth)."""
     total = a + b
     of_b = total - a
     return total, (a - (total - of_b)) + (b - of_b)
@@ -76,7 +76,7 @@ def arc(pose: Pose, distance: float, turn: float) -> Pose:
 
 
 def _wrapped(yaw: float, turn: float) -> tuple[float, float]:
-    """Return yaw + turn within [-pi, pi], and the rounding error of this sum."""
+    """Return a pair: yaw + turn, wrapped to [-pi, pi], and the rounding error of this sum."""
     total, rest = plus(yaw, turn)
     wrapped = math.remainder(total, math.tau)
     if wrapped != total:

@@ -5,9 +5,9 @@ daemon does not use such a line, and several in a row are a fault. If more than 
 hundred is impossible, the daemon logs a warning: either the wire damages lines, or a bound is too
 low and true lines are rejected. `wheel_faults.py` checks whether the wheels obey their commands.
 
-A plain line has no checksum, so the last possible line may itself be damaged, and then the true
-lines after it look impossible. It is trusted only if it agreed with the line before it. Until then,
-two later lines that agree with each other outvote it.
+A plain line has no checksum, so a damaged line may look possible, and then the true lines after it
+look impossible. Therefore a possible line is trusted only if it agrees with the possible line
+before it. A line that is not trusted is outvoted by two later lines that agree with each other.
 """
 
 from __future__ import annotations
@@ -24,70 +24,69 @@ REPEATED = 3
 """Number of impossible lines in a row that latch a fault: 30 ms at 100 Hz."""
 
 WINDOW = 1000
-"""Number of lines in a window. The impossible lines of each window are counted. A window lasts 10 s
-at 100 Hz."""
+"""Number of lines in a window, in which impossible lines are counted. A window lasts 10 s at
+100 Hz."""
 
 SHARE = 0.01
-"""If more than this share of the lines in a window is impossible, one warning is logged."""
+"""If more than this fraction of the lines in a window is impossible, one warning is logged."""
 
 SLACK = 2.0
-"""Allowed change of a speed, rad/s, beyond `feedback.wheel_acceleration`. Coarse encoders and a
-robot at rest can cause changes of this size."""
+"""Change of a speed, rad/s, that is allowed in addition to `feedback.wheel_acceleration`. Coarse
+encoders and a robot at rest can cause changes of this size."""
 
 STEPS = 2
 """Encoder counts by which two reports of a wheel at constant speed may differ, because each report
 may be wrong by one count."""
 
 SHORTEST_S = 0.004
-"""Shortest time that is expected between two lines, s. Lines follow each other this quickly while
-this computer catches up after a stall. A single encoder count in so short a time looks like a high
-speed."""
+"""Shortest time between two lines, s. Lines follow each other this quickly while this computer
+catches up after a stall. A single encoder count in so short a time looks like a high speed."""
 
 
 class Sanity:
-    """Compares each feedback line with the last line that was physically possible.
+    """Compares each feedback line with the reference: the last line that was possible.
 
-    A line that contradicts that line is still possible if that line is not trusted and the new line
-    agrees with one of the last impossible lines.
+    A line that contradicts the reference still counts as possible if the reference is not trusted,
+    and if the line agrees with one of the impossible lines since the reference.
     """
 
     def __init__(self, feedback: FeedbackConfig) -> None:
         self._settings = feedback
         self._last: WheelSpeeds | None = None
         self._trusted = False
-        """Whether `_last` differs so little from the line before it that a line with the earlier
-        speeds would be possible after it."""
+        """Whether `_last` agreed with the possible line before it. If it did, a next line with the
+        speeds of that earlier line would be possible too."""
         self._rejected: list[tuple[WheelSpeeds, float]] = []
-        """The last impossible lines since `_last`, each with its time since `_last`, s. Lines over
-        `feedback.wheel_speed` are left out."""
+        """The newest impossible lines since `_last`: pairs of the speeds and the time since
+        `_last`, s. Lines with a speed over `feedback.wheel_speed` are not included."""
         self._since = 0.0
         self._longest = 0.0
-        """Longest time over which a recent line reports the mean speed, s. A line that covers a
-        pause of t s counts as recent for t s."""
+        """Longest time that a recent line covers, s. The speeds in a line are means over this time.
+        A line that covers t s counts as recent for t s."""
         self._impossible = 0
         self._lines = self._dropped = 0
         """Numbers of all lines and of impossible lines in the present window."""
         self.warning: Event | None = None
-        """The warning of too many impossible lines. None unless the last line caused it."""
+        """The warning that too many lines are impossible; None unless the last line caused it."""
 
     def forget(self) -> None:
         """Start over, because the link was lost or a fault has been cleared.
 
-        The next line is still compared with the last one, but that line is not trusted.
+        The next line is still compared with the last possible line, which is not trusted any more.
         """
         self._trusted, self._impossible = False, 0
 
     @property
     def doubtful(self) -> bool:
-        """Whether so many impossible lines came in a row that the feedback cannot be trusted."""
+        """Whether the last `REPEATED` lines or more were impossible, which latches a fault."""
         return self._impossible >= REPEATED
 
     def impossible(self, feedback: Feedback) -> str:
         """Return why no wheel can have the speeds in this line; "" if the line is possible.
 
         The allowed change of each speed grows with the time since the last possible line, so a real
-        jump is accepted after enough time. Each speed is a mean over the time of its line, so the
-        change may have lasted from the middle of one line to the middle of the next.
+        jump is accepted after enough time. Each speed is a mean over the time that its line covers,
+        so the change may have lasted from the middle of one such time to the middle of the next.
         """
         since = max(feedback.dt, feedback.since)
         self._since += since
@@ -102,7 +101,7 @@ class Sanity:
         most = self._most(self._since, longest)
         why = ""
         if max(map(abs, wheels)) > self._settings.wheel_speed or change > most:
-            # Nearly no line comes here. Only these lines need a look at the quantization steps.
+            # Few lines come here, and only for them do the quantization steps matter.
             why = self._too_fast(feedback)
             if not why and last is not None:
                 why = self._jump(feedback, last, most)
@@ -114,8 +113,8 @@ class Sanity:
         if why:
             self._impossible += 1
             return why
-        # If this line is damaged, the next line changes by `change` again. It is allowed a change
-        # over half of `_longest` at least.
+        # If this line is damaged, the speeds change back by `change` in the next line. Every next
+        # line may at least change by as much as a wheel can in half of `_longest`.
         self._trusted = last is not None and change <= self._most(0.0, self._longest)
         self._last, self._since, self._impossible = speeds, 0.0, 0
         if self._rejected:
@@ -123,14 +122,14 @@ class Sanity:
         return ""
 
     def _most(self, since: float, longest: float) -> float:
-        """Return the largest change of a speed within `since` s, rad/s.
+        """Return the largest possible change of a speed within `since` s, rad/s.
 
-        `longest` is the longest time over which one of the lines before reports the mean speed, s.
+        `longest` is the longest time that one of the recent lines covers, s (see `_longest`).
         """
         return self._settings.wheel_acceleration * max(since, (since + longest) / 2) + SLACK
 
     def _agrees(self, line: Feedback, longest: float) -> bool:
-        """Return whether a line agrees with one of the last impossible lines."""
+        """Return whether a line agrees with one of the impossible lines in `_rejected`."""
         return any(
             not self._jump(line, speeds, self._most(self._since - since, longest))
             for speeds, since in self._rejected
@@ -156,7 +155,7 @@ class Sanity:
         )
 
     def _too_fast(self, line: Feedback) -> str:
-        """Return why a speed in this line is too high, "" if none is."""
+        """Return why a speed in this line is too high; "" if no speed is."""
         wheels, fastest = line.speeds.as_tuple(), self._settings.wheel_speed
         turned = _proven(line)
         for name, now, step, angle in zip(
@@ -175,7 +174,11 @@ class Sanity:
         return ""
 
     def _jump(self, line: Feedback, before: WheelSpeeds, most: float) -> str:
-        """Return why a speed in this line differs too much from `before`, "" if none does."""
+        """Return why a speed in this line differs from `before` by more than `most` allows.
+
+        Return "" if no speed does. `most` is in rad/s. The quantization of the speeds allows a
+        further difference.
+        """
         least = line.count / SHORTEST_S if _proven(line) is not None else 0.0
         rows = zip(WHEELS, line.speeds.as_tuple(), before.as_tuple(), line.steps, strict=True)
         for name, now, then, step in rows:
@@ -186,5 +189,5 @@ class Sanity:
 
 
 def _proven(line: Feedback) -> Motors | None:
-    """Return the angles that encoder counts prove for this line, rad, None without counts."""
+    """Return the wheel angles that encoder counts prove, rad; None if the line has no counts."""
     return line.counted if line.turned is None else line.turned

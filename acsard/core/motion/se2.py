@@ -5,8 +5,9 @@ the constant twist that leads from the estimated pose to the true pose in one un
 vector (x, y, yaw).
 
 Errors are expressed in axes that are parallel to those of odom, with the origin at the robot. When
-the robot moves, only x and y of an error in these axes change, by its yaw times the displacement
-(`seen_from`). In the axes of base_link it would change by the adjoint of the robot's displacement.
+the robot moves, only x and y of an error in these axes change, by the yaw of the error times the
+displacement (`seen_from`). In the axes of base_link, the error would change by the adjoint of the
+displacement.
 
 A covariance is the covariance of such a vector. E[...] is an expected value, ' means transposed,
 and [a, b] is the Lie bracket of two errors.
@@ -35,10 +36,10 @@ def bracket(a: Vector, b: Vector) -> Planar:
 
 
 def brackets(a: Vector, p: PoseCovariance, times: float) -> tuple[Vector, Vector]:
-    """Return E[[a, e] e'] multiplied by `times`, for a random pose error e with covariance `p`.
+    """Return the rows x and y of the matrix `times` E[[a, e] e'], whose row yaw is always 0.
 
-    E is the expected value, [a, e] is the Lie bracket, and ' means transposed. The result has the
-    rows x and y, because the row yaw is always 0.
+    e is a random pose error with the covariance `p`, E is the expected value, [a, e] is the Lie
+    bracket, and ' means transposed.
     """
     x, y, yaw = times * a[0], times * a[1], times * a[2]
     return (
@@ -77,13 +78,19 @@ def twice_bracketed(p: PoseCovariance, a: Vector) -> PoseCovariance:
 
 
 def seen_from(error: Vector, dx: float, dy: float) -> Vector:
-    """Return a pose error, in axes parallel to odom, after a motion by `dx`, `dy` m in odom."""
+    """Return a pose `error` as it is after the robot has moved by `dx`, `dy` m in odom.
+
+    Both errors are in axes parallel to odom, with the origin at the robot.
+    """
     x, y, yaw = error
     return x - dy * yaw, y + dx * yaw, yaw
 
 
 def carried(p: PoseCovariance, dx: float, dy: float) -> PoseCovariance:
-    """Return the covariance `p` of a pose error after a motion by `dx`, `dy` m in odom."""
+    """Return the covariance of a pose error after the robot has moved by `dx`, `dy` m in odom.
+
+    `p` is the covariance before that motion.
+    """
     return PoseCovariance(
         p.xx - 2 * dy * p.xyaw + dy * dy * p.yawyaw,
         p.xy + dx * p.xyaw - dy * p.yyaw - dx * dy * p.yawyaw,
@@ -97,10 +104,11 @@ def carried(p: PoseCovariance, dx: float, dy: float) -> PoseCovariance:
 def added(
     p: PoseCovariance, along: float, yaw: float, both: float, c: float, s: float
 ) -> PoseCovariance:
-    """Return the covariance `p` of the pose plus the noise of a step.
+    """Return the covariance of the pose, `p`, plus the covariance of the noise of a step.
 
-    `along` is the variance of the distance, m2, `yaw` that of the turn, rad2, and `both` their
-    covariance, m rad. `c` and `s` are the cosine and the sine of the direction of the step in odom.
+    The noise of the step has the variance `along` of the distance, m2, the variance `yaw` of the
+    turn, rad2, and the covariance `both` of distance and turn, m rad. `c` and `s` are the cosine
+    and the sine of the direction of the step in odom.
     """
     cc, cs = along * c, along * s
     return PoseCovariance(
@@ -125,8 +133,8 @@ def stepped(
 ) -> PoseCovariance:
     """Return the covariance of the pose after a step by `dx`, `dy` m, with the noise of the step.
 
-    This is `added(carried(p, dx, dy), along, yaw, both, c, s)` in one function, because it runs for
-    each feedback line.
+    The result is that of `added(carried(p, dx, dy), along, yaw, both, c, s)`. One function is
+    faster, and the covariance is updated for each feedback line.
     """
     xyaw, yyaw, yawyaw = p.xyaw, p.yyaw, p.yawyaw
     cc, cs = along * c, along * s

@@ -2,8 +2,8 @@
 
 If the true heading deviates from the estimated one and returns, the robot ends short of the
 estimated place, and never beyond it. This is an effect of second order. On a straight drive, it
-causes nearly the whole error along the path: after 60 m with k = 1e-5 (`error_model.py`) the error
-is 17 mm to first order, but 0.12 m in truth.
+causes nearly the whole error along the path: after 60 m with k = 1e-5 (`error_model.py`) the
+first-order error is 17 mm, but the true error is 0.12 m.
 
 The path is divided into stretches. Each stretch composes the error e of the path before it with its
 own error w. The formula of Baker, Campbell and Hausdorff gives the composed error, where [a, b] is
@@ -25,7 +25,8 @@ The term [e, w] / 2 then adds these errors to x and y. Sums are over all stretch
     sum of [x, n] / 2           independent in each stretch, so the covariances are summed
     sum over i of p_i M_i       M_i = sum of ([J_i, n] + [x, W_i]) / 2, where M_i correlates with x
     sum over i <= k of p_i p_k C_ik
-                                C_ik = sum of ([J_i, W_k] + [J_k, W_i]) / 2, half of it for i = k
+                                C_ik = sum of ([J_i, W_k] + [J_k, W_i]) / 2, or half of that sum
+                                if i = k
 
 Each p_i is independent of the rest and has the mean 0, so these sums are uncorrelated with each
 other and with e. From the last two terms of the series, only the part from noise is used. Without
@@ -49,8 +50,8 @@ from acsard.core.motion.se2 import (
 from acsard.core.values import PoseCovariance
 
 MAX_HEADING_VARIANCE = 1.0
-"""Largest variance of the heading for which the terms are computed, rad2. With a larger one
-the series does not converge, and the terms are 0."""
+"""Largest variance of the heading for which the terms are computed, rad2. With a larger variance
+the series does not converge, and a stretch adds nothing to the terms."""
 
 NOTHING = PoseCovariance(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -62,7 +63,8 @@ class SecondOrder:
         self._noise: Vector = ORIGIN
         """Covariance (xx, xy, yy), m2, of the sum of all [x, n] / 2 and M_i of the module."""
         self._with_x: list[tuple[Vector, Vector]] = []
-        """Covariance of M_i with the noise x (see the module), as rows for the x and the y axis."""
+        """For each parameter, the covariance of M_i with the error x of the module. The two rows
+        are those of the components of M_i along the x and the y axis."""
         self._bent: dict[tuple[int, int], Planar] = {}
         """C_ik of the module for each pair of parameters, m. The larger index comes first."""
         for _ in range(columns):
@@ -72,7 +74,7 @@ class SecondOrder:
         does not change them, because they have no yaw (`se2.seen_from`)."""
 
     def widen(self) -> None:
-        """Add one more parameter. The pose does not depend on it so far: its derivatives are 0."""
+        """Add one more parameter, which has not affected the pose so far."""
         self._with_x.append((ORIGIN, ORIGIN))
         i = len(self._with_x) - 1
         self._bent |= {(i, k): (0.0, 0.0) for k in range(i + 1)}
@@ -119,8 +121,8 @@ class SecondOrder:
         x, y = self._with_x[i]
         by_new_x, by_new_y = brackets(new, p, -0.5)
         by_noise_x, by_noise_y = brackets(column, q, 0.5)
-        # [x, W_i] / 2 also correlates with the earlier M_i. This covariance counts twice in the
-        # variance of the sum.
+        # [x, W_i] / 2 also correlates with M_i before this stretch. The variance of their sum
+        # contains this covariance twice.
         ax, ay = bracket(new, plus(plus(x, x), by_new_x))
         bx, by = bracket(new, plus(plus(y, y), by_new_y))
         cx, cy = bracket(column, by_noise_x)

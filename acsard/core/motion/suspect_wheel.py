@@ -3,12 +3,12 @@
 A faulty encoder shows one of three signs. It is dead (reports no turn), reversed (reports the
 opposite of the other wheel) or stuck (repeats one speed). A wheel with such a sign is faulty if an
 independent reference differs more from this wheel than from the other wheel of its side. The
-reference is the turn according to a gyro or, without a gyro, the command. The speed of a healthy
+reference is the turn according to a gyro or, without a gyro, the command: the speed of a healthy
 wheel lies between its command and the speed that a wheel with `feedback.response_time` has reached
 by now. Without a reference, only a stuck wheel is found, because a person who pushes the robot may
 turn one wheel and not the other.
 
-`Suspect` tests a wheel that contradicts the other one of its side. `Stuck` tests every wheel,
+`Suspect` tests a wheel that contradicts the other wheel of its side. `Stuck` tests every wheel,
 because a stuck encoder agrees with the other wheel until the command changes.
 """
 
@@ -20,38 +20,38 @@ from typing import Literal
 from acsard.core.motion.wheel_witness import Expected
 
 FAULT_S, FAULT_LINES = 0.025, 2
-"""Shortest time, s, and smallest number of lines for which a sign of a fault must last. At 100 Hz,
-`FAULT_S` takes three lines, so one bad reading is not enough."""
+"""A sign of a fault must last for at least `FAULT_S` s and for at least `FAULT_LINES` lines. At
+100 Hz, `FAULT_S` takes three lines, so one bad reading is not enough."""
 
 FAULT_COUNTS, FAULT_ANGLE = 3.5, 0.05
-"""Smallest difference of the angles of two wheels at which one of them can be called faulty: this
-number of encoder counts plus this angle in rad."""
+"""Smallest difference of the angles of two wheels at which one of them can be called faulty:
+`FAULT_COUNTS` encoder counts plus `FAULT_ANGLE` rad."""
 
 FOLLOWED_COUNTS, FOLLOWED_ANGLE = 2.5, 0.01
-"""After a new command, a wheel that repeats its old speed is called stuck only if a healthy wheel
-would have turned further or less by this number of encoder counts plus this angle in rad."""
+"""After a new command, a wheel that repeats its old speed is called stuck only if the angle of a
+healthy wheel would differ by `FOLLOWED_COUNTS` encoder counts plus `FOLLOWED_ANGLE` rad."""
 
 LEAVES = 0.05
 """Least change of the command, rad/s, after which a healthy wheel must report another speed."""
 
 VOTE = 1 / 3
-"""A reference (a gyro or the command) decides which of two wheels is faulty only if it is clearly
-nearer to one of them. The two distances from the reference must differ by at least this share of
-the difference between the wheels."""
+"""A reference (a gyro or the command) decides which of two wheels is faulty only if the reference
+is clearly nearer to one of them. The two distances from the reference must differ by at least this
+fraction of the difference between the wheels."""
 
 HAND_S = 0.3
 """Time for which a wheel must repeat one speed without a command before it is called stuck, s. A
 hand cannot turn a wheel as evenly as this."""
 
 DEAD, REVERSED = 0.1, 0.3
-"""Shares of the turn of the other wheel on the same side. A wheel is dead if it turns by less than
-the share `DEAD`. It is reversed if it turns in the opposite direction, and the sizes of the two
-turns differ by less than the share `REVERSED`."""
+"""Fractions of the angle that the other wheel of the side rolled. A wheel is dead if it rolled by
+at most the fraction `DEAD`. It is reversed if it rolled in the opposite direction, and if the
+magnitudes of the two angles differ by at most the fraction `REVERSED`."""
 
 STUCK = 0.3
-"""Smallest difference between the two wheels of a side at which one can be called stuck, as a share
-of the faster wheel's angle. If the difference is smaller, the wheel with the constant speed may be
-healthy while the other wheel slips."""
+"""Smallest difference between the two wheels of a side at which one of them can be called stuck, as
+a fraction of the faster wheel's angle. If the difference is smaller, the wheel with the constant
+speed may be healthy while the other wheel slips."""
 
 WheelFault = Literal["dead", "reversed", "stuck"]
 
@@ -63,8 +63,8 @@ WORDS: dict[WheelFault, str] = {
 
 
 class _Ballot:
-    """Sums over feedback lines, rad: the angles that two wheels rolled, and the lowest and the
-    highest angle that a healthy wheel rolled according to a reference."""
+    """Sums of angles over feedback lines, rad: the angles that two wheels rolled, and the lowest
+    and the highest angle that a healthy wheel can have rolled according to a reference."""
 
     def __init__(self) -> None:
         self._own = self._other = self._low = self._high = 0.0
@@ -82,12 +82,12 @@ class _Ballot:
 
     @property
     def vote(self) -> float:
-        """Which wheel is wrong: from 1 (only the suspect wheel) to -1 (only the other wheel)."""
+        """A number from 1 (only the suspect wheel is wrong) to -1 (only the other wheel is)."""
         return (self._off(self._own) - self._off(self._other)) / (self.apart or 1.0)
 
     @property
     def share(self) -> float:
-        """Difference between the two wheels, divided by the turn of the faster one."""
+        """Difference between the two wheels, divided by the angle of the faster wheel."""
         return self.apart / (max(abs(self._own), abs(self._other)) or 1.0)
 
     def _off(self, turned: float) -> float:
@@ -95,7 +95,7 @@ class _Ballot:
 
 
 class Suspect:
-    """The test, line by line, of one wheel that contradicts the other one of its side."""
+    """The test, over several lines, of a wheel that contradicts the other wheel of its side."""
 
     def __init__(self) -> None:
         self.forget()
@@ -107,15 +107,15 @@ class Suspect:
         self._seconds = self._apart = 0.0
         self._command, self._gyro = _Ballot(), _Ballot()
         self._begun: float | None = None
-        """Size of the angle that the wheel turned in the first line of the test, rad."""
+        """Magnitude of the angle that the wheel rolled in the first line of the test, rad."""
         self._known = False
-        """Whether the command could serve as a reference in any line of the test."""
+        """Whether the command could serve as a reference in at least one line of the test."""
 
     def looks(self, own: float, other: float, same: bool, dt: float, count: float) -> bool:
-        """Take in a line of feedback, and return whether the wheel now shows a sign of a fault.
+        """Add a feedback line of `dt` s, and return whether the wheel now shows a sign of a fault.
 
         `own` and `other` are the angles that this wheel and the other wheel of its side rolled, and
-        `count` is the angle per encoder count, rad. `same` is true if this wheel repeats the
+        `count` is the angle of an encoder count, rad. `same` is true if this wheel repeats the
         speed of the line before.
         """
         sign = self._sign(own, other, same, count)
@@ -128,7 +128,7 @@ class Suspect:
         return sign is not None
 
     def _sign(self, own: float, other: float, same: bool, count: float) -> WheelFault | None:
-        """Return the sign of a fault in this line, None without one."""
+        """Return the sign of a fault that this line shows, or None."""
         if self.sign == "stuck" and same:
             return "stuck"
         if reverses(own, other, count) or (self.sign == "reversed" and own * other == 0.0):
@@ -153,8 +153,9 @@ class Suspect:
         """
         slow, command = expected.speed, expected.commanded
         self._begun = abs(own) if self._begun is None else self._begun
-        # After a command to the other direction, a sound wheel of a slow robot still turns against
-        # the command. It obeys if it does not turn faster than in the first line of the test.
+        # After a command to the other direction, a sound wheel of a slow robot turns against the
+        # command for a while. It obeys if it does not turn faster than in the first line of the
+        # test.
         obeys = not expected.settled and own * command < 0.0 and abs(own) <= self._begun + count
         if expected.clear and not obeys:
             self._command.add(own, other, min(slow, command) * dt, max(slow, command) * dt)
@@ -165,7 +166,7 @@ class Suspect:
     def is_faulty(self, count: float) -> bool:
         """Return whether this wheel, and not the other one, is faulty.
 
-        `count` is the angle per encoder count, rad.
+        `count` is the angle of an encoder count, rad.
         """
         enough = FAULT_COUNTS * count + FAULT_ANGLE
         if self._lines < FAULT_LINES or self._seconds < FAULT_S or abs(self._apart) < enough:
@@ -184,9 +185,9 @@ class Suspect:
 class Stuck:
     """The test of one wheel for a speed that stays the same although it must change.
 
-    While the robot drives at a constant speed, nothing can detect a stuck encoder, but it does not
-    harm the pose either. After a new command, a healthy wheel must report another speed as soon as
-    its expected angle differs by a few counts from the angle at the old speed. If only the other
+    While the robot drives at a constant speed, no test can detect a stuck encoder, but then it does
+    not harm the pose either. After a new command, a healthy wheel must report another speed as soon
+    as its expected angle differs by a few counts from the angle at the old speed. If only the other
     wheel of the side reports another speed, this encoder is stuck.
     """
 
@@ -198,15 +199,18 @@ class Stuck:
         self._seconds = self._followed = self._other = 0.0
 
     def left_by(self, command: float) -> bool:
-        """Return whether `command`, rad/s, changed since the wheel first reported this speed."""
+        """Return whether the command has changed since the wheel first reported its present speed.
+
+        `command` is the present command, rad/s.
+        """
         return abs(command - self._command) >= LEAVES
 
     def says(self, same: bool, apart: float, dt: float, count: float, expected: Expected) -> bool:
         """Add a line, and return whether the encoder is stuck.
 
         `same` is true if the wheel turns and repeats the speed of the line before. `apart` is the
-        angle by which the other wheel of the side turned further than this one, rad. `count` is the
-        angle of an encoder count, rad.
+        angle by which the other wheel of the side turned further than this wheel, rad. `count` is
+        the angle of an encoder count, rad.
         """
         slow, command = expected.speed, expected.commanded
         leaves = command - self._command
@@ -226,14 +230,18 @@ class Stuck:
 
 
 def stands(own: float, other: float) -> bool:
-    """Return whether a wheel that turned `own` rad stands, while the other turned `other` rad."""
+    """Return whether a wheel seems to stand.
+
+    The wheel turned `own` rad, and the other wheel of its side turned `other` rad.
+    """
     return own == 0.0 or abs(own) <= DEAD * abs(other)
 
 
 def reverses(own: float, other: float, count: float) -> bool:
-    """Return whether a wheel that turned `own` rad turned about as far as the other, but backwards.
+    """Return whether a wheel turned about as far as the other one, but in the opposite direction.
 
-    The other wheel turned `other` rad. `count` is the angle per encoder count, rad.
+    The wheel turned `own` rad, and the other wheel of its side turned `other` rad. `count` is the
+    angle of an encoder count, rad.
     """
     return own * other < 0.0 and abs(own + other) <= REVERSED * abs(other) + FAULT_COUNTS * count
 

@@ -14,15 +14,15 @@ deviation. Each step updates both parts, and their sum is published (' means tra
   (`se2.seen_from`).
 - Q (2x2) is the covariance of the noise in the distance and the turn of the step
   (`error_model.Noise`).
-- G (3x2) transforms errors of distance and turn to an error of the pose. The distance points along
-  the chord of the step.
+- G (3x2) transforms errors of distance and turn to an error of the pose. The distance is along the
+  chord of the step.
 - G_p has a column for each parameter: the error of the pose that it causes in this step
   (`error_model.columns`).
 
-The covariance in nav_msgs/Odometry is that of x and y in the axes of odom, and of yaw. To first
-order it equals the covariance of e in these axes, so P_total is published. Rotated by -yaw, P_total
-is the covariance of e in the axes of base_link. This rotated covariance is right even if the
-heading is so uncertain that the possible positions form an arc and not an ellipse.
+The covariance in nav_msgs/Odometry is defined for x and y in the axes of odom, and for yaw. To
+first order it equals the covariance of e in these axes, so P_total is published. Rotated by -yaw,
+P_total is the covariance of e in the axes of base_link. This rotated covariance is right even if
+the heading is so uncertain that the possible positions form an arc and not an ellipse.
 
 The noise of a turn depends on |dyaw|. On a straight drive, the encoder counts of both sides arrive
 at different times, so the heading turns back and forth by one count. The sum of |dyaw| over all
@@ -54,14 +54,14 @@ MAX_VARIANCE = 1e9
 """Largest variance of the pose, m2 or rad2. A variance of this size means "unknown"."""
 
 COARSE_COUNTS = 400
-"""Encoder counts per revolution of a wheel that are assumed if the configuration has no number. Few
-encoders have fewer."""
+"""Number of encoder counts per revolution of a wheel that is assumed if the configuration has no
+number. Few encoders have a smaller number."""
 
 NOWHERE = PoseCovariance(MAX_VARIANCE, 0.0, 0.0, MAX_VARIANCE, 0.0, MAX_VARIANCE)
 
 GYRO_SCALE = 0.004
 """Relative standard deviation of a gyro's scale. An error of this size changes the heading by 1.4
-degrees in one revolution. It has no effect after equal turns to the left and to the right."""
+degrees in one revolution. After equal turns to the left and to the right, its effects cancel."""
 
 NO_EFFECT: Column = (0.0, 0.0, 0.0, 0.0)
 
@@ -70,24 +70,27 @@ STRETCH = 0.2
 
 
 class PoseUncertainty:
-    """Computes the covariance of the pose, in plain floats because it is updated at 100 Hz."""
+    """Computes the covariance of the pose. It uses plain floats, because updates come at 100 Hz."""
 
     def __init__(self, model: ErrorModel, counts: int) -> None:
-        """Start at the origin. `counts`: encoder counts per wheel revolution, 0 if unknown."""
+        """Start at the origin.
+
+        `counts` is the number of encoder counts per revolution of a wheel, 0 if unknown.
+        """
         self._model = model
         self._parameters = self._effects = model.columns
         self._counted = counts > 0
         self._count = 0.0
         self._stand_within(math.tau / (counts or COARSE_COUNTS))
         self._dx = self._dy = self._rolled = 0.0
-        """Displacement in odom, and distance that the wheels rolled, since the last update of the
-        second-order terms, m."""
+        """Motion since the last update of the second-order terms, m. `_dx` and `_dy` are the
+        displacement in odom, and `_rolled` is the distance that the wheels rolled."""
         self.set(0.0)
 
     def bend(self) -> None:
         """Use the present track and columns of the error model from now on.
 
-        The number of columns must not have changed.
+        The error model must have as many columns as before.
         """
         beside = self._effects[len(self._parameters) :]
         self._parameters = self._model.columns
@@ -95,7 +98,7 @@ class PoseUncertainty:
         self._stand_within(self._count)
 
     def _stand_within(self, angle: float) -> None:
-        """Set the angle of one encoder count, rad, and compute two effects of this angle.
+        """Set the `angle` of one encoder count, rad, and compute two effects of this angle.
 
         The first effect is the dead band of the heading. The second effect is an uncertainty of the
         pose, because each wheel may stand anywhere between two counts.
@@ -105,7 +108,7 @@ class PoseUncertainty:
         self._phase = (count**2 / 24 / 2, count**2 / 24 * 2 / track**2, 0.0)
 
     def set(self, yaw: float) -> None:
-        """Reset the covariance to that of an initial pose with the heading `yaw`, rad."""
+        """Reset the covariance to the initial one, for a pose with the heading `yaw`, rad."""
         xx, yy, _, _, _, yawyaw = self._model.settings.pose_covariance_diagonal
         self._p = PoseCovariance(xx, 0.0, 0.0, yy, 0.0, yawyaw)
         self._cos, self._sin = math.cos(yaw), math.sin(yaw)
@@ -116,8 +119,8 @@ class PoseUncertainty:
         """The columns of the matrix J of the module. The columns for the gyro's scale and for gaps
         are added when needed."""
         self._of_gyro = self._of_gaps = -1
-        """Indices in `_columns` for the gyro's scale and for motion in gaps; -1 if there is no such
-        column."""
+        """Indices in `_columns` of the column for the gyro's scale and of the column for gaps. An
+        index is -1 if there is no such column yet."""
         self._columns_before = self._columns
         self._turned = self._middle = 0.0
         self._second = SecondOrder(len(self._effects))
@@ -160,7 +163,7 @@ class PoseUncertainty:
         self._publish()
 
     def doubt(self, along: float, yaw: float) -> None:
-        """Make the last step more uncertain, by variances of its distance, m2, and turn, rad2."""
+        """Add the variances `along` of distance, m2, and `yaw` of turn, rad2, to the last step."""
         if not self._lost:
             self._p = added(self._p, along, yaw, 0.0, self._cos, self._sin)
             self._publish()
@@ -168,9 +171,10 @@ class PoseUncertainty:
     def stand(self, distance: float, turn: float, along: float, yaw: float) -> None:
         """Add the uncertainty of a gap in the feedback, during which the pose was not updated.
 
-        The motions that the pose missed in several gaps add up and do not average out, so they are
-        treated like the error of a parameter. `distance`, m, and `turn`, rad, are the probable
-        motion, and `along`, m2, and `yaw`, rad2, are their variances.
+        `distance`, m, and `turn`, rad, are the probable motion in the gap, and `along`, m2, and
+        `yaw`, rad2, are the variances of distance and turn. The motions that the pose missed in
+        several gaps add up and do not average out, so they are treated like the error of a
+        parameter.
         """
         if self._lost:
             self._forget_where(distance, turn)
@@ -190,7 +194,7 @@ class PoseUncertainty:
         self._publish()
 
     def _widen(self) -> int:
-        """Add a column of zeros to J for a further source of error; return the column's index."""
+        """Add a column of zeros to J for a further source of error, and return its index."""
         self._effects = (*self._effects, NO_EFFECT)
         self._columns = [*self._columns, ORIGIN]
         self._columns_before = [*self._columns_before, ORIGIN]
@@ -219,7 +223,7 @@ class PoseUncertainty:
 
         Half of the heading error of the step acts on the displacement of the step itself, because
         the direction of the chord is the old heading plus half of the turn. If a gyro measured the
-        turn, `scale` is the relative standard deviation of its scale, otherwise None.
+        turn, `scale` is the relative standard deviation of the gyro's scale. Otherwise it is None.
         """
         c, s, more = self._cos, self._sin, 0.0
         columns: list[Vector] = []
@@ -275,7 +279,7 @@ class PoseUncertainty:
 
 
 def _capped(p: PoseCovariance) -> PoseCovariance:
-    """Return the covariance with variances of at most `MAX_VARIANCE` and the same correlations."""
+    """Return `p` with its variances limited to `MAX_VARIANCE` and its correlations unchanged."""
     x, y, yaw = (
         min(1.0, math.sqrt(MAX_VARIANCE / max(v, MAX_VARIANCE))) for v in (p.xx, p.yy, p.yawyaw)
     )

@@ -6,17 +6,18 @@ and an independent reference contradicts it (`suspect_wheel.py`). The pose then 
 and uses the other one in its place.
 
 - If both wheels agree again for `BACK_S` of rolling, the pose uses the ignored wheel again.
-- If the ignored wheel contradicts the other one and its command for `feedback.fault_time`, the
-  robot latches a fault.
-- If any wheel contradicts its command for this time (`wheel_witness.py`), the robot latches a fault
-  too, because both wheels of a side may be wrong and agree with each other.
+- If the ignored wheel contradicts both the other wheel and its command for `feedback.fault_time`,
+  the robot latches a fault.
+- If any wheel contradicts its command for this time (`wheel_witness.py`), the robot also latches a
+  fault, because both wheels of a side may be wrong and agree with each other.
 
-Every other contradiction counts as slip, and so does a faulty encoder until the fault is proven. At
-most one wheel of each side is ignored. A wheel that is blocked or dragged looks like one with a
-dead encoder, so it is ignored too. The other wheel shows the distance driven.
+Every other contradiction counts as slip. A faulty encoder also counts as slip until the fault is
+proven. At most one wheel of each side is ignored. A wheel that is blocked or dragged looks like a
+wheel with a dead encoder, so it is ignored too. The other wheel shows the distance driven.
 
-If a wheel turns after a rest without a command, a hand or a slope turns it. This motion is reported
-but it is never a fault, because the daemon could only react with the zero that it already sends.
+If a wheel has rested and then turns without a command, a hand or a slope turns it. This motion is
+reported, but it is never a fault, because the daemon could only react with the zero that it already
+sends.
 """
 
 from __future__ import annotations
@@ -34,20 +35,21 @@ from acsard.core.motion.wheel_witness import FAULTS, SLACK, Expected, Witness
 from acsard.core.values import STILL, WHEELS, Event, WheelSpeeds, WheelsStatus
 
 COARSEST, FINEST = math.tau / 16, math.tau / 2000
-"""Range in which the angle of one encoder count is learned if it is not configured, rad."""
+"""Largest and smallest angle of one encoder count, rad, that is learned if the number of counts is
+not configured."""
 
 RECUR, SOUGHT = 3, 1000
-"""Number of times that a small wheel angle must occur to be taken as one encoder count, and number
-of lines within which it must do so. A single small angle may come from a damaged line."""
+"""A small wheel angle is taken as one encoder count if an angle of at most this size occurs `RECUR`
+times within `SOUGHT` lines. A single small angle may come from a damaged line."""
 
 LEAST = 0.005
 """A commanded wheel speed below this, rad/s, counts as zero, because the line to the board has two
 decimals and shows the speed as 0.00."""
 
 ROLLED_S, REPEATED_S = 0.2, 1.0
-"""Time for which wheels must turn without a command before the daemon logs this motion, and
-shortest time between two such log lines, s. A shorter motion may be the rocking of a robot that
-comes to rest."""
+"""`ROLLED_S` is the time for which wheels must turn without a command before the daemon logs this
+motion, s. A shorter motion may be the rocking of a robot that comes to rest. `REPEATED_S` is the
+shortest time between two such log lines, s."""
 
 SLIP_S = 0.5
 """Time after the last contradiction for which a side still counts as slipping, s."""
@@ -69,7 +71,7 @@ LEFT, RIGHT = (1, 2), (0, 3)
 
 
 class _Side:
-    """The two wheels of one side, with the evidence of faults and slip, and the ignored wheel."""
+    """The two wheels of one side: the evidence of faults and slip, and the ignored wheel."""
 
     def __init__(self, name: str, wheels: tuple[int, int]) -> None:
         self.name, self.wheels = name, wheels
@@ -79,23 +81,24 @@ class _Side:
         self._suspects = (Suspect(), Suspect())
         self._stuck = (Stuck(), Stuck())
         self.out: int | None = None
-        """Index of the wheel that the pose ignores: 0 front, 1 rear, None if it ignores none."""
+        """The wheel that the pose ignores: 0 is the front one, 1 the rear one, None means none."""
         self._fault: WheelFault = "dead"
         self.late = False
         """Whether a wheel that is not ignored turns too slowly."""
         self._out_s = 0.0
-        """Seconds for which the ignored wheel has contradicted the other one and its command."""
+        """Time for which the ignored wheel has contradicted both the other wheel and its command,
+        s."""
         self.slip_s = self._odd_s = self._agreed_s = 0.0
         self.event: Event | None = None
 
     @property
     def left_out(self) -> str:
-        """The name of the wheel that the pose ignores, "" without one."""
+        """The name of the wheel that the pose ignores; "" if it uses both wheels."""
         return "" if self.out is None else WHEELS[self.wheels[self.out]]
 
     @property
     def text(self) -> str:
-        """A text about the ignored wheel or the slip of this side, "" if there is neither."""
+        """A text about the ignored wheel or about slip on this side; "" without either."""
         if self.out is not None:
             return (
                 f"{self.left_out} wheel is left out of the pose: it {WORDS[self._fault]}; check "
@@ -107,9 +110,9 @@ class _Side:
 
     @property
     def slow(self) -> list[str]:
-        """Names of the wheels that turn too slowly, each with the percentage of its expected speed.
+        """Words for each wheel that turns too slowly: its name and its speed in percent.
 
-        An ignored wheel is not included.
+        100 % is the expected speed. An ignored wheel is not included.
         """
         return [
             f"{WHEELS[self.wheels[i]]} {witness.ratio:.0%}"
@@ -124,7 +127,11 @@ class _Side:
             part.forget()
 
     def watch(self, seen: Motors, dt: float, most: float, count: float, still: bool) -> bool:
-        """Compare both wheels with their command, and return whether one of them may be faulty."""
+        """Compare both wheels with their command, and return whether one of them may be faulty.
+
+        `seen` contains the speeds of all wheels, rad/s. For the other arguments, see
+        `Witness.look`.
+        """
         i, j = self.wheels
         front, rear = self.witnesses
         bad = front.look(seen[i], self.expected, dt, most, count, still)
@@ -133,7 +140,10 @@ class _Side:
         return bad or self._out_s > 0.0
 
     def fault(self, seen: Motors, limit: float) -> str:
-        """Return words for a wheel fault that has lasted longer than `limit` s, "" without one."""
+        """Return words for a wheel fault that has lasted longer than `limit` s, otherwise "".
+
+        `seen` contains the speeds of all wheels, rad/s.
+        """
         for i, witness in enumerate(self.witnesses):
             evidence = dict(witness.evidence)
             if i == self.out:
@@ -148,7 +158,7 @@ class _Side:
         return ""
 
     def agree(self, dt: float) -> None:
-        """Process a line of `dt` s in which the two wheels agree."""
+        """Process a line in which the two wheels agree. It covers `dt` s."""
         if self.suspected:
             self.suspected = False
             for suspect in self._suspects:
@@ -166,7 +176,11 @@ class _Side:
             self.out, self._out_s, self.residual.learns = None, 0.0, True
 
     def stands_still(self, turned: Motors, same: Same, dt: float, count: float) -> bool:
-        """Test both wheels for a stuck encoder; return whether the pose now ignores one of them."""
+        """Test both wheels for a stuck encoder, and return whether this line proves one stuck.
+
+        The pose then ignores this wheel. `turned` contains the angles that all wheels rolled in the
+        line, and `count` is the angle of an encoder count, rad.
+        """
         if self.out is not None:
             return False
         for i, stuck in enumerate(self._stuck):
@@ -190,7 +204,8 @@ class _Side:
         """Process a line in which the two wheels contradict each other.
 
         Return whether this line has proved a wheel faulty, so that the pose now ignores this wheel.
-        `by_gyro` is the angle that this side rolled according to a trusted gyro, rad.
+        `same` says whether the front and the rear wheel of this side repeat their speeds. `by_gyro`
+        is the angle that this side rolled according to a trusted gyro, rad.
         """
         self._agreed_s, fault = 0.0, None if self.out is None else self._fault
         if self.out is not None and self.expected.clear:
@@ -223,7 +238,10 @@ class _Side:
         return False
 
     def was_faulty(self, before: WheelSpeeds, now: WheelSpeeds) -> bool:
-        """Return whether the ignored wheel may already have been wrong in an earlier line."""
+        """Return whether the ignored wheel may already have been wrong in an earlier line.
+
+        `before` are the speeds in that line, and `now` are the speeds in the last line.
+        """
         if self.out is None:
             return False
         own, other = self.wheels[self.out], self.wheels[1 - self.out]
@@ -244,33 +262,36 @@ class _Side:
 
 
 class WheelFaults:
-    """Checks all wheels, and decides which to ignore and whether any slips."""
+    """Checks all wheels, and decides which wheels the pose ignores and which sides slip."""
 
     def __init__(self, kinematics: Kinematics, counts: int, feedback: FeedbackConfig) -> None:
-        """Start. `counts` are the encoder counts per revolution of a wheel, 0 if unknown."""
+        """Start without evidence of a fault.
+
+        `counts` is the number of encoder counts per revolution of a wheel, 0 if unknown.
+        """
         self._kinematics, self._settings = kinematics, feedback
         self._count = math.tau / counts if counts else COARSEST
         self._seeking, self._period = not counts, PERIOD
         self._least, self._looked = [COARSEST] * RECUR, 0
-        """The `RECUR` smallest angles that a front wheel rolled in the last `_looked` lines, rad,
-        and the number of these lines."""
+        """`_least` are the `RECUR` smallest angles that a front wheel rolled in one of the last
+        `_looked` lines, rad."""
         self._sides = self._left, self._right = _Side("left", LEFT), _Side("right", RIGHT)
         self._last = STILL
         self._busy = self._leaves_out = self._stands = False
         self.slips = False
-        """Whether the wheels of a side contradict each other or did so in the last `SLIP_S`."""
+        """Whether a side slips: its wheels have contradicted each other in the last `SLIP_S`."""
         self._rolled, self._unreported = 0.0, REPEATED_S
         self.pushed = ""
-        """The message if the last line shows that a hand or a slope turns wheels, otherwise ""."""
+        """The message that a hand or a slope turns wheels; "" unless the last line causes it."""
         self._late = False
         self._found: _Side | None = None
-        """The side on which the last line proved a wheel faulty, None without one."""
+        """The side on which the last line proved a wheel faulty, or None."""
         self.events: list[Event] = []
         """Log events of the last line."""
 
     @property
     def status(self) -> WheelsStatus:
-        """The state of the wheels: ignored ones, slow ones, and the sides that slip."""
+        """The state of the wheels: ignored wheels, slow wheels, and the sides that slip."""
         sides = self._sides
         return WheelsStatus(
             text="; ".join(side.text for side in sides if side.text),
@@ -303,10 +324,11 @@ class WheelFaults:
             side.forget()
 
     def skip(self, seen: WheelSpeeds) -> None:
-        """Leave out a line that waited while the board may have stopped the motors.
+        """Process a line without checking it, because the board may have stopped the motors.
 
-        Healthy wheels then start again from the speeds that they report. A side with a wheel that
-        is suspected already gets no such excuse.
+        The line waited while this computer did not run the daemon. From now on, the checks expect
+        the wheels to start again from at most the speeds `seen`, rad/s. On a side with a wheel that
+        is already suspected, the expected speeds do not change.
         """
         self.pushed, speeds = "", seen.as_tuple()
         for side in self._sides:
@@ -318,9 +340,9 @@ class WheelFaults:
         """Compare the wheel speeds in a line with their commands. The caller must then call `look`.
 
         If a wheel has contradicted its command for `feedback.fault_time`, return the reason of the
-        fault, which names the wheel. Otherwise return "". `commanded` is None while the emergency
-        stop counts as pressed, so that the motors may have no power. `dt` is the time since the
-        line before, s.
+        fault, which names the wheel. Otherwise return "". `commanded` is None if the motors may
+        have no power, because the emergency stop counts as pressed. `seen` are the reported speeds,
+        and `dt` is the time since the line before, s.
         """
         self.pushed, speeds = "", seen.as_tuple()
         if commanded is None:
@@ -335,8 +357,8 @@ class WheelFaults:
         left.expected.follow(commanded.front_left, front_left, rear_left, dt, lag)
         right.expected.follow(commanded.front_right, front_right, rear_right, dt, lag)
         still = abs(commanded.front_left) < LEAST and abs(commanded.front_right) < LEAST
-        # After a time in which this computer did not run the daemon, one line covers that whole
-        # time. This line alone must not prove a fault.
+        # After this computer did not run the daemon for a while, one line covers that whole time.
+        # This line alone must not prove a fault.
         most, count = limit / LINES_OF_EVIDENCE, self._count
         bad_left = left.watch(speeds, dt, most, count, still)
         bad_right = right.watch(speeds, dt, most, count, still)
@@ -346,7 +368,10 @@ class WheelFaults:
         return right.fault(speeds, limit) or left.fault(speeds, limit)
 
     def _notice(self, speeds: Motors, dt: float, still: bool) -> None:
-        """Set `pushed` if uncommanded wheels turn after a rest, at most once per `REPEATED_S`."""
+        """Set `pushed` if wheels that rested turn without a command.
+
+        Set it at most once per `REPEATED_S`.
+        """
         fastest = 0.0
         if still:
             fastest = max([
@@ -368,10 +393,10 @@ class WheelFaults:
     ) -> bool:
         """Compare the wheels of each side, and return whether this line proves a wheel faulty.
 
-        The pose then ignores the faulty wheel, and the caller must find the earlier lines in which
-        this wheel was wrong (`was_faulty`). `turned` contains the angles that the wheels rolled in
-        the line, rad. `turn` is the turn that the wheels should show according to a gyro, rad; None
-        without a trusted gyro.
+        If it does, the pose ignores the faulty wheel from now on. The caller must find the earlier
+        lines in which this wheel was wrong (`was_faulty`). `turned` contains the angles that the
+        wheels rolled in the line, rad. `turn` is the turn that the wheels should show according to
+        a gyro, rad; None without a trusted gyro.
         """
         slow = self._left.late or self._right.late
         if self.events or slow != self._late:
@@ -413,7 +438,7 @@ class WheelFaults:
         return self._found is not None
 
     def _standing(self, turned: Motors, same: Same, dt: float) -> _Side | None:
-        """Return the side in which this line shows a stuck encoder, None without one."""
+        """Return the side on which this line proves an encoder stuck, or None."""
         left = self._left.stands_still(turned, same, dt, self._count)
         right = self._right.stands_still(turned, same, dt, self._count)
         return self._right if right else self._left if left else None
@@ -429,11 +454,14 @@ class WheelFaults:
         return Event("wheel_fault", text, "warning", kind="slow")
 
     def was_faulty(self, before: WheelSpeeds) -> bool:
-        """Return whether the newly faulty wheel may already have been wrong in an earlier line."""
+        """Return whether the newly faulty wheel may already have been wrong in an earlier line.
+
+        `before` are the speeds in that line.
+        """
         return self._found is not None and self._found.was_faulty(before, self._last)
 
     def _seek(self, speeds: WheelSpeeds, dt: float) -> None:
-        """Learn the angle of an encoder count: the smallest angle that often occurs in a line."""
+        """Learn the angle of an encoder count: the smallest wheel angle that occurs repeatedly."""
         self._period += SMOOTHED * (dt - self._period)
         self._looked += 1
         if self._looked > SOUGHT:

@@ -5,7 +5,7 @@ harmless effects explains the difference:
 
 - The position of each wheel between two encoder counts is unknown. This error does not grow with
   the angle, because the next count corrects it.
-- The wheels differ, for example in the pressure of their tyres. This difference is a constant
+- The wheels differ, for example in the pressure of their tires. This difference is a constant
   fraction of the angle, so it is learned.
 - One motor reacts later than the other.
 - The speeds in a feedback line have two decimals.
@@ -15,16 +15,16 @@ weight (`MEMORY_S`). The wheels contradict each other if
 
     |D - r A| > SHARE A + COUNTS c + LEAST
 
-where D is the sum of the front wheel's angles minus those of the rear wheel, rad, A is the sum of
-the side's angles, rad, r is the learned fraction, and c is the angle of an encoder count, rad. The
-wheels slip if |D - r A| exceeds this limit by more than LAG_S |v - mean of v|, where v is the speed
-of the side, rad/s. This term is the effect of a motor that reacts later.
+where D is the sum of the front wheel's angles minus the sum of the rear wheel's angles, rad, A is
+the sum of the side's angles, rad, r is the learned fraction, and c is the angle of an encoder
+count, rad. The wheels slip if |D - r A| exceeds this limit by more than LAG_S |v - mean of v|,
+where v is the speed of the side, rad/s. This term is the effect of a motor that reacts later.
 
 Without slip, the angles of two wheels can differ by two counts. Therefore a slip by the fraction s
-at v rad/s is certain only after 2 c / (s v) seconds. With 96 counts per turn, a slip of a tenth at
-10 rad/s is certain after 0.13 s, or after 0.26 s if unequal tyres may cause the difference SHARE.
-With the limit COUNTS, and with sums that forget old angles, a slip of a tenth is found within 0.2 s
-above 22 rad/s, and never below 11.5 rad/s.
+at v rad/s is certain only after 2 c / (s v) seconds. With 96 counts per revolution, a slip of a
+tenth at 10 rad/s is certain after 0.13 s, or after 0.26 s if unequal tires may cause the difference
+SHARE. With the limit COUNTS, and with sums that forget old angles, a slip of a tenth is found
+within 0.2 s at speeds above 22 rad/s, and is never found at speeds below 11.5 rad/s.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ MEMORY_S = 0.14
 """Time after which the weight of an angle in the sums has fallen to 1 / e, s."""
 
 SHARE = 0.05
-"""Allowed fraction by which two wheels differ: half of the slip of 10 % that must be found."""
+"""Allowed difference of two wheels, as a fraction of their angle. It is half of the slip of 10 %
+that must be found."""
 
 COUNTS = 1.2
 """Allowed difference of the angles of two wheels, in encoder counts. Wheels without slip rarely
@@ -45,21 +46,22 @@ LAG_S = 0.03
 """Allowed delay of one motor relative to the other, s."""
 
 LEAST = 0.002
-"""Further allowed difference of two wheels, rad, for speeds with two decimals and for backlash."""
+"""Further allowed difference of two wheels, rad. Speeds with two decimals and backlash cause it."""
 
 UNEQUAL = 0.05
 """Largest fraction by which two healthy wheels of a side may differ permanently."""
 
 LEARNING_S, DOUBTED_S = 5.0, 20.0
 """While the wheels agree, the fraction by which they differ is learned with the time constant
-`LEARNING_S`, s. While they contradict each other, it changes by `WILD` in `DOUBTED_S`, s."""
+`LEARNING_S`, s. While they contradict each other, the learned fraction changes by `WILD` in
+`DOUBTED_S`, s."""
 
 SLOWEST = 1.0
 """Wheel speed, rad/s, below which the difference of the wheels is not learned."""
 
 WILD = 0.1
 """Change of the learned fraction while the wheels contradict each other for `DOUBTED_S`. Slip ends
-sooner, but a flat tyre stays flat, so the effect of the tyre is learned."""
+sooner, but a flat tire stays flat, so its effect is learned."""
 
 
 class Residual:
@@ -70,16 +72,16 @@ class Residual:
         """Learned fraction by which the front wheel turns further than the rear one."""
         self.learns = True
         self.slips = False
-        """Whether the wheels differ by more than a late motor can cause. The value is valid only
-        after a call of `add` that returned False."""
+        """Whether the wheels differ by more than a late motor can cause. The value is valid only if
+        the last call of `add` returned False."""
         self._off = self._way = self._net = 0.0
 
     def add(self, front: float, rear: float, keep: float, dt: float, count: float) -> bool:
-        """Add a feedback line, and return whether the wheels agree.
+        """Add a feedback line of `dt` s, and return whether the wheels agree.
 
         `front` and `rear` are the angles that the wheels rolled in the line, and `count` is the
-        angle of an encoder count, rad. `keep` is the factor by which the line reduces the weight of
-        the earlier angles.
+        angle of an encoder count, rad. `keep` is the factor by which this line reduces the weight
+        of all angles so far.
         """
         mean = (front + rear) / 2
         size = abs(mean) if front * rear >= 0.0 else (abs(front) + abs(rear)) / 2
@@ -99,13 +101,16 @@ class Residual:
         return True
 
     def stand_in(self, front: bool) -> float:
-        """Return the ratio of the angles front / rear, or rear / front if `front` is false."""
+        """Return the ratio of the angles of the wheels.
+
+        The ratio is front / rear, or rear / front if `front` is false.
+        """
         more = 1.0 + self.ratio / 2, 1.0 - self.ratio / 2
         return more[0] / more[1] if front else more[1] / more[0]
 
     @property
     def rolling(self) -> bool:
-        """Whether the wheels roll fast enough to show a difference (`SLOWEST` on average)."""
+        """Whether the wheels rolled fast enough to show a difference (`SLOWEST` on average)."""
         return self._way > SLOWEST * MEMORY_S
 
     def _learn(self, more: float) -> None:

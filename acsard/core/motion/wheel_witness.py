@@ -3,7 +3,7 @@
 `Expected` is the only model of a healthy wheel: its speed follows the command with a first-order
 lag. `suspect_wheel.py` uses it to decide which of two wheels is wrong, and `Witness` uses it to
 decide whether a wheel obeys. The bounds around the expected speed leave room for load, slip and
-coarse encoders. Only behaviour that no healthy wheel shows is evidence, and evidence must last.
+coarse encoders. Only behavior that no healthy wheel shows is evidence, and evidence must last.
 
 If a wheel stands, turns against its command or turns too fast, it still counts as obeying while its
 speed approaches the command. If a wheel turns in the right direction but too slowly, the daemon
@@ -17,8 +17,8 @@ import math
 from typing import Literal
 
 SLACK = 2.0
-"""Smallest speed at which a fault can be recognized, rad/s. Below it, coarse encoders and a robot
-at rest can look like any fault."""
+"""Smallest speed at which a fault can be recognized, rad/s. At lower speeds, coarse encoders and a
+robot at rest can look like any fault."""
 
 COMMANDED = 0.3
 """Smallest commanded speed that can show which of two wheels is right, rad/s."""
@@ -27,7 +27,7 @@ SLOWEST = 3.0
 """Response time of a slow robot's wheels, as a multiple of `feedback.response_time`."""
 
 CLEAR = 1.0
-"""Wheel speed, rad/s, that determines the smoothing of the measured speed. The time constant of the
+"""Wheel speed that determines the smoothing of the measured speed, rad/s. The time constant of the
 smoothing is the time in which a wheel at this speed turns by one encoder count."""
 
 NEARER = 1.0
@@ -38,8 +38,8 @@ RATIO_S = 2.0
 should have rolled."""
 
 TOO_SLOW, FAST_ENOUGH = 0.7, 0.8
-"""Ratios of measured to expected speed. Below `TOO_SLOW`, a wheel is too slow. Above `FAST_ENOUGH`,
-it is not too slow any more."""
+"""Ratios of the measured to the expected speed. A wheel becomes too slow below `TOO_SLOW`, and is
+not too slow any more from `FAST_ENOUGH` on."""
 
 FaultKind = Literal["dead", "reversed", "runaway", "stuck"]
 
@@ -59,28 +59,31 @@ def faster(front: float, rear: float) -> float:
 
 
 class Expected:
-    """The speed that healthy wheels of one side have according to their command, rad/s."""
+    """The speed, rad/s, that the wheels of one side should have by now if they are healthy."""
 
     def __init__(self) -> None:
         self.commanded = self.speed = self._slow = 0.0
         self._begins = self.settled = self.clear = False
 
     def forget(self) -> None:
-        """Start over: expect the next reported speed, because the wheels may still coast."""
+        """Start over from the next reported speed, because the wheels may still coast."""
         self.commanded, self._begins, self.clear = 0.0, True, False
 
     def slow_down(self, front: float, rear: float) -> None:
-        """Expect no more than these reported speeds, because the motors may have been stopped."""
+        """Limit the expected speed to the larger one of two reported speeds, rad/s.
+
+        The caller must call this if the board may have stopped the motors.
+        """
         most = faster(front, rear)
         self.speed, self._slow = (
             min(most, old, key=abs) if most * old > 0.0 else 0.0 for old in (self.speed, self._slow)
         )
 
     def follow(self, commanded: float, front: float, rear: float, dt: float, lag: float) -> None:
-        """Update the expected speeds with a line, `dt` s after the one before.
+        """Update the expected speed for a line that arrives `dt` s after the line before.
 
-        `front` and `rear` are reported speeds, rad/s. `lag` is the response time of a healthy
-        wheel, s.
+        `commanded` is the command for this side, and `front` and `rear` are the reported speeds,
+        rad/s. `lag` is the response time of a healthy wheel, s.
         """
         if self._begins:
             self._begins = False
@@ -100,16 +103,16 @@ class Witness:
 
     def __init__(self) -> None:
         self.driven = False
-        """Whether any wheel is commanded to turn, or this wheel still turns after that command."""
+        """Whether any wheel is commanded to turn, or this wheel has not rested since then."""
         self.ratio = 1.0
         """Angle that the wheel rolled in `RATIO_S` of driving, divided by the expected angle."""
         self.slow = False
         """Whether the wheel turns in the right direction, but too slowly."""
         self._due = 0.0
-        """Magnitude that the smoothed speed may have, rad/s: the expected one, equally smoothed.
-        Few counts need much smoothing, and a healthy wheel then seems to brake too late."""
+        """Expected magnitude of `speed`, rad/s. It is smoothed like `speed` itself: an encoder with
+        few counts needs much smoothing, and then a healthy wheel seems to brake too late."""
         self._rested_s = 0.0
-        """Time since the last line with more than `SLACK`, s."""
+        """Time since the last line with a speed above `SLACK`, s."""
         self.forget()
 
     def forget(self) -> None:
@@ -120,9 +123,9 @@ class Witness:
         self.evidence: dict[FaultKind, float] = dict.fromkeys(FAULTS, 0.0)
         """Seconds for which the wheel has shown each fault."""
         self.suspected = False
-        # Infinity lets the first line count as approaching the command. With 0, a wheel that was
-        # already too fast would never count as slowing down: slow motors latched "runaway" that
-        # way.
+        # Because of the infinity, the first line counts as approaching the command. With 0, a wheel
+        # that was already too fast would never count as slowing down, and slow motors would latch
+        # "runaway".
         self._nearest = math.inf
         """Deviation from the command when the wheel last approached its command, rad/s. For a wheel
         that is too fast, the deviation is its speed. Otherwise it is the speed of the wheel in the
@@ -132,25 +135,30 @@ class Witness:
         self._seconds = self._went = self._way = 0.0
 
     def coast(self, seen: float, dt: float, count: float) -> None:
-        """Look at the speed of a wheel, rad/s, whose motor may have no power.
+        """Process the speed `seen`, rad/s, of a wheel whose motor may have no power.
 
-        If it comes to rest, nothing but a push can turn it until the next command. `dt` and `count`
-        are those of `look`.
+        When the wheel comes to rest, `driven` becomes false: until the next command, only a push
+        can turn the wheel. For `dt` and `count`, see `look`.
         """
         self.driven = self.driven and not self._rests(seen, dt, count)
 
     def _rests(self, seen: float, dt: float, count: float) -> bool:
-        """Return whether the wheel is slower than `SLACK`, also if its encoder has few counts."""
+        """Return whether the wheel is certainly not faster than `SLACK`.
+
+        An encoder with few counts often reports 0 although the wheel turns. Therefore the reported
+        speed must stay low for the time of one count at the speed `SLACK`.
+        """
         self._rested_s = 0.0 if abs(seen) > SLACK else self._rested_s + dt
         return self._rested_s >= count / SLACK and abs(seen) <= SLACK
 
     def look(
         self, seen: float, expected: Expected, dt: float, most: float, count: float, still: bool
     ) -> bool:
-        """Check a line that reports `seen` rad/s; return whether it is evidence of a fault.
+        """Check a line that reports `seen` rad/s, and return whether it is evidence of a fault.
 
-        `most` is the longest time that one line can add to the evidence, s. `count` is the angle of
-        an encoder count, rad. `still` is true if all wheels are commanded to stand.
+        `dt` is the time since the line before, and `most` is the longest time that one line can add
+        to the evidence, s. `count` is the angle of an encoder count, rad. `still` is true if all
+        wheels are commanded to stand.
         """
         goal, command = expected.speed, expected.commanded
         if self._begins:
@@ -166,8 +174,8 @@ class Witness:
         moving = size > SLACK and expected.settled
         fast = driven and turns > 1.5 * due + SLACK
         against = moving and speed * goal < 0.0 and turns > 0.3 * size
-        # A wheel that slows down sooner than `response_time` says is not dead, so compare its speed
-        # with the smaller one of command and expected speed.
+        # A wheel that slows down sooner than according to `response_time` is not dead. Therefore
+        # compare its speed with the smaller of command and expected speed.
         dead = moving and least > SLACK and abs(seen) < 0.1 * least
         wrong = fast or against or dead
         off = turns if fast else -math.copysign(1.0, command) * speed
