@@ -50,7 +50,7 @@ recovered."""
 
 
 class EndRecord(Struct, frozen=True):
-    """The end record of a recording. To list recordings, only this record of each is read."""
+    """The end record of a recording. A list of recordings needs no other part of each file."""
 
     wall_ns: Ns
     """Wall-clock time at which the recording began, ns since 1970."""
@@ -69,7 +69,7 @@ class EndRecord(Struct, frozen=True):
 
 
 CRASHES = frozenset({"bug", "crash"})
-"""The keys of `CUTS` for failures after which the robot had no daemon."""
+"""The keys of `CUTS` that stand for a failure of the daemon or of its computer."""
 
 
 def how_it_ends(cut: str, why: str = "") -> str:

@@ -330,7 +330,7 @@ def test_lines_during_a_silence_do_not_count_as_another_silence() -> None:
 
 def test_missing_steps_are_reported() -> None:
     gaps = [one.text for one in story(driven(), range(100, 160)) if one.name == "gap"]
-    assert gaps == ["60 steps are missing before this step: 0.3 s"]
+    assert gaps == ["60 steps are missing before this step (0.3 s)"]
 
 
 def test_a_pressed_emergency_stop_is_a_serious_incident_and_its_release_is_none() -> None:
