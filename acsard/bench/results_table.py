@@ -23,7 +23,7 @@ POINTS = {
 """Maps each duration that the benchmark measures to the events that begin and end it."""
 
 OWN = {
-    "period_lateness": "control step due (the first, if some were missed) -> step begins",
+    "period_lateness": "control step due (the first missed step, if any) -> step begins",
     "step_time": "control step begins -> same step ends",
     "command_age": "command arrives at the daemon -> each line that carries it",
     "command_to_wire": "command of the active source arrives -> first line that carries it",

@@ -1,4 +1,4 @@
-"""The texts of all findings of the check. `find` inserts the measured values into them."""
+"""The texts of all findings of the check. `find` inserts the measured values into the texts."""
 
 from __future__ import annotations
 
@@ -360,10 +360,10 @@ FAIL serial line: lost | lost
 
 
 class Unsure(Finding, frozen=True):
-    """A finding that a late computer may cause, whatever the board does.
+    """A finding that may be wrong if this computer was late.
 
     `margin_s` is the time by which the measurement exceeds its bound, s. A delay of this computer
-    that is shorter than half of the margin cannot have caused the finding.
+    that is shorter than half of `margin_s` cannot have caused the finding.
     """
 
     margin_s: float = 0.0
@@ -372,8 +372,8 @@ class Unsure(Finding, frozen=True):
 class Outcome(Struct, frozen=True):
     """One possible outcome of a step, with the texts of its finding.
 
-    `figure`, `text` and `mend` are format strings for the measured values. `unsure` says whether a
-    late computer can cause this outcome.
+    `figure`, `text` and `mend` are format strings, into which `find` inserts the measured values.
+    `unsure` says whether a late computer can cause this outcome.
     """
 
     verdict: Verdict
@@ -399,13 +399,13 @@ MANUAL = _read(OUTCOMES)
 
 
 def find(outcome: str, keys: dict[str, object] | None = None, **seen: object) -> Finding:
-    """Return the finding of this outcome with the measured values filled in.
+    """Return the finding for an outcome, with the measured values in its texts.
 
     Args:
-        outcome: a key of `MANUAL`. The part before the colon is the finding's name.
-        keys: configuration values that the finding suggests.
-        seen: the measured values. A value `name` replaces the finding's name. A value `margin_s`
-            sets the margin of an `Unsure`.
+        outcome: a key of `MANUAL`. The part before the colon is the name of the finding.
+        keys: the configuration values that the finding suggests, by dotted key.
+        seen: the measured values. If one has the name `name`, it replaces the name of the finding.
+            If one has the name `margin_s`, it becomes the margin of an `Unsure`.
     """
     entry = MANUAL[outcome]
     name = str(seen.get("name", outcome.partition(":")[0]))
@@ -417,5 +417,5 @@ def find(outcome: str, keys: dict[str, object] | None = None, **seen: object) ->
 
 
 def plain(found: Finding) -> Finding:
-    """Return a copy of the finding for the report, without the margin of an `Unsure`."""
+    """Return a copy of the finding as a plain `Finding`, without the margin of an `Unsure`."""
     return Finding(*(getattr(found, name) for name in Finding.__struct_fields__))
