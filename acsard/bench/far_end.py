@@ -30,7 +30,7 @@ class Part(msgspec.Struct, frozen=True):
 
     config: dict[str, object]
     free_running: float = 0.0
-    """Period at which the simulated board reports without being asked, s; 0 if it only answers."""
+    """Period at which the simulated board reports unasked, s; 0 if it only replies to lines."""
     baud_rate: int = 0
     """Baud rate of the simulated board; 0 means the configured rate.
 

@@ -420,7 +420,7 @@ class Board:
         """Send zeros until all motors stand. Raises `StoppedError` if a motor keeps turning.
 
         In some firmware motor d obeys only lines that end with a comma, or only lines without a
-        final comma. If only the ending that is not in use stops motor d, later lines have it.
+        final comma. If only the other ending stops motor d, `comma` is changed for later lines.
         """
         began_s = self.now_s
         if self.settles(self.comma):

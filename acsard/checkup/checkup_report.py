@@ -21,7 +21,7 @@ Changes = dict[str, object]
 
 OPTIONAL = ("mcu.encoder_counts", "mcu.link_check")
 """Keys that improve the link but make its lines longer. If the wire is too slow, the advice leaves
-out the first key, and then the second one."""
+out the first key. If that is not enough, it leaves out the second key too."""
 
 
 def answered(findings: Iterable[Finding]) -> bool:

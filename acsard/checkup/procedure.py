@@ -156,7 +156,7 @@ class _Watched:
         return answer
 
     def look(self) -> None:
-        """Raise `KeyboardInterrupt` if the operator quits; `StoppedError` after a stall."""
+        """Raise `KeyboardInterrupt` if the operator quits, and `StoppedError` after a stall."""
         now_s = self._now_s()
         stalled_s, self._ran_s = now_s - self._ran_s, now_s
         if stalled_s > (STALL_S if self._board.armed else ZEROS_STALL_S):

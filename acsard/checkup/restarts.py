@@ -127,7 +127,7 @@ class Restarts:
         if line.startswith(IDENTITY) and at_s - self._asked_s > ASKED_S:
             return "the board sent its name without a request"
         boots = self._unanswered >= UNANSWERED and _WORD.search(line)
-        return "the board was silent, then printed a text" if boots else ""
+        return "the board was silent, then sent a text instead of replies" if boots else ""
 
     def _clock_sign(self, reply: Reply) -> str:
         before, reading = self._clock, reply.reading

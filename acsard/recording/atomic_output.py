@@ -126,7 +126,7 @@ def _recording(path: Path) -> Recording | None:
 def _remove(path: Path) -> None:
     """Remove a file, or the directory of a ROS bag with its files.
 
-    The removal is not recursive: a ROS bag has no subdirectories, so they must contain other data.
+    Raises `OSError` if the directory has a subdirectory, because a ROS bag never has one.
     """
     if path.is_dir() and not path.is_symlink():
         for file in path.iterdir():

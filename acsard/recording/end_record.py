@@ -62,7 +62,7 @@ class EndRecord(Struct, frozen=True):
     cut: str = ""
     """Why the recording was cut off: a key of `CUTS`, or "" if the daemon ended normally."""
     why: str = ""
-    """For the cause `bug`, the step in which the daemon failed and the exception; otherwise ""."""
+    """If `cut` is "bug", text that names the failed step and the exception; otherwise ""."""
     earliest_ns: Ns | None = None
     """Earliest wall-clock time of a message, ns since 1970; None if it is not known. It is before
     `wall_ns` if the clock was set back during the recording."""

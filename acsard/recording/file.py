@@ -383,7 +383,7 @@ class Recording:
         self.cut = ""
         """Cause that cut off the recording, a key of `CUTS`; "" if the daemon ended normally."""
         self.why = ""
-        """For the cause `bug`, the step in which the daemon failed and the exception, else ""."""
+        """If `cut` is "bug", text that names the failed step and the exception; otherwise ""."""
         self.unfinished: bytes | None = None
         """Encoded inputs of the step in which the daemon failed; None if it did not fail."""
         self.about = self._about()
@@ -429,7 +429,7 @@ class Recording:
     def messages(self) -> Iterator[tuple[Topic, int, bytes]]:
         """Yield the triple (topic, wall-clock time in ns since 1970, data) of each message.
 
-        After the last message, `ended`, `damaged`, `cut`, `why` and `unfinished` have their values.
+        After the last message, `ended`, `damaged`, `cut`, `why` and `unfinished` are valid.
         """
         self.ended, self.damaged, self.cut, self.why = False, 0, "", ""
         self.unfinished = None

@@ -473,9 +473,9 @@ class EventCopies:
             self._differs(str(error))
 
     def end(self) -> None:
-        """Compare the events of the last batch with their copies.
+        """Compare the events of the last batch with their copies, and check the end record.
 
-        In a complete file, also compare the summary in the end record with the events.
+        If the file is complete, the summary in its end record must agree with the events.
         """
         recording = self._recording
         self._compare(last=True)

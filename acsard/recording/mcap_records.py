@@ -36,7 +36,7 @@ result is 13 to 16 % smaller than at level 3."""
 PARAMETERS = ZstdCompressionParameters.from_level(
     LEVEL, source_size=1 << 18, write_content_size=False
 )
-"""Parameters of zstd for a chunk of 256 KiB. The compressor then needs 3 MB of memory."""
+"""Parameters of zstd for chunks of 256 KiB. With them the compressor needs 3 MB of memory."""
 
 LAST_BLOCK = b"\x01\0\0"
 """An empty zstd block with the mark of a last block. It completes a chunk that was cut off."""

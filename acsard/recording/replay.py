@@ -110,7 +110,7 @@ class Comparison(Struct):
 
     @property
     def only_words(self) -> bool:
-        """True if there are differences, but only in the words of reasons or events."""
+        """True if outputs differ, but only in the wording of reasons and event texts."""
         return not self.same and self.first_by_output.keys() <= WORDING
 
 

@@ -150,7 +150,7 @@ def _protected(ended: Sequence[Ended]) -> set[str]:
 
 
 def _groups(ended: Sequence[Ended]) -> Iterator[list[Ended]]:
-    """Yield the recordings that are not `plain`, in groups with consecutive numbers."""
+    """Yield groups of recordings that are not `plain`. The numbers in a group are consecutive."""
     group: list[Ended] = []
     for file in ended:
         if file.kind == "plain":

@@ -4,7 +4,7 @@ A row is one step. Its times and poses are stored as differences from earlier ti
 Similar steps therefore give equal bytes, which compress well. Each batch can be decoded without the
 other batches. A file may be forged, so `decode` refuses a batch with values that no daemon records.
 
-If you change one of these structs, change `FORMAT` as well.
+If you change a struct of this module, change `FORMAT` as well.
 """
 
 from __future__ import annotations

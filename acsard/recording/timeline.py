@@ -135,7 +135,8 @@ class ReasonChanges:
         self._mode = self._reason = ""
         """The last mode and reason that the timeline shows. The reason has `#` for each number."""
         self._reported_ns = -REASON_NS
-        """Monotonic time of the last entry or of the last report of the mode `waiting`, ns."""
+        """Monotonic time of the last entry, or of the last event that reported the mode `waiting`,
+        whichever is later, ns."""
         self._sender = ("", "")
         """Pair: the source that the robot followed when its last command arrived, and the sender of
         that command."""
@@ -340,7 +341,7 @@ class TimelineWriter:
             x, y, yaw = [value / MICRO for value in self._pose]
             at = f"at x {x:.2f} m, y {y:.2f} m, yaw {math.degrees(yaw):.1f} deg"
         text = (
-            "this recording continues an earlier one; at its beginning the robot is: "
+            "this recording continues an earlier one; when this one begins, the robot is: "
             f"{does}, link {link}, {at}"
         )
         yield TimelineEntry(first.inputs.now.wall_ns / 1e9, "continues", text, by=source)
