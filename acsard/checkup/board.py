@@ -39,7 +39,7 @@ class Wire(Protocol):
         """
 
     def close(self) -> None:
-        """Send the last bytes and close the connection."""
+        """Send the bytes that are still waiting, and close the connection."""
 
     def now_ns(self) -> int:
         """Return the monotonic time, ns."""
@@ -186,8 +186,8 @@ class Board:
     def _farewell(self) -> None:
         """Send zeros several times, but send no more once a motor runs away.
 
-        With a reversed encoder, the firmware's speed control makes the motor run away even on
-        zeros. Each further line would keep the watchdog from stopping it.
+        If an encoder is reversed, the firmware's speed control may make the motor run away even
+        when zeros are sent. Each further line would keep the watchdog from stopping the motor.
         """
         self.armed, self.restarts.watched, self.between = False, False, _nothing
         try:

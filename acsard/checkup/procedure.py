@@ -1,4 +1,4 @@
-"""Runs the whole check: the order of its steps, their repetitions, and its early ends."""
+"""Runs the whole check: puts the steps in order, repeats a step if needed, and ends early."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ class _Watched:
     """The operator during the steps. `look` ends the check if the operator quits or may be away."""
 
     def __init__(self, operator: Operator, board: Board, asleep_ns: Callable[[], int]) -> None:
-        """`asleep_ns` is the argument of `run`."""
+        """Start now, without a stall. `asleep_ns` is the argument of `run()`."""
         self.doing, self.keys = operator.doing, operator.keys
         self._operator, self._board, self._asleep_ns = operator, board, asleep_ns
         self._ran_s = self._now_s()

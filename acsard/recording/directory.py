@@ -134,7 +134,7 @@ def _marked(part: Path) -> tuple[Kind, str] | None:
 
 
 class Run(Struct):
-    """State that lasts until the daemon ends. After a disk error the next `Ring` takes it over."""
+    """State of one run of the daemon. After a disk error, a new `Ring` continues with it."""
 
     numbers: set[int] = field(default_factory=set)
     """Numbers, from the file names, of the files that ended in this run of the daemon."""

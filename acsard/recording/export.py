@@ -116,7 +116,7 @@ def _quoted(text: str) -> str:
 
 
 MEASURED = ("t [s]", "fr [rad/s]", "fl [rad/s]", "rl [rad/s]", "rr [rad/s]", "yaw_rate [rad/s]")
-"""Columns that calibration reads: the wall-clock time, s since 1970, the speeds of the wheels
+"""Columns that calibration reads: the wall-clock time (s since 1970), the speeds of the wheels
 (front right, front left, rear left and rear right), and the yaw rate from a gyro."""
 
 OUTPUT_COLUMNS = (

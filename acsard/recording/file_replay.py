@@ -62,7 +62,7 @@ class Gap(Struct):
     """Number of readable steps that are not replayed, because the next recorded robot state comes
     later."""
     lines: int = 0
-    """Number of skipped steps in which the robot decided to send a line to the board."""
+    """How many of the `skipped` steps contain a line that the robot decided to send."""
     end_lost: bool = False
     """True if the last steps of the recording cannot be read."""
 
@@ -126,9 +126,9 @@ def _items(
 
 
 MAX_STATE_BYTES = 8
-"""Number of bytes of robot states that may be decoded after gaps, for each byte of the file.
-`MAX_BYTES` are allowed in addition. A genuine file stays below this limit. Without the limit, the
-replay of a forged file of 5 kB took 4 s."""
+"""Limit on the size of the robot states that are decoded after gaps, in bytes for each byte of the
+file. `MAX_BYTES` are allowed in addition. A genuine file stays below this limit. Without the limit,
+the replay of a forged file of 5 kB took 4 s."""
 
 
 class _Source:
@@ -382,7 +382,9 @@ class DisplayReplay(_Source):
             )
 
     def steps(self) -> Iterator[tuple[Step, Outputs, Robot]]:
-        """Yield each recorded step, its replayed outputs, and the robot after the step.
+        """Yield a triple for each step: the recorded step, its replayed outputs, and the robot.
+
+        The robot is in its state after the step.
 
         Raises `RecordingError` if the recorded state lacks a part that a step uses.
         """

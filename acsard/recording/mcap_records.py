@@ -142,7 +142,7 @@ class GrowingChunk:
         return self._taken()
 
     def end(self) -> tuple[bytes, bytes]:
-        """End the chunk. Return its last bytes, and the header that must replace `GROWING_HEAD`."""
+        """End the chunk. Return a pair: its last bytes, and the header for its beginning."""
         self._out.append(self._compressor.flush())
         last = self._taken()
         return last, _head(self.first_ns, self._last_ns, self.size, self._crc, self._length)

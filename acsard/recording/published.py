@@ -87,7 +87,7 @@ class Publisher:
         yield from self.skip(step)
 
     def skip(self, step: Step) -> Iterator[Published]:
-        """Yield only the log lines of a step. This step need not have been replayed."""
+        """Yield only the log lines of a step, which may be a step that was not replayed."""
         self._now = step.inputs.now
         yield from map(self._line, self._timeline.step(step))
 

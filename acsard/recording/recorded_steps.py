@@ -30,7 +30,8 @@ from acsard.core.values import (
 MICRO = 1e6
 
 Status = tuple[str, str, str, str]
-"""Mode of the robot, its reason in words, state of the link, and commanding source ("" if none)."""
+"""Tuple: mode of the robot, reason of the mode in words, state of the link, and source that
+commands the robot ("" if there is none)."""
 
 Micropose = tuple[int, int, int]
 """Pose as integers: x and y in um, yaw in urad."""

@@ -1,6 +1,6 @@
 """Replays steps: runs `Robot.step` over the recorded inputs and compares the outputs.
 
-A robot's behaviour depends only on its inputs and its configuration. So the same code with the same
+A robot's behavior depends only on its inputs and its configuration. So the same code with the same
 configuration reproduces every line, mode and pose. With other code or another configuration, the
 differences show how the robot would have behaved.
 """

@@ -113,7 +113,7 @@ class StepWriter:
         self._cut_ns: int | None = None
         """Time at which a crash cut off the previous run's file, ns since 1970.
 
-        None if there was no crash, and as soon as this run has begun a file.
+        It is None if there was no crash, and it becomes None when this run begins a file.
         """
         self.bug: Bug | None = None
         """The failure that ends the daemon; only the last call of `write` reads it."""

@@ -226,7 +226,7 @@ class WaitingSenders:
     def __init__(self, priorities: Mapping[str, int]) -> None:
         self._priorities = priorities
         self._commander = ""
-        """Source and sender that the robot follows, as in the event `commander`."""
+        """The sender that the robot follows: text "source (sender)" from the event `commander`."""
         self._waiting: dict[tuple[str, str], _Waiting] = {}
         self._reported_ns = -REASON_NS
 
