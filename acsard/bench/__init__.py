@@ -1,1 +1,1 @@
-"""`acsard bench`: measures a daemon from outside, with one clock."""
+"""The package of `acsard bench`, which measures a daemon from outside, on a single clock."""

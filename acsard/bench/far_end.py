@@ -1,7 +1,8 @@
 """The far end of the serial wire in a benchmark: a process that simulates the board on a pty.
 
-The process has real-time priority if that is permitted. It writes the path of the pty to standard
-output first. When its standard input ends, it writes all recorded data to standard output and ends.
+The process has real-time priority if that is permitted. At its start it writes the path of the pty
+to standard output. When its standard input ends, the process writes all recorded data to standard
+output and ends.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ class Part(msgspec.Struct, frozen=True):
 
     config: dict[str, object]
     free_running: float = 0.0
-    """Period of feedback lines that the simulated board sends unasked, s; 0 for answers only."""
+    """Period at which the simulated board reports unasked, s; 0 if it only replies to lines."""
     baud_rate: int = 0
     """Baud rate of the simulated board; 0 means the configured rate.
 
@@ -38,7 +39,7 @@ class Part(msgspec.Struct, frozen=True):
 
 
 class NumberedMcu(FakeMcu):
-    """A simulated board that reports the speeds of `staircase()` instead of those of a vehicle."""
+    """A simulated board that reports the speeds of `staircase()`, whatever speeds are commanded."""
 
     def __init__(self, config: Config, now_ns: int) -> None:
         super().__init__(config, now_ns)
@@ -50,12 +51,12 @@ class NumberedMcu(FakeMcu):
         return [forward * speed for _, forward in self._wiring]
 
     def _pass(self, now_ns: int) -> None:
-        # Advance only the time, because the reported speeds do not come from a simulated vehicle.
+        # Advance only the time: the reported speeds do not depend on a simulated vehicle.
         self._now_ns = max(self._now_ns, now_ns)
 
 
 class FarEnd:
-    """Runs the simulated board at one end of a pty. `path` names the other end, for the daemon."""
+    """Runs the simulated board at one end of a pty. The daemon opens the other end, `path`."""
 
     def __init__(self, mcu: FakeMcu) -> None:
         self.seen = Seen()
@@ -101,7 +102,7 @@ class FarEnd:
 def main(part: Part) -> None:
     """Simulate the board until standard input ends.
 
-    Then write the data that the board sent and received to standard output.
+    Then write a `Seen` with all data that the board received and sent to standard output.
     """
     try:
         # Other processes must not delay the simulated board: a real one has its own processor.

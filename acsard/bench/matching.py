@@ -1,7 +1,8 @@
-"""The record of a benchmark, and the figures that are computed from it.
+"""The record of a benchmark, and the figures that are computed from the record.
 
-Successive commands and feedback lines have different speeds. Each output of the measured daemon is
-therefore matched with its input by the speed, not by the time. Times are monotonic, in ns.
+Successive commands have different speeds, and so have successive feedback lines. Each output of the
+measured daemon is therefore matched with its input by the speed, not by the time. Times are
+monotonic, in ns.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import Instant
 
 STEPS = 1000
-"""Number of commands, or of feedback lines, after which their speeds repeat.
+"""Number of commands, or of feedback lines, after which the speeds repeat.
 
-Lines with equal speeds are distinguished by their times.
+Two lines with equal speeds are distinguished by their times.
 """
 
 LOWEST, STEP = 5.0, 0.02
@@ -32,7 +33,7 @@ PATIENCE_NS = 1_000_000_000
 """Time after which a command that has not reached the wire counts as lost, ns."""
 
 Chunk = tuple[int, bytes]
-"""Monotonic time, ns, and the bytes that were sent or received at that time."""
+"""Pair: a monotonic time, ns, and the bytes that were sent or received at that time."""
 
 
 class Summary(Struct, frozen=True):
@@ -48,16 +49,16 @@ class Fed(Struct, frozen=True):
     """A feedback line from which the measured daemon published an odometry sample."""
 
     delay_ns: int
-    """Time from the writing of the line's last byte to the arrival of the sample, ns."""
+    """Time from the moment at which the board wrote the line to the arrival of the sample, ns."""
     waiting: int
     """Number of newer lines that the simulated board had written before the sample arrived."""
 
 
 def staircase(number: int) -> float:
-    """Return the speed of all wheels, rad/s, for the command or feedback line with this number.
+    """Return the speed of all wheels, rad/s, in the command or feedback line with this number.
 
-    The speeds rise and fall with a period of `STEPS`. The falling speeds lie between the rising
-    ones, so that all speeds of a period differ.
+    The speeds rise and fall with a period of `STEPS` lines. The falling speeds lie between the
+    rising speeds, so that all speeds of a period differ.
     """
     half = STEPS // 2
     place = number % STEPS
@@ -83,9 +84,10 @@ def lines_of(chunks: Iterable[Chunk]) -> list[Chunk]:
 
 
 def commands_to_lines(sent: Sequence[Chunk], lines: Sequence[Chunk]) -> list[int]:
-    """Return the time, ns, from each command to the line that the daemon sent because of it.
+    """Return the time, ns, from each command to the line that carries it to the board.
 
-    If no such line follows within `PATIENCE_NS`, the command is lost and is left out.
+    If no such line follows within `PATIENCE_NS`, the command is lost and has no entry in the
+    result.
 
     Args:
         sent: for each command, its time, ns, and the line that the daemon must make of it.
@@ -106,9 +108,10 @@ def commands_to_lines(sent: Sequence[Chunk], lines: Sequence[Chunk]) -> list[int
 def lines_to_samples(
     said: Sequence[tuple[int, float]], samples: Iterable[tuple[int, float]]
 ) -> list[Fed]:
-    """Return the delay of each feedback line that became an odometry sample.
+    """Return a `Fed` for each feedback line that became an odometry sample.
 
-    Lines and samples are matched by their linear speed. A second sample of a line is left out.
+    Lines and samples are matched by their linear speed. A second sample of the same line is
+    ignored.
 
     Args:
         said: the time, ns, and the linear speed, m/s, of each feedback line.
@@ -134,9 +137,9 @@ def _key(speed: float) -> int:
 
 
 def summary(durations_ns: Sequence[int]) -> Summary | None:
-    """Return the count, percentiles and maximum of these durations, or None if there are none.
+    """Return the count, percentiles and maximum of the durations, or None if the list is empty.
 
-    Each percentile is one of the durations, not an interpolation.
+    Each percentile is one of the durations, not an interpolation between two of them.
     """
     if not durations_ns:
         return None
@@ -157,7 +160,7 @@ class Seen(Struct, frozen=True):
 
 
 class Sent(Struct, frozen=True):
-    """A command: the monotonic time of its publication, ns, and the serial line it must become."""
+    """A command: the monotonic time of its publication, ns, and the line that must carry it."""
 
     at_ns: int
     line: bytes
@@ -177,7 +180,7 @@ class Record(Struct, frozen=True):
     began_ns: int
     """Monotonic time just before the daemon was started, ns."""
     window_ns: tuple[int, int]
-    """Begin and end of the evaluated time, ns: after the daemon's start-up, before its shutdown."""
+    """Pair: begin and end, ns, of the time that is evaluated. It excludes start-up and shutdown."""
     seen: Seen | None
     """Data on the wire; None on a real port, whose wire cannot be observed."""
     sent: list[Sent]
@@ -185,14 +188,14 @@ class Record(Struct, frozen=True):
 
     @property
     def said(self) -> list[Chunk]:
-        """Feedback lines that the board began to send within `window_ns`, with their times, ns."""
+        """Feedback lines that the board began to send in `window_ns`, each with its time, ns."""
         first_ns, last_ns = self.window_ns
         lines = lines_of(self.seen.said) if self.seen else []
         return [line for line in lines if first_ns <= line[0] < last_ns]
 
 
 def command_waits(record: Record) -> list[int]:
-    """Return the time from each command to its line on the wire, ns. Lost commands are left out."""
+    """Return the time from each command to its line on the wire, ns, without lost commands."""
     if record.seen is None:
         return []
     sent = [(sent.at_ns, sent.line) for sent in record.sent]
@@ -200,7 +203,7 @@ def command_waits(record: Record) -> list[int]:
 
 
 def feedback_fates(config: Config, record: Record) -> list[Fed]:
-    """Return the delay of each feedback line that became an odometry sample."""
+    """Return a `Fed` for each feedback line that became an odometry sample."""
     codec = Codec(config.mcu.wheels, config.mcu.trailing_comma)
     kinematics = Kinematics(config.drive)
     said = [(at_ns, kinematics.twist(codec.decode(line)).linear) for at_ns, line in record.said]

@@ -42,9 +42,10 @@ from acsard.host.errors import MendableError
 def bench_config(config: Config, *, simulated: bool) -> Config:
     """Return `config` with a separate robot id, bus and command source for the measured daemon.
 
-    With the simulated board, more settings change. The limits are so high that the daemon writes
-    each command unchanged into its next line. Feedback that contradicts the commands does not count
-    as a fault. Lines have no sequence number, because the benchmark recognizes a line by its text.
+    If the board is `simulated`, more settings change. The limits are so high that the daemon writes
+    the speeds of each command unchanged into its next line. Feedback that contradicts the commands
+    does not count as a fault. Lines have no sequence number, because the benchmark recognizes a
+    line by its text.
     """
     own = replace(
         config,
@@ -89,7 +90,7 @@ def write(config: Config, where: Path) -> Path:
 
 
 def measure(config: Config, port: str, seconds: float) -> Result:
-    """Measure a daemon for `seconds`: a quarter without commands, then the rest with commands.
+    """Measure a daemon for `seconds` s: first a quarter of the time without commands, then with.
 
     `port` is the serial port; "" means the simulated board.
     """

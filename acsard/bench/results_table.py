@@ -20,20 +20,17 @@ POINTS = {
     "feedback_to_odometry": "last byte of a feedback line sent -> benchmark gets the odometry",
     "read_to_odometry": "microcontroller samples the wheels (stamp) -> benchmark gets odometry",
 }
-"""Durations that the benchmark measures, and the events that begin and end each duration.
-
-"Here" is the process of the benchmark.
-"""
+"""Maps each duration that the benchmark measures to the events that begin and end it."""
 
 OWN = {
-    "period_lateness": "control step due (the first, if some were missed) -> step begins",
+    "period_lateness": "control step due (the first missed step, if any) -> step begins",
     "step_time": "control step begins -> same step ends",
     "command_age": "command arrives at the daemon -> each line that carries it",
     "command_to_wire": "command of the active source arrives -> first line that carries it",
     "feedback_to_bus": "daemon has read a feedback line -> its messages are on the bus queue",
     "mcu_round_trip": "daemon writes a line -> end of the reply (only on a checked link)",
 }
-"""Durations that the daemon measures, and the events that begin and end each duration."""
+"""Maps each duration that the daemon measures to the events that begin and end it."""
 
 
 class Machine(Struct, frozen=True):
@@ -57,7 +54,7 @@ class Result(Struct, frozen=True, omit_defaults=False):
     realtime: bool
     """True if the daemon's control task had real-time scheduling."""
     outside: dict[str, Summary | None]
-    """Summaries of the durations in `POINTS`, by name. An unmeasured one is null or absent."""
+    """Summaries of the durations in `POINTS`, by name; null or absent if it was not measured."""
     own: dict[str, Summary]
     """Summaries of the durations in `OWN`, by name. The percentiles are accurate to 12 %."""
     commands_sent: int
@@ -68,8 +65,8 @@ class Result(Struct, frozen=True, omit_defaults=False):
     lines_told: int
     """Number of feedback lines whose odometry the benchmark received."""
     lines_waiting_max: int | None
-    """Largest number of newer lines that the simulated board had written before a line's odometry
-    arrived here; null on a real port."""
+    """Largest number of newer lines that the simulated board had written before the odometry of a
+    line arrived at the benchmark; null on a real port."""
     lines_sent: int
     """Number of lines that the daemon had written to the port when `missed_periods` was read."""
     missed_periods: int
@@ -152,7 +149,7 @@ def _counts(result: Result) -> list[tuple[str, str]]:
     said = "" if r.lines_said is None else f" of {r.lines_said}"
     waiting = ""
     if r.lines_waiting_max is not None:
-        waiting = f"; at most {r.lines_waiting_max} newer lines were sent before that"
+        waiting = f"; at most {r.lines_waiting_max} newer lines were sent meanwhile"
     start = "not measured" if r.start_up_ms is None else f"{r.start_up_ms:.0f} ms"
     rows = [
         ("commands", f"{r.commands_sent} sent{seen}"),

@@ -3,8 +3,8 @@
     bench (bus client)  <- loopback TCP ->  daemon  <- pty ->  far_end.py (simulated MCU)
 
 The three processes use the same monotonic clock, so their times can be compared. The measured
-program is usually acsard. Any other program that accepts `--config` and `--port` and uses the same
-Zenoh keys can be measured in its place.
+program is usually acsard. It may be any other program that accepts `--config` and `--port` and uses
+the same Zenoh keys.
 """
 
 from __future__ import annotations
@@ -45,21 +45,23 @@ from acsard.host.errors import Exit, ExitError, MendableError, NoAnswerError, Un
 from acsard.host.own_identity import sender_id
 
 END_S = 5.0
-"""Time in which a process must end after it was told to, s. A process usually needs 0.2 s."""
+"""Time limit for a process to end after it was asked to, s. A process usually needs 0.2 s."""
 
 
 def ended(who: str, code: int, said: str = "") -> MendableError:
-    """Return an error which says that process `who` ended with the exit code `code`.
+    """Return an error which says that the process named `who` ended, and how.
 
-    If `code` is negative, it is the number of a signal. `said` is the process's message.
+    `code` is its exit code. If `code` is negative, the signal with the number -`code` ended the
+    process. `said` is the last message of the process.
     """
     return MendableError(f"{who} {how_it_ended(code)}" + (f": {said}" if said else ""))
 
 
 def daemon_ended(code: int, log: Path) -> MendableError:
-    """Return an error that says why the daemon ended by itself, with the last message in `log`.
+    """Return an error that says why the daemon ended by itself.
 
-    If there is such a message and `code` is in `Exit`, the benchmark also exits with `code`.
+    The error quotes the daemon's last message in the file `log`. If there is such a message and the
+    exit code `code` is one of `Exit`, the benchmark exits with the same code.
     """
     lines = log.read_text(errors="replace").splitlines()
     # The daemon's log lines are JSON; its reason for ending is plain text.
@@ -93,7 +95,7 @@ A start takes 0.3 s, or 2.3 s if opening the port resets the board.
 """
 
 SETTLED = 10
-"""Number of odometry samples after which the start of the daemon counts as complete."""
+"""Number of odometry samples that must arrive before the daemon's start counts as complete."""
 
 LOOK_S = 0.5
 """Interval at which the benchmark checks that all its processes are running, s."""
@@ -101,12 +103,12 @@ LOOK_S = 0.5
 FAR_END = "the simulated microcontroller's process"
 
 SPACING_S = (0.02, 0.06)
-"""Range of the random times between commands, s, so that the commands are not in step with the
-daemon's control period."""
+"""Range of the random time between two commands, s. It is random so that the commands do not keep
+step with the daemon's control period."""
 
 
 class Rig:
-    """Context manager that starts the daemon and waits until it publishes odometry.
+    """Context manager that starts the measured program and waits until it publishes odometry.
 
     `follow()` and `command()` measure, and `end()` returns the record.
 
@@ -115,9 +117,9 @@ class Rig:
         file: the configuration file of the measured program.
         words: the command line that starts the measured program.
         port: the serial port; "" starts a process that simulates the board on a pty.
-        free_running: period of the reports of a simulated board that reports without being asked,
-            s; 0 simulates a board that answers each line.
-        wire_baud_rate: baud rate of the simulated board; 0 means the configured one.
+        free_running: period at which the simulated board reports without being asked, s; 0
+            simulates a board that answers each line.
+        wire_baud_rate: baud rate of the simulated board; 0 means the configured baud rate.
     """
 
     def __init__(
@@ -135,7 +137,7 @@ class Rig:
         self._endpoint = config.bus.listen[0]
         self._codec = Codec(config.mcu.wheels, config.mcu.trailing_comma)
         self._kinematics = Kinematics(config.drive)
-        # With an identity of its own, the benchmark may drive directly after its zero.
+        # A sender with its own identity may drive as soon as it has sent a zero.
         self._attachment = Signature(sender_id("bench")).pack()
         self._stack = ExitStack()
         self._far_end: subprocess.Popen[bytes] | None = None
@@ -256,10 +258,11 @@ class Rig:
         return self._share(began_ns, used_ns)
 
     def command(self, seconds: float, wheel_speed: Callable[[int], float], seed: int = 1) -> float:
-        """Send commands at random intervals. Return the daemon's CPU use as a fraction of one core.
+        """Send commands at random intervals for `seconds`.
 
-        `wheel_speed` takes the number of a command (0, 1, ...) and returns the wheels' speed,
-        rad/s.
+        Returns the daemon's CPU use as a fraction of one core. `wheel_speed` takes the number of a
+        command (0, 1, ...) and returns the speed of all wheels, rad/s. `seed` determines the random
+        intervals.
         """
         phases, number = random.Random(seed), 0
         self._neutral(phases)
@@ -275,7 +278,7 @@ class Rig:
         return self._share(began_ns, used_ns)
 
     def _neutral(self, phases: random.Random) -> None:
-        """Send zero speeds until the daemon accepts them: at first it ignores a new sender."""
+        """Send zero speeds until the daemon counts one. At first it ignores a new sender."""
         before = self._counted()
 
         def look() -> bool | None:

@@ -1,10 +1,10 @@
-"""Drives the board that is checked: sends speeds to its motors a to d and stores its replies.
+"""Drives the board that is checked: sends speeds for its motors a to d, and stores its replies.
 
 A step of the check sends lines through a `Board` for some time, and then evaluates the stored
-`replies`. Speeds belong to motors and not to wheels, because the check has to find out which wheel
-a motor turns. Three events interrupt a step at once: a motor runs away, the board falls silent
-while motors turn, or the board restarts. The first two end the check. The caller implements the
-interfaces `Wire` (the serial line) and `Operator` (the person at the robot).
+`replies`. Speeds are given for motors and not for wheels, because the check has to find out which
+wheel a motor turns. Three events interrupt a step immediately: a motor runs away, the board falls
+silent while motors turn, or the board restarts. After the first two, the check ends. The caller
+implements the interfaces `Wire` (the serial line) and `Operator` (the person at the robot).
 """
 
 from __future__ import annotations
@@ -33,10 +33,13 @@ class Wire(Protocol):
     """Interface of the serial connection between this computer and the board."""
 
     def open(self, baud_rate: int) -> None:
-        """Open the connection or set its baud rate. Raises `MendableError` or `WireLostError`."""
+        """Open the connection, or set the baud rate if the connection is open already.
+
+        Raises `MendableError` or `WireLostError`.
+        """
 
     def close(self) -> None:
-        """Send the last bytes and close the connection."""
+        """Send the bytes that are still waiting, and close the connection."""
 
     def now_ns(self) -> int:
         """Return the monotonic time, ns."""
@@ -45,16 +48,17 @@ class Wire(Protocol):
         """Send bytes now. Raises `WireLostError` if the connection is lost."""
 
     def late_ns(self) -> int:
-        """Return how long a simulated board waited for processor time since the last call, ns.
+        """Return how long the board has waited for a processor since the last call, ns.
 
-        The result is 0 if the board is a real one and not a program on this computer.
+        Only a simulated board, which is a program on this computer, can wait for a processor. For a
+        real board the result is 0.
         """
 
     def listen(self, until_ns: int) -> Sequence[tuple[int, bytes]]:
         """Receive until the monotonic time `until_ns`, and return the received pieces of data.
 
-        Each piece has the monotonic time of its arrival, ns. Raises `WireLostError` if the
-        connection is lost.
+        Each piece is a pair: the monotonic time of its arrival, ns, and the bytes. Raises
+        `WireLostError` if the connection is lost.
         """
 
 
@@ -62,31 +66,31 @@ class Operator(Protocol):
     """Interface through which the check asks and informs the operator, a person at the robot."""
 
     def doing(self, text: str) -> None:
-        """Show `text`, which says what the check does now. It stays until the next call."""
+        """Show `text`, which says what the check does now, until the next call of this method."""
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
-        """Return one of the answers, or None if no person watches the robot."""
+        """Ask a question. Return one of `answers`, or None if no person watches the robot."""
 
     def keys(self, wait_s: float) -> str:
-        """Return the keys that were typed; wait up to `wait_s` s for the first key."""
+        """Return the keys that the operator has typed. Wait up to `wait_s` s for the first key."""
 
 
 def _nothing() -> None:
-    """Do nothing."""
+    """Do nothing, as the default of `Board.between`."""
 
 
 LEAST_S = 0.001
-"""Time, s. `Board.drive` sends no further line if less than this is left of its duration."""
+"""Shortest remaining part of its duration, s, for which `Board.drive` sends another line."""
 
 BEAT_NS = int(motion.PERIOD_S * NS_PER_S)
-"""Interval at which the lateness of this computer is measured while listening, ns."""
+"""Interval at which `Board.listen` measures the lateness of this computer, ns."""
 
 FAREWELL = 5
 """Number of times that zeros are sent at the end of the check."""
 
 
 KNOWN = ("comma", "latched", "sealed", "sampled", "own_clock", "gap_s", "paced", "lost")
-"""Names of the attributes of `Board` in which a step leaves results for later steps."""
+"""Names of the attributes of `Board` that hold the results of steps, which later steps use."""
 
 
 class Board:
@@ -103,37 +107,37 @@ class Board:
         self.longest_reply_s = longest_reply
         """Largest permitted value of mcu.reply_period, s."""
         self.armed = False
-        """Whether all motors have stood still once. From then on, a runaway motor ends the
-        check."""
+        """Whether all motors have been seen to stand once. From then on, a motor that runs away
+        ends the check."""
         self.between: Callable[[], object] = _nothing
-        """Function that is called before `send` sends a line that turns a motor, when the board
-        begins to listen, and then after each wait of up to `BEAT_NS`. It may raise an exception
-        that ends the check. It is not called while the last zeros are sent."""
+        """Callback that may raise an exception to end the check. `send` calls it before each line
+        that turns a motor. `listen` calls it at its beginning, and then after each wait of up to
+        `BEAT_NS`. It is not called while the last zeros are sent."""
         # Results of the steps
         self.baud_rate: int = mcu.baud_rate
         self.comma = mcu.trailing_comma
         """Whether the lines to the board end with a comma."""
         self.latched = False
-        """Whether zeros stop motor d only if the line ends as `comma` says."""
+        """Whether motor d stops only if the line of zeros has the ending that `comma` says."""
         self.sealed = self.sampled = False
-        """`sealed`: each line has a checksum. `sampled`: each line to the board also requests the
-        board's clock and encoder counts."""
+        """`sealed` says whether each line has a checksum. `sampled` says whether each line to the
+        board also requests the board's clock and encoder counts."""
         self.identity: dict[str, str] = {}
         self.own_clock = False
-        """Whether the board sends reports by its own clock, and not in reply to lines."""
+        """Whether the board sends reports by its own clock, instead of replies to lines."""
         self.gap_s = mcu.reply_period
         """Mean time between two replies while lines are sent, s."""
         self.paced = False
-        """Whether the reply rate was judged, so that `own_clock` and `gap_s` are known."""
+        """Whether the reply rate has been measured, so that `own_clock` and `gap_s` are known."""
         self.lost = 0.0
-        """Fraction of the lines that are lost or damaged in either direction."""
+        """Fraction of the lines, in both directions together, that are lost or damaged."""
         # Received lines
         self.replies: list[Reply] = []
         self.others: list[bytes] = []
         """Received lines that are not valid replies."""
         self.inputs: dict[int, bool] = {}
-        """Whether each input was pressed in the last status line that reported it. Input 0 is the
-        emergency stop, and inputs from 1 on are the bumpers."""
+        """Maps the number of each reported input to whether it was pressed in the last status line
+        that reported it. Input 0 is the emergency stop, and inputs 1, 2, ... are the bumpers."""
         self.heard = Heard()
         """Statistics of all bytes and lines received since the port was opened."""
         self.sent_lines = 0
@@ -141,13 +145,13 @@ class Board:
         self.lateness = Lateness()
         """The delays of this computer, including those of a simulated board that runs on it."""
         self.fled = False
-        """Whether a motor runs away, or keeps turning although zeros are sent. The host then sends
+        """Whether a motor runs away, or keeps turning although zeros are sent. Then the check sends
         nothing more, so that the board's watchdog can stop the motor."""
 
         self._commanded = ZERO
         self._unanswered_s = 0.0
-        """Time for which `drive` has sent lines without any reply, s. Pauses of this computer do
-        not count."""
+        """Time for which `drive` has sent lines since the last reply, s. Times during which this
+        computer paused do not count."""
         self._listened_s = 0.0
         self._sequence = 0
         self._lines = LineReader()
@@ -155,7 +159,7 @@ class Board:
         self._codecs = {comma: Codec(WheelMap(), comma) for comma in (False, True)}
 
     def open(self, baud_rate: int) -> None:
-        """Open the port at this baud rate, and discard everything that was received before."""
+        """Open the port at this baud rate, and discard all lines that were received before."""
         self.wire.open(baud_rate)
         self.baud_rate, self.heard = baud_rate, Heard()
         self.forget()
@@ -174,7 +178,7 @@ class Board:
         try:
             self._farewell()
         except BaseException:
-            self._farewell()  # a signal interrupted the first call; zeros must still be sent
+            self._farewell()  # a signal interrupted the first call, but zeros must still be sent
             raise
         finally:
             self.wire.close()
@@ -182,8 +186,8 @@ class Board:
     def _farewell(self) -> None:
         """Send zeros several times, but send no more once a motor runs away.
 
-        With a reversed encoder, the firmware's speed control makes the motor run away even on
-        zeros. Each further line would keep the watchdog from stopping it.
+        If an encoder is reversed, the firmware's speed control may make the motor run away even
+        when zeros are sent. Each further line would keep the watchdog from stopping the motor.
         """
         self.armed, self.restarts.watched, self.between = False, False, _nothing
         try:
@@ -203,7 +207,7 @@ class Board:
 
     @property
     def known(self) -> dict[str, object]:
-        """Values of the attributes in `KNOWN`, from which a repetition of a step starts."""
+        """Values of the attributes in `KNOWN`, which are restored before a step is repeated."""
         return {name: getattr(self, name) for name in KNOWN}
 
     @known.setter
@@ -236,7 +240,7 @@ class Board:
         return seal(line, self._sequence, ASK_SAMPLE if self.sampled else b"")
 
     def send(self, motors: Motors, comma: bool | None = None) -> None:
-        """Send one line that commands these speeds, rad/s. The parameters are those of `line()`."""
+        """Send one line that commands these speeds, rad/s. See `line()` for the parameters."""
         if any(motors):
             self.between()
         turned, self._commanded = any(self._commanded), motors
@@ -248,7 +252,10 @@ class Board:
         self.restarts.sent(motors, self.sent_s)
 
     def zeros(self) -> None:
-        """Send zeros in all forms: with and without a comma, and with a checksum if `sealed`."""
+        """Send zeros in all forms: lines with and without a final comma, and one with a checksum.
+
+        The line with a checksum is sent only if `sealed` is true.
+        """
         self._commanded = ZERO
         plain = self._codecs[True].stop + self._codecs[False].stop
         self.wire.send(b"\r\n" + plain + (self.line(ZERO) if self.sealed else b""))
@@ -272,9 +279,9 @@ class Board:
     def answers(
         self, lines: int, wait_s: float, comma: bool | None = None
     ) -> list[tuple[float, Reply]]:
-        """Send zeros `lines` times. Return the delay, s, and the first reply for each line.
+        """Send zeros `lines` times. Return a pair for each line: the delay, s, and the first reply.
 
-        Wait `wait_s` s for each reply, but at least 1.5 times `period_s`. A line without a reply
+        Wait `wait_s` s after each line, but at least 1.5 times `period_s`. A line without a reply
         has no entry in the result.
         """
         # Replies to earlier lines must not be taken for replies to these lines.
@@ -289,8 +296,8 @@ class Board:
     def drive(self, motors: Motors, seconds: float, period_s: float = 0.0) -> list[Reply]:
         """Send these speeds, rad/s, repeatedly for `seconds`, and return the replies of that time.
 
-        The time between two lines is `period_s`; 0 means `self.period_s`. Raises `StoppedError` if
-        the board falls silent while `armed`, because a runaway motor would then go unnoticed.
+        `period_s` is the time between two lines; 0 means `self.period_s`. Raises `StoppedError` if
+        the board falls silent while `armed` is true, because a motor could then run away unnoticed.
         """
         period_s = period_s or self.period_s
         end_s = self.now_s + seconds
@@ -309,7 +316,7 @@ class Board:
         return got
 
     def let_go(self, silent_s: float) -> None:
-        """Send zeros once, then nothing for `silent_s` s, so that the watchdog stops any motor."""
+        """Send zeros once, then nothing for `silent_s` s, so that the watchdog stops the motors."""
         self.zeros()
         self.listen(silent_s)
 
@@ -318,12 +325,12 @@ class Board:
     def listen(self, seconds: float) -> list[Reply]:
         """Receive for `seconds`, and return the replies of that time.
 
-        Raises `StoppedError` if a motor runs away while `armed`; `RestartedError` if the board
-        restarts.
+        Raises `StoppedError` if a motor runs away while `armed` is true, and `RestartedError` if
+        the board restarts.
         """
         end_ns = self.wire.now_ns() + ceil(seconds * NS_PER_S)
         if self.now_s - self._listened_s > BEAT_NS / NS_PER_S:
-            self.wire.late_ns()  # discard this lateness: nothing was measured at that time
+            self.wire.late_ns()  # nothing was measured during that lateness, so discard it
         got: list[Reply] = []
         self.between()
         while True:
@@ -384,7 +391,7 @@ class Board:
 
     @property
     def silent_s(self) -> float:
-        """Time since the last reply, s; 0 before the first reply, and 0 if `fled` is true."""
+        """Time since the last reply, s; 0 before the first reply, and 0 while `fled` is true."""
         return self.now_s - self.replies[-1].at_s if self.replies and not self.fled else 0.0
 
     def _guard(self) -> None:
@@ -412,8 +419,8 @@ class Board:
     def rest(self) -> None:
         """Send zeros until all motors stand. Raises `StoppedError` if a motor keeps turning.
 
-        Some firmware lets motor d obey only one line ending: with a comma, or without one. If only
-        the other ending stops motor d, later lines have that ending.
+        In some firmware motor d obeys only lines that end with a comma, or only lines without a
+        final comma. If only the other ending stops motor d, `comma` is changed for later lines.
         """
         began_s = self.now_s
         if self.settles(self.comma):
@@ -430,10 +437,10 @@ class Board:
         raise StoppedError(outcomes.find("stop: turns", motors=motors, seconds=seconds))
 
     def settles(self, comma: bool) -> bool:
-        """Send zeros until at least two replies show that every motor stands.
+        """Send zeros until the last two replies show that every motor stands, then return True.
 
-        `comma` says whether the lines end with a comma. Returns False if this takes longer than
-        `MOTOR_S`, or longer than `PATIENCE_S` while a motor still slows down.
+        `comma` says whether the lines end with a comma. Returns False if the motors do not stand
+        after `MOTOR_S`, or after `PATIENCE_S` while a motor still slows down.
         """
         began_s = self.now_s
         while True:

@@ -1,4 +1,4 @@
-"""The result of the check as text and as an object, and the advised changes to `acsard.toml`."""
+"""Makes the report of the check, as text and as an object, and advises changes to `acsard.toml`."""
 
 from __future__ import annotations
 
@@ -17,22 +17,23 @@ from acsard.core.config.settings import Config
 from acsard.core.config.toml_text import excerpt
 
 Changes = dict[str, object]
-"""New configuration values by dotted key, such as `mcu.port`."""
+"""Maps dotted keys, such as `mcu.port`, to new configuration values."""
 
 OPTIONAL = ("mcu.encoder_counts", "mcu.link_check")
 """Keys that improve the link but make its lines longer. If the wire is too slow, the advice leaves
-out the first key, and then the second one."""
+out the first key. If that is not enough, it leaves out the second key too."""
 
 
 def answered(findings: Iterable[Finding]) -> bool:
-    """Return whether a board answered at the port. It did if the check found its baud rate."""
+    """Return whether a board answered at the port, so that the check found its baud rate."""
     return any(finding.name == "baud rate" and finding.keys for finding in findings)
 
 
 def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Changes:
     """Return the suggested changes of the configuration.
 
-    They include `mcu.port` with the value `port`, unless `port` is "" or no board answered there.
+    The changes include `mcu.port` with the value `port`, unless `port` is "" or no board answered
+    at the port.
     """
     wanted: Changes = {"mcu.port": port} if port and answered(findings) else {}
     for finding in findings:
@@ -43,8 +44,8 @@ def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Chan
         changed = applied(given, config)
         return changed is not None and not contradictions(changed)
 
-    # Longer or slower lines may leave no room for the control rate. Leave out the least important
-    # keys first.
+    # Longer or slower lines may take too long for the control rate. Then leave out the optional
+    # keys, the least important one first.
     for optional in ("", *OPTIONAL):
         if optional and attrgetter(optional)(config) in (0, "off"):
             differing.pop(optional, None)
@@ -57,7 +58,7 @@ def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Chan
 def withheld(simulated: bool, config: Config) -> str:
     """Return why the findings do not apply to the robot of this configuration, or "" if they do.
 
-    `simulated` means that the check tested the simulator.
+    `simulated` is true if the check tested the simulator.
     """
     if not simulated or config.mcu.simulated:
         return ""
@@ -83,8 +84,9 @@ class Report(Struct, frozen=True):
     """The result of a check.
 
     `changes` are the suggested configuration values, and `toml` contains them as lines of TOML.
-    `written` is the file that now contains the changes. `error` is a failure outside the board,
-    such as a port that cannot be opened or a file that could not be written.
+    `written` is the path of the file that now contains the changes, or None. `error` describes a
+    failure outside the board, such as a port that cannot be opened or a file that cannot be
+    written.
     """
 
     port: str
@@ -109,8 +111,8 @@ def report(
 ) -> Report:
     """Return the report of a check.
 
-    A check has passed if the board answered, every step was run and judged, and no step failed. If
-    `written`, `error` or `withheld` is "", the report contains None instead.
+    A check has passed if the board answered, every step was run and judged, and no step failed. The
+    report contains None instead of an empty `written`, `error` or `withheld`.
     """
     judged = answered(findings) and not lateness.unjudged(findings)
     passed = judged and not any(one.verdict == "FAIL" or one.name == REST for one in findings)
@@ -121,7 +123,7 @@ def report(
 
 
 def summary(found: Report, where: str) -> str:
-    """Return the last lines that the check prints, for a configuration file named `where`."""
+    """Return the last lines that the check prints. `where` names the configuration file."""
     verdicts = [finding.verdict for finding in found.findings]
     counts = ", ".join(f"{verdicts.count(v)} {v}" for v in get_args(Verdict) if v in verdicts)
     if late := lateness.unjudged(found.findings):

@@ -12,14 +12,14 @@ from acsard.core.link.checked_line import seal
 from acsard.core.link.codec import LETTERS
 
 WHOLE = {"over-long", "garbage before it"}
-"""Kinds of damage that leave the values intact. Firmware that accepts them is not dangerous."""
+"""Kinds of damage that leave the speeds intact. A board that obeys such lines is not dangerous."""
 
 
 def broken_lines(comma: bool, sealed: bool, motors: Sequence[int]) -> list[tuple[str, bytes]]:
-    """Return the damaged lines, each with the name of its kind of damage.
+    """Return a pair for each damaged line: the name of the kind of damage, and the line.
 
-    The lines command `SPEED` for `motors` and zero for the other motors. With `comma`, the lines
-    end with a comma. With `sealed`, the result includes lines with a damaged checksum.
+    The lines command `SPEED` for `motors` and zero for the other motors. If `comma` is true, the
+    lines end with a comma. If `sealed` is true, the result includes lines with a damaged checksum.
     """
     a, b, c, d = (
         f"{letter}p{SPEED if motor in motors else 0.0:05.2f}"
@@ -50,7 +50,7 @@ def broken_lines(comma: bool, sealed: bool, motors: Sequence[int]) -> list[tuple
 
 
 def finding(board: Board, motors: Sequence[int]) -> Finding:
-    """Send damaged lines while `motors` stand. Report the kinds of damage that moved a motor."""
+    """Send damaged lines while `motors` stand, and return which kinds of damage moved a motor."""
     if not motors:
         return outcomes.find("damaged lines: untested")
     lines = broken_lines(board.comma, board.sealed, motors)

@@ -1,6 +1,6 @@
 """Steps of the check that find out how the board communicates.
 
-They send only zeros and questions. Later steps use the results.
+These steps send only zeros and questions. Later steps use their results.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from acsard.core.link.session import IDENTITY
 
 
 def baud(board: Board) -> Finding:
-    """Find the baud rate at which the board answers. Raises `StoppedError` if there is none."""
+    """Find the baud rate at which the board answers. Raises `StoppedError` if it never answers."""
     configured = board.mcu.baud_rate
     if board.baud_rate != configured:
-        board.open(configured)  # the board restarted while another rate was being tried
+        board.open(configured)  # a restart of the board interrupted a trial of another rate
     if _knock(board, BOOT_S):  # the wait is long because opening the port resets many boards
         return outcomes.find("baud rate: right", {"mcu.baud_rate": configured}, rate=configured)
     heard = board.heard
@@ -39,11 +39,11 @@ def baud(board: Board) -> Finding:
 
 
 def _knock(board: Board, seconds: float) -> bool:
-    """Send zeros until three good replies have arrived. Return False after `seconds` s."""
+    """Send zeros until three valid replies have arrived. Return False if they take too long."""
     end_s = board.now_s + seconds
     while board.now_s < end_s:
         board.zeros()
-        # Firmware that has accepted a checked line since it booted refuses plain ones.
+        # Firmware with the checked link refuses plain lines once it has accepted a checked line.
         board.wire.send(seal(board.line(ZERO), 0))
         board.listen(max(GLANCE_S / 4, 5 * board.period_s))
         if len(board.replies) >= 3:
@@ -53,7 +53,7 @@ def _knock(board: Board, seconds: float) -> bool:
 
 
 def identity(board: Board) -> Finding:
-    """Ask for the board's identification. An echo of the question raises `StoppedError`."""
+    """Ask for the board's identification. Raises `StoppedError` if only an echo comes back."""
     board.others.clear()
     for _ in range(3):  # the question or its answer may be lost
         board.restarts.asked(board.now_s)
@@ -73,15 +73,15 @@ def identity(board: Board) -> Finding:
 
 
 def form(board: Board) -> Finding | None:
-    """Find out whether the board answers only lines with the ending that is not configured.
+    """Find out whether the configured `mcu.trailing_comma` keeps the board from answering.
 
-    Lines end with a comma or without one. If only the other ending works, return a finding and use
-    that ending for later lines. Otherwise return None.
+    If the board answers only lines with the other ending, use this ending for later lines and
+    return a finding. Otherwise return None.
     """
     if board.own_clock or _answers(board, board.comma) or not _answers(board, not board.comma):
         return None
     if _answers(board, board.comma):
-        return None  # the board had only been delayed
+        return None  # the board was only late
     board.comma = not board.comma
     return _comma_wrong(board, "refused")
 
@@ -91,7 +91,7 @@ def _answers(board: Board, comma: bool) -> list[Reply]:
 
 
 def comma(board: Board, dead: bool) -> Finding:
-    """Return the finding about a comma at the end of lines. Some firmware needs it for motor d.
+    """Return the finding about `mcu.trailing_comma`. Some firmware needs the comma for motor d.
 
     `dead` is True if motor d was not seen to move, or if its movement could not be measured.
     """
@@ -104,7 +104,10 @@ def comma(board: Board, dead: bool) -> Finding:
 
 
 def _comma_wrong(board: Board, how: str) -> Finding:
-    """Return the finding that `mcu.trailing_comma` is wrong. `how` ends the outcome's name."""
+    """Return the finding that `mcu.trailing_comma` is wrong.
+
+    `how` is the last part of the outcome's name in `outcomes.py`.
+    """
     return outcomes.find(
         f"trailing comma: {how}",
         {"mcu.trailing_comma": board.comma},
@@ -116,7 +119,10 @@ def _comma_wrong(board: Board, how: str) -> Finding:
 
 
 def replies(board: Board) -> Finding:
-    """Compare the replies with the documented form. The daemon also reads other forms."""
+    """Compare the form of the replies with the documented form.
+
+    The daemon also reads the other forms that this step detects.
+    """
     lines = [reply.line.partition(b"#")[0] for reply in board.replies]
     forms = {"spaces": rb", ", "unpadded": rb"[pn]\d\.", "trailing comma": rb", *\Z"}
     found = [name for name, sign in forms.items() if any(re.search(sign, line) for line in lines)]
@@ -128,10 +134,10 @@ def replies(board: Board) -> Finding:
 
 
 def check(board: Board) -> Finding:
-    """Find out whether the board supports the checked link and the sample fields.
+    """Find out whether the board supports the checked link, and samples in its replies.
 
-    The checked link adds a checksum to each line. The sample fields of a reply are the board's
-    clock and its encoder counts.
+    The checked link adds a sequence number and a checksum to each line. A sample is a reading of
+    the board's clock and of its encoder counts.
     """
     wanted = board.mcu.link_check
     board.sealed = board.sampled = True
@@ -148,11 +154,11 @@ def check(board: Board) -> Finding:
 
 
 def rate(board: Board) -> Finding:
-    """Measure how often the board replies, and find out whether it reports by its own clock."""
+    """Measure how often the board replies, and whether it reports by its own clock."""
     board.paced = True
     board.listen(GLANCE_S / 4)
     unasked = board.listen(CUT_S)
-    # Late replies to earlier lines all arrive at once, so they span no time.
+    # Late replies to earlier lines arrive almost at the same time, unlike reports.
     board.own_clock = bool(unasked) and unasked[-1].at_s - unasked[0].at_s > GLANCE_S
     highest_hz = highest_rate(board.baud_rate, line_bytes(board.comma), COMFORTABLE_USE)
     period_s, before = 1 / min(board.rate_hz, highest_hz), board.sent_lines
@@ -186,7 +192,7 @@ def rate(board: Board) -> Finding:
 
 
 def trip(board: Board) -> Finding:
-    """Measure the time from sending a line to the board's reply."""
+    """Measure the time from the sending of a line to the arrival of the board's reply."""
     if not board.paced:
         return lateness.finding("round trip", board.lateness.since(0.0))
     if board.own_clock:

@@ -13,19 +13,19 @@ from acsard.checkup.motion import GLANCE_S, Reply, steps
 from acsard.core.link.codec import LETTERS
 
 AGREES = 0.02
-"""Largest relative difference between the measured and the stated counts per turn."""
+"""Largest tolerated relative difference between measured counts per turn and the stated number."""
 
 ALIKE = 0.75
-"""Smallest accepted ratio of the lowest to the highest counts per turn of the motors. It is low,
-because with a coarse encoder the measurement of a single motor is rough."""
+"""Smallest accepted ratio between the counts per turn of the motor with the fewest and of the motor
+with the most. It is low, because a coarse encoder allows only a rough measurement."""
 
 COARSE = 0.015
-"""If a motor's angle jumps by at least this much on average from reply to reply, rad, its encoder
-is coarse. The daemon must know the counts per turn of such an encoder."""
+"""An encoder is coarse if the angle between two replies varies by at least this much on average,
+rad. The daemon must know the counts per turn of a coarse encoder."""
 
 LONGEST_S = 0.05
-"""Longest time between replies, s, for which jumps of the speed can show a coarse encoder. With a
-longer time, the motors' own accelerations look like jumps."""
+"""Longest time between replies, s, at which jumps of the speed reveal a coarse encoder. At longer
+times, the accelerations of the motors look like jumps too."""
 
 LEAST_ANGLES = 20
 """Smallest number of nonzero speed readings that can show a coarse encoder."""
@@ -37,8 +37,9 @@ MOST_COUNTS = 100_000
 def per_turn(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
     """Return the mean encoder counts per wheel turn of these motors.
 
-    They are computed from the change of the counts and the reported speeds. The result is negative
-    if the counts run against the speeds, and None if the motors turned too little.
+    The result is the change of the counts divided by the number of turns, which follows from the
+    reported speeds. It is negative if the counts run against the speeds, and None if the motors
+    turned too little.
     """
     counts = angle = 0.0
     for step in steps(replies):
@@ -47,15 +48,15 @@ def per_turn(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
             if step.counts and abs(speed) >= 1.0:
                 counts += math.copysign(1.0, speed) * step.counts[motor]
                 angle += abs(speed) * step.mcu_s
-    # Below 2 rad, the speeds' own rounding spoils the result.
+    # Below 2 rad, the rounding of the reported speeds makes the result too inaccurate.
     return counts / angle * math.tau if angle >= 2.0 else None
 
 
 def coarse(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
     """Estimate the counts per turn of coarse encoders from the jumps of the reported speeds.
 
-    This is for replies without counts. Returns None if the encoders are not coarse, if there are
-    too few speeds, or if the replies are too rare (`LONGEST_S`).
+    Use this function if the replies contain no counts. It returns None if the encoders are not
+    coarse, if there are too few speeds, or if the replies are too rare (`LONGEST_S`).
     """
     course = [step for step in steps(replies) if 0.0 < step.seconds <= GLANCE_S]
     # The time of a single line may be wrong if this computer is late.
@@ -94,7 +95,7 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
     unused: dict[str, object] = {"mcu.encoder_counts": 0} if configured else {}
     if measured is None and not named:
         return outcomes.find("encoder counts: not turned")
-    # The mean over all motors may look right although the counts of one of them are wrong.
+    # The mean over all motors may look right although the counts of a single motor are wrong.
     single = {motor: per_turn(board.replies, [motor]) for motor in motors}
     each = {motor: counts for motor, counts in single.items() if counts is not None}
     if wrong := [motor for motor, counts in each.items() if counts < 1]:

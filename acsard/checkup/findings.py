@@ -18,10 +18,10 @@ REST = "the rest"
 
 
 class Finding(Struct, frozen=True):
-    """The result for one subject. Its texts come from `outcomes.py`.
+    """The result for one subject of the check. Its texts come from `outcomes.py`.
 
-    `figure` is the measurement, and `text` its meaning. `mend` is the remedy, or "" if there
-    is none. `keys` contains the suggested configuration values by dotted key. Some of them may be
+    `figure` is the measurement, and `text` is its meaning. `mend` is the remedy, or "" if there is
+    none. `keys` maps dotted keys of the configuration to suggested values. A suggested value may be
     configured already.
     """
 
@@ -34,7 +34,7 @@ class Finding(Struct, frozen=True):
 
 
 class StoppedError(AcsardError):
-    """Ends the check early. `finding` tells the operator why."""
+    """Ends the check early. `finding` is the reason for the operator."""
 
     def __init__(self, finding: Finding) -> None:
         super().__init__(finding.text)
@@ -46,7 +46,7 @@ class WireLostError(AcsardError):
 
 
 def wheel_of(mcu: McuConfig, motor: int) -> tuple[str, int]:
-    """Return the wheel that a motor (0 to 3) turns according to the configuration, and a sign.
+    """Return a pair: the wheel that a motor (0 to 3) turns by configuration, and a sign.
 
     The sign is -1 if a positive speed of the motor turns the wheel backward, else 1.
     """

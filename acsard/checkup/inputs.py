@@ -1,7 +1,7 @@
 """Asks the operator to press the emergency stop and each bumper, and checks the status lines.
 
-The board reports the inputs in status lines (`core/link/board_status.py`). The step comes last,
-because a pressed emergency stop cuts the motors, and some drivers must be enabled again after it.
+The board reports these inputs in status lines (`core/link/board_status.py`). This step comes last,
+because the emergency stop cuts the motors, and some motor drivers must be enabled again afterward.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from acsard.checkup.findings import Finding
 from acsard.core.config.settings import SafetyConfig
 
 PRESS_S = 20.0
-"""Time in which the operator must press an input and release it, s."""
+"""Time within which the operator must press and release an input, s."""
 
 NEWS_S = 0.5
 """Time within which every board reports each of its inputs at least once, s."""
@@ -27,10 +27,10 @@ class Input(Struct, frozen=True):
 
 
 def finding(board: Board, operator: Operator, safety: SafetyConfig) -> Finding:
-    """Let the operator press each input, and return a finding about how the board reported them.
+    """Let the operator press each input, and check that the board reports each press and release.
 
-    The inputs are those that the configuration requires or the board reports. A bumper is named by
-    its configured place, or by its number on the board if no places are configured.
+    The inputs are those that the configuration requires or that the board reports. A bumper is
+    named by its configured place, or by its number on the board if no places are configured.
     """
     board.ask(NEWS_S)
     estop = safety.estop == "required" or (safety.estop == "auto" and 0 in board.inputs)
@@ -64,7 +64,10 @@ def finding(board: Board, operator: Operator, safety: SafetyConfig) -> Finding:
 
 
 def _pressed(board: Board, operator: Operator, asked: Input, inputs: list[Input]) -> str:
-    """Let the operator press the input `asked`. Return its fault in words, or ""."""
+    """Let the operator press and release the input `asked`.
+
+    Returns a text that says what the board reported wrongly, or "" if its reports were right.
+    """
     operator.doing(f"press the {asked.name} and release it, within {PRESS_S:g} s")
     end_s, seen = board.now_s + PRESS_S, set[int]()
     while board.now_s < end_s:

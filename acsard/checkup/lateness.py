@@ -1,9 +1,10 @@
 """Measures the lateness of this computer, and decides which findings may be wrong because of it.
 
-An overloaded computer sends and receives late, and so finds faults that the board does not have. If
-the board is a program on this computer, its waits for a processor count as lateness too. A step
-during which this computer was late is repeated (`procedure.py`). If it is late each time, the
-finding says so and does not blame the board.
+An overloaded computer sends and receives late, so that the check finds faults which the board does
+not have. If the board is a program on this computer, the time for which this program waits for a
+processor counts as lateness too. If this computer was late during a step, the step is repeated
+(`procedure.py`). If this computer is late each time, the finding says so and does not blame the
+board.
 """
 
 from __future__ import annotations
@@ -15,21 +16,21 @@ from acsard.checkup.findings import Finding
 from acsard.checkup.outcomes import Unsure
 
 LEAST_S = 0.005
-"""Smallest delay that is recorded, s. Every computer has smaller ones now and then."""
+"""Smallest delay that is recorded, s. Every computer has smaller delays now and then."""
 
 SPOILS_S = motion.PERIOD_S
 """Smallest delay of this computer that can cause a bad finding, s: the time between two lines."""
 
 PAUSE_S = motion.WATCHDOG_LEAST_S
-"""Smallest delay of this computer that makes even a good finding doubtful, s. The board's watchdog
-may have stopped the motors in that time."""
+"""Smallest delay of this computer that makes even a good finding doubtful, s. During such a delay
+the board's watchdog may have stopped the motors."""
 
 
 LATE = "late: not judged"
 
 
 class Lateness:
-    """Record of the delays with which this computer woke up from waiting."""
+    """Record of delays: how much too late this computer woke up from each wait."""
 
     def __init__(self) -> None:
         self._seen: list[tuple[float, float]] = []
@@ -45,10 +46,10 @@ class Lateness:
 
 
 def spoilt(found: Unsure, late_s: float) -> bool:
-    """Return whether the finding may be wrong because this computer was late by up to `late_s` s.
+    """Return whether the finding may be wrong because this computer was late.
 
-    A delay of half of `found.margin_s` is enough, because the computer may have been late both at
-    the start and at the end of the measurement.
+    `late_s` is the largest delay during the step, s. A delay of half of `found.margin_s` is enough,
+    because this computer may have been late both at the start and at the end of the measurement.
     """
     least_s = PAUSE_S if found.verdict == "PASS" else SPOILS_S
     return late_s >= max(least_s, found.margin_s / 2)
@@ -60,11 +61,11 @@ def finding(name: str, late_s: float) -> Finding:
 
 
 def judged(found: Finding) -> bool:
-    """Return False if the finding says only that this computer was too late to judge the step."""
+    """Return whether the step was judged, and not left open because this computer was late."""
     return found.figure != outcomes.MANUAL[LATE].figure
 
 
 def unjudged(findings: Iterable[Finding]) -> list[str]:
-    """Return the names of the steps that were not judged, according to their last findings."""
+    """Return the names of the steps whose last finding says that they were not judged."""
     last = {found.name: found for found in findings}
     return [name for name, found in last.items() if not judged(found)]

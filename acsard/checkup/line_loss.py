@@ -1,8 +1,9 @@
 """Counts lost and damaged lines, and finds long silences and the direction in which lines are lost.
 
 A reply that arrives damaged was damaged on its way from the board. If a line has no reply, either
-the line or its reply was lost. To find out which, the check sends single lines that turn standing
-motors for a moment. If the motors obey a line without a reply, the reply was lost.
+the line or its reply was lost. To find out which of the two, the check sends single lines, each of
+which turns standing motors for a moment. If the motors obey a line that has no reply, the reply was
+lost. If they do not obey it, the line was lost.
 """
 
 from __future__ import annotations
@@ -23,21 +24,21 @@ from acsard.core.link.link_diagnosis import SHOWN
 from acsard.core.link.session import IDENTITY
 
 MOST = 0.02
-"""Largest fraction of lost lines that the check accepts. A sound link loses none."""
+"""Largest fraction of lost lines that the check accepts. A sound link loses no line."""
 
 FEW = 2
-"""Smallest number of lost lines that counts as a fault. Fewer may be a coincidence."""
+"""Smallest number of lost lines that counts as a fault. A smaller number may be a coincidence."""
 
 LINES, LEAST_S, MOST_S = 300, 3.0, 10.0
-"""The count of lost lines takes `LEAST_S` s. If a line is lost, the count goes on until it has
-`LINES` lines, enough to show a loss of 2 %, or until `MOST_S` s have passed."""
+"""Lost lines are counted for at least `LEAST_S` s. If a line is lost, the count goes on until there
+are `LINES` lines, enough to show a loss of 2 %, or until `MOST_S` s have passed."""
 
 SILENT = 2.0
 """A gap between two replies is a silence only if it is this many times as long as the mean gap."""
 
 
 class Count(Struct, frozen=True):
-    """Numbers of all lines, of lost lines (including damaged ones), and of damaged lines."""
+    """Numbers of all lines, of lost lines and of damaged lines. Damaged lines count as lost too."""
 
     lines: int
     lost: int
@@ -50,15 +51,15 @@ class Count(Struct, frozen=True):
 
 
 def finding(board: Board) -> Finding:
-    """Send zeros at the control rate, count the lost replies, and set `board.lost`.
+    """Send zeros at the control rate, count the lost lines, and set `board.lost`.
 
-    Raises `StoppedError` if the loss exceeds `MOST`, and lines without a checksum arrive damaged. A
-    damaged line to the board could then command any speed. If the rate of the replies was not
-    measured, the finding says that the loss is not judged.
+    Raises `StoppedError` if the loss exceeds `MOST`, lines arrive damaged, and lines have no
+    checksum: a damaged line to the board could then command any speed. If the rate of the replies
+    was not measured, the finding says that the loss was not judged.
     """
     if not board.paced:
         return lateness.finding("lost lines", board.lateness.since(0.0))
-    board.listen(motion.GLANCE_S)  # later replies belong to the lines that are sent after this
+    board.listen(motion.GLANCE_S)  # wait for replies to earlier lines
     began_s, sent, others = board.now_s, board.sent_lines, len(board.others)
     board.drive(ZERO, LEAST_S, _period_s(board))
     silent_s = _silence_s(board, motion.since(board.replies, began_s))
@@ -90,7 +91,10 @@ def finding(board: Board) -> Finding:
 
 
 def _period_s(board: Board) -> float:
-    """Return the time between two lines, s: at least the control period, more for a slow board."""
+    """Return the time between two lines, s.
+
+    It is the control period, or longer if the wire or the board needs more time for a line.
+    """
     longest = line_bytes(board.comma, board.sealed, board.sampled)
     period_s = 1 / min(board.rate_hz, highest_rate(board.baud_rate, longest, COMFORTABLE_USE))
     if not board.own_clock and board.gap_s > 1.5 * period_s:
@@ -114,8 +118,8 @@ def _gaps(replies: Sequence[Reply]) -> list[float]:
 def _left_out(replies: Sequence[Reply]) -> int:
     """Return the number of missing replies of a board that sends them at regular intervals.
 
-    The number follows from the time between the first and the last reply. Single gaps would not
-    show it, because a reply that is received late makes one gap longer and the next one shorter.
+    The number follows from the time between the first and the last reply. A single gap shows
+    nothing, because a reply that is received late makes one gap longer and the next gap shorter.
     """
     gaps = _gaps(replies)
     usual = median(gaps) if gaps else 0.0
@@ -124,36 +128,37 @@ def _left_out(replies: Sequence[Reply]) -> int:
 
 
 def _silence_s(board: Board, replies: Sequence[Reply]) -> float:
-    """Return the longest gap between replies, s, if it would look like a lost link, else 0."""
+    """Return the longest gap between replies, s, or 0 if it would not look like a lost link."""
     longest = max(_gaps(replies), default=0.0)
     quiet_s = max(0.1, 4 / board.rate_hz, 3 * board.mcu.reply_period)
     return longest if longest > max(quiet_s, SILENT * board.gap_s) else 0.0
 
 
 PULSE_S = 0.08
-"""Time from a pulse (a single line that turns the motors) to the zeros that follow, s. It is long
-enough for the encoders to show the movement, and too short for the board's watchdog to act."""
+"""Time from a pulse (a single line that turns the motors) to the zeros that follow, s. In this time
+the encoders can show the movement, and the board's watchdog does not act yet."""
 
 TOLD, PULSES_S = 8, 20.0
-"""The search for the direction of a loss ends after `TOLD` unanswered pulses, or `PULSES_S` s."""
+"""The search for the direction of the loss ends after `TOLD` unanswered pulses or `PULSES_S` s."""
 
 SPREAD, STRIDE = 12, 5
-"""The pause after pulse n is (n * `STRIDE`) % `SPREAD` line periods longer than the shortest pause.
-With equal pauses, losses at regular intervals could miss every pulse."""
+"""The pause after pulse n is the shortest pause plus (n * `STRIDE`) % `SPREAD` line periods. If all
+pauses were equal, losses at regular intervals could miss every pulse."""
 
 OBEYED = 0.5
 """The motors obeyed a pulse if they turned by at least this fraction of the median angle of all
 pulses."""
 
 SEEN, GRAINS = 0.02, 4
-"""Pulses can be judged if they usually turn a motor by `SEEN` rad and `GRAINS` encoder steps."""
+"""Pulses can be judged if the median angle of a pulse is at least `SEEN` rad and at least `GRAINS`
+encoder steps."""
 
 
 class Ways(Struct, frozen=True):
     """Numbers of pulses (see `pulsed`).
 
-    `sent` counts the pulses that could be judged. `there` counts the pulses that were lost on the
-    way to the board. `back` counts the pulses that the motors obeyed, but whose reply was lost.
+    `sent` counts the pulses that could be judged. `there` counts the pulses that were lost on their
+    way to the board. `back` counts the pulses that the motors obeyed although no reply arrived.
     """
 
     sent: int
@@ -164,8 +169,8 @@ class Ways(Struct, frozen=True):
 def direction(board: Board, operator: Operator, motors: Sequence[int]) -> Finding | None:
     """Find out whether lines are lost on the way to the board, or replies on the way back.
 
-    `motors` turn as commanded, so their encoders show which lines arrived. Returns None if the
-    board replies to lines and few lines are lost.
+    `motors` are the motors that turn as commanded, so that their encoders show which lines arrived.
+    Returns None without a search if the board replies to lines and `board.lost` is at most `MOST`.
     """
     if not (board.own_clock or board.lost > MOST):
         return None
@@ -183,9 +188,10 @@ def direction(board: Board, operator: Operator, motors: Sequence[int]) -> Findin
 
 
 def pulsed(board: Board, motors: Sequence[int]) -> Ways | None:
-    """Send pulses, single lines that turn standing motors for a moment, and count the lost ones.
+    """Send pulses and count the lost pulses and replies.
 
-    Returns None if the movement of `motors` does not show which pulses arrived.
+    A pulse is a single line that turns standing motors for a moment. Returns None if the movement
+    of `motors` does not show which pulses arrived.
     """
     on = motion.each(lambda motor: motion.SPEED if motor in motors else 0.0)
     # If the board reports by its own clock, no loss is known yet, so a shorter search is enough.
@@ -220,20 +226,20 @@ def pulsed(board: Board, motors: Sequence[int]) -> Ways | None:
 
 
 def _whole(board: Board, since_s: float) -> bool:
-    """Return whether no periodic report of the board is missing since `since_s`."""
+    """Return whether all periodic reports of the board since `since_s` have arrived."""
     times = [reply.at_s for reply in motion.since(board.replies, since_s - board.gap_s)]
     return all(after - before < 1.5 * board.gap_s for before, after in pairwise(times))
 
 
 def _grain(board: Board, motors: Sequence[int]) -> float:
-    """Return the smallest nonzero angle that these encoders turned between two replies, rad."""
+    """Return the smallest nonzero angle by which an encoder turned between two replies, rad."""
     course = motion.steps(board.replies)
     shown = [abs(step.speeds[m]) * step.seconds for step in course for m in motors]
     return min((angle for angle in shown if angle), default=0.0)
 
 
 def _stand(board: Board) -> bool:
-    """Wait until the motors stand. Return False if they coast too long for more pulses."""
+    """Send zeros until the motors stand. Return False if they coast too long for further pulses."""
     began_s = board.now_s
     while board.turning():
         if board.now_s - began_s > motion.MOTOR_S / 2:

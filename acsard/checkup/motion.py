@@ -18,12 +18,12 @@ from acsard.core.config.wire_time import FIELD
 from acsard.core.link.checked_line import Reading
 from acsard.core.link.codec import Motors
 
-# Bounds, s, of a measured watchdog time that agrees with the firmware's contract, `WATCHDOG_S`.
-WATCHDOG_LEAST_S = 0.1  # a pause of this host that is longer may already have stopped the motors
+# Smallest and largest measured watchdog time, s, that agrees with the firmware's `WATCHDOG_S`.
+WATCHDOG_LEAST_S = 0.1  # during a longer pause of this computer, the watchdog may stop the motors
 WATCHDOG_MOST_S = 0.5
 
 # Speeds, rad/s
-SPEED = 3.0  # the fastest speed that is commanded: half a turn per second
+SPEED = 3.0  # the highest speed that the check commands: half a turn per second
 RUNAWAY = 2 * SPEED  # a faster motor ends the check
 MOVES = SPEED / 4  # a motor at this speed or above counts as moving
 STANDING = SPEED / 10  # a motor below this speed counts as standing
@@ -34,27 +34,27 @@ PROBE_MOVES = SPEED / 40
 # Times, s
 PERIOD_S = 0.02  # interval between two lines, unless the wire needs longer for a line
 GLANCE_S = 0.2  # enough for a few replies, and for some counts of a coarse encoder
-# A lifted wheel reaches the commanded speed, or comes to rest, within this time. A wheel whose
-# speed still changes then gets more time.
+# A lifted wheel usually reaches the commanded speed, or comes to rest, within this time. If its
+# speed still changes then, the check waits longer.
 MOTOR_S = 2.0
 # Longest wait for a speed that still changes: a heavy wheel, or a hub motor that coasts.
 PATIENCE_S = 3 * MOTOR_S
 BOOT_S = 3.0  # a restarted board answers by then; many bootloaders wait two seconds
-CUT_S = WATCHDOG_MOST_S + GLANCE_S  # a silence after which every correct watchdog has cut motors
-# A silence after which the motors stand, unless the MCU has no watchdog.
+CUT_S = WATCHDOG_MOST_S + GLANCE_S  # after such a silence a correct watchdog has cut the motors
+# After such a silence the motors stand, unless the MCU has no watchdog.
 STOOD_S = WATCHDOG_MOST_S + MOTOR_S
 
 
-COUNT_S = 1.0  # longest wait for a count of a motor that may still turn at the speed `STANDING`
+COUNT_S = 1.0  # a reply that is older than this does not show that a motor still turns
 
 ZERO: Motors = (0.0, 0.0, 0.0, 0.0)
 
 TREND_S = 0.5
-"""Shortest length of the two intervals whose mean speeds `trend` compares, s."""
+"""Shortest length of each of the two intervals whose mean speeds `trend` compares, s."""
 
 FALLS = 0.97
-"""A motor slows down if its speed is below this fraction of its speed just before. It speeds up if
-the ratio of the two speeds is above the inverse of this number."""
+"""A motor slows down if its ratio in `trend` is below this number. It speeds up if its ratio is
+above the inverse of this number."""
 
 
 class Reply(Struct, frozen=True):
@@ -86,7 +86,7 @@ class Step(Struct, frozen=True):
 
 
 def each(value: Callable[[int], float]) -> Motors:
-    """Return `value(motor)` for the motors 0 to 3."""
+    """Return the tuple of `value(motor)` for the motors 0 to 3."""
     a, b, c, d = (value(motor) for motor in range(4))
     return a, b, c, d
 
@@ -103,7 +103,7 @@ def since(replies: Sequence[Reply], since_s: float, until_s: float = math.inf) -
 
 
 def mean(replies: Sequence[Reply]) -> Motors:
-    """Return each encoder's mean speed over these replies, rad/s; 0 if there are none."""
+    """Return each encoder's mean speed over these replies, rad/s; 0 if there are no replies."""
     return each(lambda motor: fmean([reply.motors[motor] for reply in replies] or [0.0]))
 
 
@@ -121,10 +121,10 @@ def steps(replies: Sequence[Reply]) -> Iterator[Step]:
 
 
 def covered(replies: Sequence[Reply], since_s: float, per_turn: float = 0.0) -> Motors:
-    """Return the angle that each encoder turned since the monotonic time `since_s`, s, in rad.
+    """Return the angle, rad, by which each encoder has turned since `since_s`, a monotonic time, s.
 
-    `per_turn` is the number of encoder counts per turn. If it is 0, or if a reply has no counts,
-    the angle is computed from the speeds.
+    `per_turn` is the number of encoder counts per turn. The angle is computed from the counts. If
+    `per_turn` is 0, or for a reply without counts, it is computed from the speeds.
     """
 
     def angle(step: Step, motor: int) -> float:
@@ -140,8 +140,8 @@ def turning(replies: Sequence[Reply], now_s: float) -> list[int]:
     """Return the numbers of the motors that may still turn at the monotonic time `now_s`, s.
 
     A coarse encoder reports a speed of 0 in most replies, even while its motor turns. So after a
-    reply that shows a turn by some angle, the motor counts as turning for a while: for the time
-    that it would need to turn by the same angle at the speed `STANDING`.
+    reply that shows that the motor has turned by some angle, the motor counts as turning for a
+    while: for the time that it would need for the same angle at the speed `STANDING`.
     """
     found: set[int] = set()
     for reply, earlier in pairwise(reversed([Reply(-math.inf, ZERO, b""), *replies])):
@@ -158,10 +158,11 @@ def turning(replies: Sequence[Reply], now_s: float) -> list[int]:
 
 
 def trend(replies: Sequence[Reply], now_s: float, gap_s: float) -> Motors:
-    """Return the ratio of each motor's mean speed now to its mean speed just before.
+    """Return for each motor the ratio of its mean speeds in two successive intervals.
 
-    The means are over two intervals of equal length, the second of which ends at `now_s`. `gap_s`
-    is the time between two replies, s. The ratio is 1 for a motor that stands.
+    Both intervals have the same length, and the second one ends at `now_s`. The ratio is the speed
+    in the second interval divided by that in the first, or 1 for a motor that stands. `gap_s` is
+    the time between two replies, s.
     """
     span_s = max(TREND_S, 4 * gap_s)
     before = mean(since(replies, now_s - 2 * span_s, now_s - span_s))
@@ -173,10 +174,9 @@ def trend(replies: Sequence[Reply], now_s: float, gap_s: float) -> Motors:
 def grain_s(steady: Sequence[Reply], motors: Sequence[int]) -> float:
     """Return the resolution of the speed readings, expressed as a time, s.
 
-    The readings jump, because the firmware computes them from whole encoder counts. The
-    result is the time in which a motor at `SPEED` turns by the angle of one jump. `steady` are the
-    replies of a time in which `motors` turned at this speed. The result is 0 for fewer than five
-    replies.
+    The readings jump, because the firmware computes them from whole encoder counts. The result is
+    the time in which a motor at `SPEED` turns by the angle of one jump. `steady` are replies that
+    arrived while `motors` turned at this speed. The result is 0 for fewer than five replies.
     """
     if len(steady) < 5:
         return 0.0
@@ -187,11 +187,12 @@ def grain_s(steady: Sequence[Reply], motors: Sequence[int]) -> float:
 
 
 def fastest(replies: Sequence[Reply], above: float) -> tuple[int, float] | None:
-    """Return a motor that certainly turns faster than `above` rad/s, and its speed, or None.
+    """Return the pair (motor, speed in rad/s) of a motor that surely turns faster than `above`.
 
-    One reading proves nothing: it may be damaged, or show a single count of a coarse encoder. The
-    function therefore ignores the largest reading of each interval. It examines a short interval,
-    which shows a runaway sooner, and a longer one, which shows it even with a coarse encoder.
+    Returns None if no motor does. A single reading proves nothing: it may be damaged, or show a
+    single count of a coarse encoder. The function therefore ignores the largest reading of an
+    interval. It examines a short interval, which shows a runaway motor sooner, and a longer one,
+    which shows it even with a coarse encoder.
     """
     for span_s in (GLANCE_S / 2, GLANCE_S) if replies else ():
         near = since(replies, replies[-1].at_s - span_s)
@@ -199,8 +200,8 @@ def fastest(replies: Sequence[Reply], above: float) -> tuple[int, float] | None:
         for motor in range(4):
             pieces = [(min(GLANCE_S, step.seconds), step.speeds[motor]) for step in course]
             sure = sorted(pieces, key=lambda piece: abs(piece[0] * piece[1]))[:-1]
-            # After a silence, two replies may come close together: one count in so short a time is
-            # not a speed.
+            # After a silence, two replies may come close together. A single count in so short a
+            # time would look like a high speed.
             seconds = max(GLANCE_S / 2, sum(seconds for seconds, _ in sure))
             speed = sum(seconds * speed for seconds, speed in sure) / seconds
             if abs(speed) > above:

@@ -1,4 +1,4 @@
-"""The texts of all findings of the check. `find` inserts the measured values into them."""
+"""The texts of all findings of the check. `find` inserts the measured values into the texts."""
 
 from __future__ import annotations
 
@@ -65,10 +65,10 @@ WARN? reply rate: lossy | {rate:.0f} Hz, {way}
     only {answered:.0%} of the lines were answered
     -> odometry is computed only at this rate; a later step of this check counts lost lines
 FAIL? reply rate: slow | {rate:.0f} Hz, {way}
-    one reply in {gap:.0f} ms: the daemon takes {quiet:.0f} ms of silence for a lost link
+    one reply every {gap:.0f} ms, but the daemon takes {quiet:.0f} ms of silence for a lost link
     -> write mcu.reply_period = {period:g}, or let the firmware answer every line
 FAIL? reply rate: rare | {rate:.1f} Hz, {way}
-    one reply in {gap:.0f} ms, which is too seldom for any setting
+    one reply every {gap:.0f} ms, which is too seldom for any setting
     -> let the firmware answer every line, or report by its own clock at least every {most:g} s
 FAIL? reply rate: none | too few replies
     the board leaves lines unanswered
@@ -96,8 +96,8 @@ FAIL? checked link: required | none
 PASS lost lines: none | none of {lines}
 PASS lost lines: few | {lost} of {lines}
 WARN? lost lines: late | none of {lines}, but silent for {silent:.0f} ms
-    nothing came for that time, then all lines at once: the daemon takes that for a lost link, and
-    the robot stops
+    nothing arrived for that time, then all lines together: the daemon takes such a silence for a
+    lost link, and the robot stops
     -> use another USB port without a hub, and no USB power saving; does the firmware wait
     somewhere?
 FAIL? lost lines: back | {share:.0%} of {lines}
@@ -105,8 +105,8 @@ FAIL? lost lines: back | {share:.0%} of {lines}
     -> check the lead from the board's TX to the computer's RX; use a short cable away from the
     motors' leads, a common ground, or a lower baud rate at both ends
 FAIL? lost lines: both | {share:.0%} of {lines}
-    {damaged} arrived damaged from the board, the last one is `{last}`; others were lost on the way
-    there or back
+    {damaged} arrived damaged from the board, the last one is `{last}`; other lines or their replies
+    were lost
     -> use a short cable away from the motors' leads, a common ground, or a lower baud rate at both
     ends
 FAIL? lost lines: either | {share:.0%} of {lines}
@@ -119,15 +119,15 @@ FAIL? lost lines: silent | {share:.0%} of {lines}
     motors' leads, a common ground, or a lower baud rate at both ends
 
 PASS lost where: not seen | none of {sent} more lines
-FAIL? lost where: there | of {sent} lines, {there} lost on the way there, {back} on the way back
+FAIL? lost where: there | of {sent} lines, {there} lost on the way out, {back} on the way back
     lines are lost on the way to the board: the motors did not follow these lines
     -> check the lead from the computer's TX to the board's RX and the ground, or use a lower baud
     rate; does the firmware read its buffer often enough?
-FAIL? lost where: back | of {sent} lines, {there} lost on the way there, {back} on the way back
+FAIL? lost where: back | of {sent} lines, {there} lost on the way out, {back} on the way back
     answers are lost on their way back: the motors followed the lines
     -> check the lead from the board's TX to the computer's RX and the ground, or use a lower baud
     rate at both ends
-FAIL? lost where: both | of {sent} lines, {there} lost on the way there, {back} on the way back
+FAIL? lost where: both | of {sent} lines, {there} lost on the way out, {back} on the way back
     lines and answers are lost
     -> check first the ground of board and computer, then cable and plugs; or use a lower baud rate
     at both ends
@@ -183,7 +183,7 @@ FAIL? motor: one way | {figure}
     -> check the direction output of {here}'s driver, and A and B of its encoder
 FAIL? motor: size | {figure}
     encoder {here} is more than {tolerance:.0%} off the commanded {speed:g} rad/s: every distance
-    would have this error
+    would be wrong by as much
     -> check counts per turn and gear ratio in the firmware; does it control the speed at all?
 
 PASS trailing comma: sent | sent, as configured
@@ -216,8 +216,8 @@ SKIPPED encoder counts: none
     the firmware sends no counts
 WARN? encoder counts: coarse | about {about:.0f} per turn
     the firmware sends no counts, and its speeds jump by one count of a coarse encoder from line to
-    line: unless the daemon knows the counts, the heading is wrong by degrees after the robot has
-    driven one square
+    line: unless the daemon knows the counts, the heading is wrong by several degrees after the
+    robot has driven one square
     -> write mcu.encoder_counts = the exact counts per wheel turn: the encoder's counts times the
     gear ratio (two channels give four counts for each pulse)
 SKIPPED encoder counts: damaged
@@ -226,7 +226,7 @@ SKIPPED encoder counts: damaged
 SKIPPED encoder counts: not turned
     the wheels turned too little to measure the counts
 FAIL encoder counts: unequal | {shown} per turn
-    the counts of the motors do not agree, but the daemon takes the same counts per turn for all
+    the counts of the motors do not agree, but the daemon uses the same counts per turn for all
     -> the firmware must compute counts and speeds of every motor with the same counts per turn
 FAIL encoder counts: backward | {measured:.0f} per turn
     the counts of {names} run against the speeds, or do not change: the pose would be wrong
@@ -360,10 +360,10 @@ FAIL serial line: lost | lost
 
 
 class Unsure(Finding, frozen=True):
-    """A finding that a late computer may cause, whatever the board does.
+    """A finding that may be wrong if this computer was late.
 
     `margin_s` is the time by which the measurement exceeds its bound, s. A delay of this computer
-    that is shorter than half of the margin cannot have caused the finding.
+    that is shorter than half of `margin_s` cannot have caused the finding.
     """
 
     margin_s: float = 0.0
@@ -372,8 +372,8 @@ class Unsure(Finding, frozen=True):
 class Outcome(Struct, frozen=True):
     """One possible outcome of a step, with the texts of its finding.
 
-    `figure`, `text` and `mend` are format strings for the measured values. `unsure` says whether a
-    late computer can cause this outcome.
+    `figure`, `text` and `mend` are format strings, into which `find` inserts the measured values.
+    `unsure` says whether a late computer can cause this outcome.
     """
 
     verdict: Verdict
@@ -399,13 +399,13 @@ MANUAL = _read(OUTCOMES)
 
 
 def find(outcome: str, keys: dict[str, object] | None = None, **seen: object) -> Finding:
-    """Return the finding of this outcome with the measured values filled in.
+    """Return the finding for an outcome, with the measured values in its texts.
 
     Args:
-        outcome: a key of `MANUAL`. The part before the colon is the finding's name.
-        keys: configuration values that the finding suggests.
-        seen: the measured values. A value `name` replaces the finding's name. A value `margin_s`
-            sets the margin of an `Unsure`.
+        outcome: a key of `MANUAL`. The part before the colon is the name of the finding.
+        keys: the configuration values that the finding suggests, by dotted key.
+        seen: the measured values. If one has the name `name`, it replaces the name of the finding.
+            If one has the name `margin_s`, it becomes the margin of an `Unsure`.
     """
     entry = MANUAL[outcome]
     name = str(seen.get("name", outcome.partition(":")[0]))
@@ -417,5 +417,5 @@ def find(outcome: str, keys: dict[str, object] | None = None, **seen: object) ->
 
 
 def plain(found: Finding) -> Finding:
-    """Return a copy of the finding for the report, without the margin of an `Unsure`."""
+    """Return a copy of the finding as a plain `Finding`, without the margin of an `Unsure`."""
     return Finding(*(getattr(found, name) for name in Finding.__struct_fields__))

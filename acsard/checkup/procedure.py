@@ -1,4 +1,4 @@
-"""Runs the whole check: the order of its steps, their repetitions, and its early ends."""
+"""Runs the whole check: puts the steps in order, repeats a step if needed, and ends early."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ STEPS = (
     "lost lines", "motors", "trailing comma", "wheel map", "encoder counts", "watchdog",
     "damaged lines", "inputs",
 )  # fmt: skip
-"""Names of all steps. After an early end of the check, one finding lists those that did not run."""
+"""Names of all steps. If the check ends early, the finding `REST` lists the steps that are left."""
 
 SILENT: tuple[tuple[str, Callable[[Board], Finding | None]], ...] = (
     ("listening for 3 s at the configured baud rate, then at other baud rates", dialect.baud),
@@ -56,24 +56,25 @@ SILENT: tuple[tuple[str, Callable[[Board], Finding | None]], ...] = (
     ("asking whether the board supports the link check", dialect.check),
     ("counting lost lines for 3 s or more", line_loss.finding),
 )
-"""The steps that send only zeros and questions, in order, each with a message for the operator."""
+"""The first steps of the check, in order, each with a message for the operator. These steps send
+only zeros and questions."""
 
 Tell = Callable[[Finding], None]
 Step = Callable[[], Finding | None]
 
 LATE_AGAIN, LATE_MOST = 2, 8
-"""Largest numbers of repetitions because this computer was late: of one step, and of all steps.
-Without the limit for all steps, a check could take four minutes."""
+"""If this computer is late, a step is repeated up to `LATE_AGAIN` times. A check has at most
+`LATE_MOST` such repetitions. Without the second limit, it could take four minutes."""
 
 STALL_S, ZEROS_STALL_S = 0.5, 5.0
-"""Longest time for which the program may stand still, s; `ZEROS_STALL_S` until the motors have
-stood still once, because only zeros are sent until then. After a longer stall, the check ends,
-because the operator may have left the robot. After a shorter one, a step may be repeated (see
-`LATE_AGAIN`)."""
+"""Longest stalls of this program that do not end the check, s. `ZEROS_STALL_S` applies until all
+motors have been seen to stand, because the check sends only zeros until then. Later `STALL_S`
+applies. A longer stall ends the check, because the operator may have left the robot. A shorter
+stall may only cause a step to be repeated (see `LATE_AGAIN`)."""
 
 AGAIN, MOST = 1, 5
-"""After a restart of the board, the step is repeated up to `AGAIN` times. One more restart in the
-same step ends the check, and so do `MOST` restarts in all steps together."""
+"""If the board restarts, the step is repeated, up to `AGAIN` times. One more restart in the same
+step ends the check. The check also ends after `MOST` restarts in all steps together."""
 
 
 def run(
@@ -85,21 +86,21 @@ def run(
 ) -> None:
     """Check one microcontroller, and call `tell` with each finding as soon as it is known.
 
-    Before the operator confirms that the wheels are lifted, only zeros are sent. The last lines are
-    always zeros, unless the serial port is lost. The check ends early if this program stands still
-    for more than `STALL_S`, or `ZEROS_STALL_S`, while it does not wait for an answer. Raises
-    `KeyboardInterrupt` if the operator types `QUITS`, also while a motor turns.
+    Until the operator confirms that the wheels are lifted, the check sends only zeros. The last
+    lines are always zeros, unless the serial port is lost. The check ends early if this program
+    stalls for longer than `STALL_S` or `ZEROS_STALL_S`; the wait for an answer of the operator is
+    not a stall. Raises `KeyboardInterrupt` if the operator types `QUITS`, even while a motor turns.
 
-    `asleep_ns` returns for how long this computer was suspended since its start, ns. The wire's
-    clock stands still in a suspend.
+    `asleep_ns` returns for how long this computer has been suspended since its start, ns. The
+    clock of `wire` stops while the computer is suspended.
     """
     told: set[str] = set()
     unjudged: set[str] = set()
 
     def once(finding: Finding | None) -> None:
-        """Report a finding unless one of that name has been reported already.
+        """Report a finding, unless a finding with the same name has been reported already.
 
-        A judged finding is also reported after one that was not judged.
+        If the earlier finding was not judged, a judged finding is still reported.
         """
         if finding is None:
             return
@@ -135,33 +136,33 @@ def run(
 
 
 class _Watched:
-    """The operator during the steps. `look` ends the check if the operator cannot attend to it."""
+    """The operator during the steps. `look` ends the check if the operator quits or may be away."""
 
     def __init__(self, operator: Operator, board: Board, asleep_ns: Callable[[], int]) -> None:
-        """`asleep_ns` is the argument of `run`."""
+        """Start now, without a stall. `asleep_ns` is the argument of `run()`."""
         self.doing, self.keys = operator.doing, operator.keys
         self._operator, self._board, self._asleep_ns = operator, board, asleep_ns
         self._ran_s = self._now_s()
-        """Time of the last call of `look`, or of the last answer if that came later."""
+        """Time of the last call of `look` or of the last answer, whichever is later, s."""
 
     def _now_s(self) -> float:
-        """Return a monotonic time, s, that also advances during a suspend."""
+        """Return a monotonic time, s, that advances even while the computer is suspended."""
         return self._board.now_s + self._asleep_ns() / NS_PER_S
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
-        """Ask the operator, who may take any time to answer."""
+        """Ask the operator. The time until the answer does not count as a stall."""
         answer = self._operator.ask(question, answers)
         self._ran_s = self._now_s()
         return answer
 
     def look(self) -> None:
-        """Raise `KeyboardInterrupt` if the operator quits; `StoppedError` after a stall."""
+        """Raise `KeyboardInterrupt` if the operator quits, and `StoppedError` after a stall."""
         now_s = self._now_s()
         stalled_s, self._ran_s = now_s - self._ran_s, now_s
         if stalled_s > (STALL_S if self._board.armed else ZEROS_STALL_S):
             raise StoppedError(outcomes.find("stall: seen", seconds=stalled_s))
         if stalled_s > STALL_S:
-            # The board's own measurement leaves out a suspend, and a stall of the terminal.
+            # `Board` does not measure the time of a suspended computer or of a stalled terminal.
             self._board.lateness.look(stalled_s, self._board.now_s)
         if QUITS in self.keys(0.0).lower():
             raise KeyboardInterrupt
@@ -179,7 +180,7 @@ class _Steps:
     ) -> None:
         self._board, self._operator, self._tell = board, operator, tell
         self._seen = seen
-        """Restarts of the board. The caller owns the list and reads it at the end."""
+        """The restarts of the board so far. The caller reads this list after the last step."""
         self._channels: list[Channel] = []
         self._late_left = LATE_MOST
 
@@ -207,7 +208,7 @@ class _Steps:
         self._board.armed = True
 
     def _turn(self, motor: int) -> Finding:
-        """Test one motor. Ask the operator which wheel turned, unless this computer was late."""
+        """Test one motor. Unless this computer was late, ask the operator which wheel turned."""
         board, operator, channels = self._board, self._operator, self._channels
         operator.doing(f"{motor_name(board.mcu, motor)} turns: briefly, then forward and back")
 
@@ -238,8 +239,8 @@ class _Steps:
                     board.rest()
             began_s = board.now_s
             found, ends = _ended(step)
-            # If the board is a program on this computer, its lateness is known only when it runs
-            # again. A board that never answers is silent, whatever this computer does.
+            # If the board is a program on this computer, its lateness is known only when that
+            # program runs again. If the board does not answer, lateness does not explain it.
             if board.fled or not isinstance(found, Unsure):
                 break
             if found.verdict != "PASS" and not board.wakes(BOOT_S):
@@ -250,7 +251,7 @@ class _Steps:
             late_s = max(late_s, meanwhile_s)
             told = lateness.finding(found.name, late_s)
             if ends and board.armed:
-                # No motor may be turned again after an early end, even if this computer caused it.
+                # After an early end no motor may be turned again, even if lateness was the cause.
                 found, board.known = told, known
                 break
         else:
@@ -279,7 +280,11 @@ class _Steps:
                 board.known = known
 
     def _tried(self, step: Step) -> Finding | None:
-        """Run a step. If the finding is bad, wait for a silent board: it may have restarted."""
+        """Run a step and return its finding.
+
+        If the finding is bad, first wait until a silent board answers, because it may have
+        restarted.
+        """
         try:
             finding = step()
         except StoppedError:
@@ -290,9 +295,9 @@ class _Steps:
         return finding
 
     def _await_return(self, silent_s: float) -> None:
-        """Send zeros until the board answers or has had time to boot.
+        """If the board is silent, send zeros until it answers or has had enough time to boot.
 
-        Do nothing unless the board has been silent for longer than `silent_s` s.
+        The board is silent if it has not replied for `silent_s` s and for four times `gap_s`.
         """
         board = self._board
         if board.silent_s > max(silent_s, 4 * board.gap_s):

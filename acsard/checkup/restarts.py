@@ -1,8 +1,8 @@
 """Detects restarts of the board during the check, from the lines that the board sends.
 
 A restart falsifies the measurements of the present step, so that the cable, a motor or the watchdog
-seems to be at fault. The step is therefore repeated (`procedure.py`). The check reports the
-probable cause of the restarts at its end.
+seems to be at fault. The step is therefore repeated (`procedure.py`). At the end of the check, a
+finding gives the probable cause of the restarts.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from acsard.core.link.session import IDENTITY
 from acsard.core.values import AcsardError
 
 ASKED_S = 1.0
-"""Longest time from a request for the identification to the board's answer, s. If it arrives later,
-the board sent it without a request."""
+"""Longest time from a request for the identification to the board's answer, s. If an identification
+arrives later, the board sent it without a request."""
 
 UNANSWERED = 5
-"""Number of successive lines without a reply after which a text from the board shows a restart.
-After fewer lines, the text may be a debug print of the firmware."""
+"""A text from the board shows a restart if at least this many successive lines had no reply. With
+fewer such lines, the text may be a debug print of the firmware."""
 
 AHEAD_S = 2.0
-"""Largest credible gain of the board's clock on this computer's clock between replies, s. A delayed
-line causes a smaller gain. A restart causes a larger one, because the clock's jump back to 0 looks
-like a large advance modulo `CLOCK`."""
+"""Largest time by which the board's clock may advance more than this computer's clock between two
+replies without a restart, s. A delayed line causes a smaller difference. A restart causes a larger
+one, because the jump of the clock back to 0 looks like a large advance modulo `CLOCK`."""
 
 CLOCK = 65536
 """Time after which the board's clock starts again at 0, ms."""
@@ -41,7 +41,7 @@ SILENT_S = 0.25
 """Shortest time without a sent line after which a watchdog may restart the whole board, s."""
 
 CAUSES = {"power": "supply", "brown-out": "supply", "watchdog": "watchdog", "pin": "pin"}
-"""Maps each cause of a restart that the reference firmware names to an outcome of the check."""
+"""Maps each cause of a restart that the reference firmware reports to an outcome of the check."""
 
 _WORD = re.compile(rb"[a-z]{3}|[G-Z]{3}")
 """Pattern that occurs in printed texts, but in no reply, not even in a damaged one."""
@@ -55,9 +55,9 @@ class Restart(Struct, frozen=True):
     turned: Motors = ZERO
     """Speeds that were commanded just before the restart, rad/s; zeros if the motors stood."""
     silent_s: float = 0.0
-    """Longest time without a line to the board between its last reply and its restart, s."""
+    """Longest time without a line to the board, between its last reply and the restart, s."""
     cause: str = ""
-    """Cause of the restart as the board names it, or "" if it names none."""
+    """Cause of the restart as the board reports it, or "" if the board reports no cause."""
 
 
 class RestartedError(AcsardError):
@@ -69,7 +69,7 @@ class RestartedError(AcsardError):
 
 
 class Restarts:
-    """Detector of restarts since the port was opened. Times are in s."""
+    """Detector of restarts since the port was opened. All times are monotonic, in s."""
 
     def __init__(self) -> None:
         self.watched = True
@@ -82,11 +82,12 @@ class Restarts:
         """Longest time between two lines to the board since the last reply, s."""
         self._unanswered = 0
         self._replied_s: float | None = None
-        """Time of the last reply, s, or None before the first one. Until then, a printed text does
-        not mean a restart: opening the port resets many boards, which print texts when they boot.
-        """
+        """Time of the last reply, s, or None before the first reply. Before the first reply, a text
+        from the board does not show a restart: the opening of the port resets many boards, and
+        they print texts when they boot."""
         self._clock: tuple[int, float] | None = None
-        """The board's clock, ms, in the last reply that contained it, and that reply's time, s."""
+        """Pair: the board's clock, ms, in the last reply that contained it, and the time of that
+        reply, s."""
 
     def asked(self, at_s: float) -> None:
         """Record that the check requested the identification at the monotonic time `at_s`, s."""
@@ -126,7 +127,7 @@ class Restarts:
         if line.startswith(IDENTITY) and at_s - self._asked_s > ASKED_S:
             return "the board sent its name without a request"
         boots = self._unanswered >= UNANSWERED and _WORD.search(line)
-        return "the board was silent, then printed a text" if boots else ""
+        return "the board was silent, then sent a text instead of replies" if boots else ""
 
     def _clock_sign(self, reply: Reply) -> str:
         before, reading = self._clock, reply.reading
@@ -136,20 +137,20 @@ class Restarts:
         if before is None:
             return ""
         most_ms = 1000 * (reply.at_s - before[1] + AHEAD_S)
-        # After half a minute without a reply, the clock may have started again at 0 by itself.
+        # After half a minute without a reply, an overflow may have set the clock back to 0.
         if most_ms < CLOCK / 2 and (reading.mcu_ms - before[0]) % CLOCK > most_ms:
             return "the board's clock and encoder counts started again from 0"
         return ""
 
 
 def cause(lines: Sequence[bytes]) -> str:
-    """Return the cause of a restart that the board names in these lines, or "" if it names none."""
+    """Return the cause of a restart that these lines report, or "" if they report none."""
     said = [match[1].decode() for line in lines if (match := _CAUSE.search(line))]
     return said[-1] if said else ""
 
 
 def finding(mcu: McuConfig, restarts: Sequence[Restart], back: bool = True) -> Finding:
-    """Return the finding about these restarts. `back` says whether the board answers again."""
+    """Return the finding about `restarts`. `back` says whether the board answers again."""
     each = Counter(_told(mcu, one) for one in restarts)
     seen: dict[str, object] = {
         "times": f"restarted{_times(len(restarts))}",

@@ -1,12 +1,12 @@
-"""Tests whether the board's watchdog stops the motors when this computer sends nothing more.
+"""Tests whether the board's watchdog stops the motors when this computer sends no more lines.
 
 The watchdog must also act if the board receives only damaged lines, as with a half-broken cable.
 
 The check brings the motors to speed, sends nothing (or damaged lines) for some time, and then sends
-zeros. The watchdog's time follows from the distance that the motors ran on, minus the distance of
-an ordinary stop. Firmware that replies only to lines, and reports momentary speeds, does not show
-these distances. The check then tries silences of different lengths, and sees after each one whether
-the motors still turn.
+zeros. The time of the watchdog follows from the distance by which the motors ran on, minus the
+distance of an ordinary stop. Some firmware does not show these distances, because it replies only
+to lines and reports momentary speeds. In this case the check tries silences of different lengths,
+and sees after each silence whether the motors still turn.
 """
 
 from __future__ import annotations
@@ -26,45 +26,48 @@ from acsard.core.config.wire_time import FIELD
 from acsard.core.link.codec import LETTERS, Motors
 
 FEEDING = ("a wrong letter", "neither p nor n", "cut short")
-"""Kinds of damaged lines that are sent to test whether damaged lines feed the watchdog."""
+"""Kinds of damaged lines that the check sends to find out whether they feed the watchdog."""
 
 TURNING, STOPPED = 0.9, 0.1
-"""Fractions of the commanded speed: a motor at `TURNING` or more has not slowed down, and a motor
-below `STOPPED` stands."""
+"""Fractions of the commanded speed. A motor at `TURNING` or more has not slowed down. A motor below
+`STOPPED` stands."""
 
 UNKNOWN = math.inf
 
 Between = tuple[float, float]
-"""Lower and upper bound of the time for which the motors run on after the last line, s."""
+"""Pair: lower and upper bound of the time for which the motors run on after the last line, s."""
 
 
 class Run(Struct, frozen=True):
-    """Behaviour of the motors in a silence after the last line that turned them.
+    """Behavior of the motors in a silence after the last line that turned them.
 
-    `silent_s` is the length of the silence, s, or about 0 in an ordinary stop, in which zeros
-    follow at once. A distance is expressed as the time that the motor needs for it at full speed,
-    s. Speeds are fractions of full speed.
+    `silent_s` is the length of the silence, s. It is about 0 for an ordinary stop, in which zeros
+    follow immediately. A distance is given as the time, s, that a motor needs for it at full speed.
+    A speed is given as a fraction of full speed.
     """
 
     silent_s: float
     ran_s: float
-    """Largest distance that a motor ran on until it stood, as a time at full speed, s."""
+    """Largest distance by which a motor ran on until it stood, as a time at full speed, s."""
     slow_s: float
     """Time until all motors were slower than `STOPPED`, s. It begins with the last line that turned
-    the motors, or with the zeros in an ordinary stop."""
+    the motors. For an ordinary stop, it begins with the zeros."""
     first: float
     """Speed in the first reply after the silence, as a fraction of full speed. Firmware that
     computes speeds from line to line reports the mean over the silence. Firmware that measures by
     its own clock reports the momentary speed."""
     second: float
-    """Speed in the second reply after the silence, as a fraction of full speed. A quick motor has
-    obeyed the first line of zeros by then."""
+    """Speed in the second reply after the silence, as a fraction of full speed. By then a quick
+    motor has obeyed the first line of zeros."""
     grain_s: float
-    """Resolution of the speeds: the time in which a motor turns by one jump of its readings, s."""
+    """Resolution of the speeds, as a time, s. See `motion.grain_s`."""
 
 
 def finding(board: Board, motors: Sequence[int]) -> Finding:
-    """Measure the time after which the watchdog stops `motors`. Then bring them to rest."""
+    """Measure the time after which the watchdog stops `motors`, and leave them at rest.
+
+    Unless the result is a failure, also test whether damaged lines feed the watchdog.
+    """
     if not motors:
         return outcomes.find("watchdog: untested")
     stop = run(board, motors, 0.0)
@@ -76,8 +79,8 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
     broken = cycle(line for what, line in lines if what in FEEDING)
     fed = run(board, motors, max(motion.CUT_S, 2 * most_s) + stop.slow_s, broken)
     if fed.ran_s >= 0.75 * fed.silent_s:
-        # The damaged lines fed the watchdog. Otherwise it would have stopped the motors earlier,
-        # and their distance would be smaller.
+        # The damaged lines fed the watchdog. Otherwise the watchdog would have stopped the motors
+        # earlier, after a smaller distance.
         beyond_s = fed.ran_s - stop.ran_s - most_s
         return outcomes.find("watchdog: fed", figure=judged.figure, margin_s=beyond_s)
     return judged
@@ -103,10 +106,10 @@ def _judged(least_s: float, most_s: float) -> Finding:
 
 
 def measured(board: Board, motors: Sequence[int], stop: Run) -> Between:
-    """Return the bounds of the time for which these motors run on when no lines are sent, s.
+    """Return the bounds of the time for which `motors` run on when no lines are sent, s.
 
-    `stop` is their behaviour in an ordinary stop. If the motors do not stop even in the longest
-    silence, the upper bound is `UNKNOWN`.
+    `stop` is the behavior of the motors in an ordinary stop. If the motors do not stop even in the
+    longest silence, the upper bound is `UNKNOWN`.
     """
     least_s = 0.0
     for length_s in (motion.CUT_S + stop.slow_s, motion.STOOD_S + stop.slow_s):
@@ -120,14 +123,14 @@ def measured(board: Board, motors: Sequence[int], stop: Run) -> Between:
     by_counts = _per_turn(board, motors) > 0
     if not (board.own_clock or by_counts or found.first >= STOPPED):
         return _asked(board, motors, stop, (least_s, found.silent_s))
-    # Each of the two distances may err by a jump of its readings, and a motor that coasts may add
-    # half a jump.
+    # Each of the two distances may be wrong by one jump of the readings, and a coasting motor may
+    # add half a jump.
     about_s = max(2.5 * stop.grain_s, 0.0 if by_counts else board.gap_s / 2)
     return max(0.0, ran_on_s - about_s), max(0.0, ran_on_s + about_s)
 
 
 def _asked(board: Board, motors: Sequence[int], stop: Run, between: Between) -> Between:
-    """Narrow the bounds `between`, s, of the time for which the motors run on, by bisection."""
+    """Narrow the bounds `between` by bisection, with silences of different lengths."""
     least_s, most_s = between
     for _ in range(8):  # each run halves the interval, unless this computer pauses
         if most_s - least_s <= max(0.03, 0.1 * most_s):
@@ -138,7 +141,7 @@ def _asked(board: Board, motors: Sequence[int], stop: Run, between: Between) -> 
         else:
             most_s = min(most_s, answer.silent_s)
     # The reply that decides describes a moment after the end of the silence. In the same way, the
-    # reply that shows the end of the ordinary stop comes later than that end.
+    # reply that shows the end of the ordinary stop arrives after that end.
     least_s -= stop.slow_s - board.period_s + 2 * stop.grain_s
     most_s -= stop.slow_s - board.period_s - motion.PERIOD_S - 2 * stop.grain_s
     return max(0.0, least_s), max(0.0, most_s)
@@ -147,8 +150,8 @@ def _asked(board: Board, motors: Sequence[int], stop: Run, between: Between) -> 
 def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[bytes] = ()) -> Run:
     """Bring the motors to speed, send no valid line for `length_s` s, and stop them with zeros.
 
-    A length of 0 is an ordinary stop. The damaged lines in `instead` are sent before the zeros.
-    Raises `StoppedError` if no motor reaches half of the commanded speed.
+    If `length_s` is 0, this is an ordinary stop. During the time `length_s`, the damaged lines in
+    `instead` are sent. Raises `StoppedError` if no motor reaches half of the commanded speed.
     """
     began_s = board.now_s
     full = run_up(board, command(motors))
@@ -172,7 +175,7 @@ def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[
     slow_s = next(
         (r.at_s - told_s for r in course if _share(r, motors) < STOPPED), motion.PATIENCE_S
     )
-    # The reply to the last line contains a measurement from the time when that line took effect.
+    # The reply to the last line contains speeds from the moment at which that line took effect.
     answered = not board.own_clock and course[0].at_s < told_s + motion.PERIOD_S + 2 * board.gap_s
     since_s = course[0].at_s if answered else told_s
     ran = motion.covered(board.replies, since_s, _per_turn(board, motors))
@@ -186,7 +189,10 @@ def command(motors: Sequence[int]) -> Motors:
 
 
 def _per_turn(board: Board, motors: Sequence[int]) -> float:
-    """Return the measured encoder counts per wheel turn; 0 if unknown, or if they may overflow."""
+    """Return the measured encoder counts per wheel turn.
+
+    Returns 0 if they are not known, or if the counter could overflow in the longest silence.
+    """
     per_turn = encoder_counts.per_turn(board.replies, motors) or 0.0
     wraps = per_turn * motion.RUNAWAY / math.tau * motion.STOOD_S >= FIELD / 2
     return 0.0 if wraps or per_turn < 1 else per_turn

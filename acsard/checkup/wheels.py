@@ -1,8 +1,8 @@
 """Turns one motor at a time forward and backward, and asks the operator which wheel turned.
 
-A channel is a motor with its encoder and its wheel. From the encoders and the answers, the check
-finds out whether the three belong together. `Channel`, `encoder_finding` and `wheel_map` compute
-this without any I/O.
+A channel is a motor with its encoder and its wheel. From the speeds that the encoders show and from
+the answers, the check finds out whether these three parts belong together. `Channel`,
+`encoder_finding` and `wheel_map` compute this without any I/O.
 """
 
 from __future__ import annotations
@@ -22,19 +22,22 @@ from acsard.core.link.codec import LETTERS, Motors
 from acsard.core.values import WHEELS
 
 TOLERANCE = 0.25
-"""Relative error of an encoder's speed against the command, above which the check fails."""
+"""If an encoder's speed differs from the commanded speed by more than this fraction, the check
+fails."""
 
 OFF = 0.05
-"""Relative error of an encoder's speed against the command, above which the check warns."""
+"""If an encoder's speed differs from the commanded speed by more than this fraction, the check
+warns."""
 
 Kind = Literal["right", "reversed", "dead", "other", "several", "one way", "size", "off", "late"]
 
 FOLLOWS: tuple[Kind, ...] = ("right", "off", "size")
-"""The values of `kind` for a motor that moves only its own encoder, in the commanded direction."""
+"""The values of `Channel.kind` for a motor that moves only its own encoder, in the commanded
+direction."""
 
 
 class Channel(Struct, frozen=True):
-    """Behaviour of one motor, as all four encoders and the operator saw it.
+    """Behavior of one motor, as the four encoders showed it and the operator saw it.
 
     `forth` and `back` are the speeds of the four encoders, rad/s, while the motor was commanded
     forward (letter p) and backward (letter n).
@@ -44,16 +47,16 @@ class Channel(Struct, frozen=True):
     forth: Motors
     back: Motors
     wheel: str | None = None
-    """Wheel that the operator saw turn, "" for none, or None if no person watched."""
+    """Wheel that the operator saw turn; "" if no wheel turned, None if no person watched."""
     forward: bool = True
     """Whether the wheel turned forward first, as the operator saw it."""
     probed: bool = False
-    """Whether the motor was only probed, because its own encoder did not follow. Then `forth`
-    contains the speeds of the probe, and `back` is zero."""
+    """Whether the motor was only probed (turned slowly and briefly), because its own encoder did
+    not follow. Then `forth` contains the speeds of the probe, and `back` is zero."""
     unsure: float = 0.0
-    """Relative error of the measured speeds that a coarse encoder may cause."""
+    """Possible relative error of the measured speeds because of a coarse encoder."""
     judged: bool = True
-    """Whether this computer was punctual. If it was not, the other fields may be wrong."""
+    """Whether this computer was on time. If it was late, the other fields may be wrong."""
 
     @property
     def moved(self) -> list[int]:
@@ -64,7 +67,7 @@ class Channel(Struct, frozen=True):
 
     @property
     def kind(self) -> Kind:
-        """Result for this motor according to the encoders. The operator's answer is not used."""
+        """Result for this motor from the encoders alone, without the operator's answer."""
         if not self.judged:
             return "late"
         moved, own = self.moved, self.motor
@@ -84,8 +87,8 @@ class Channel(Struct, frozen=True):
 
     @property
     def error(self) -> float:
-        """Relative error of the speed of the motor's own encoder, forward or backward, whichever is
-        larger."""
+        """Relative error of the motor's own encoder against the commanded speed. It is the larger
+        of the errors forward and backward."""
         own = self.motor
         return max(abs(self.forth[own] / SPEED - 1), abs(self.back[own] / SPEED + 1))
 
@@ -94,8 +97,8 @@ def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
     motor, moved = channel.motor, channel.moved
     forth, back = channel.forth[motor], channel.back[motor]
     there = moved[0] if moved else motor
-    # A computer that was late by this much would explain the error: in half of the measurements the
-    # motor would have seemed to stand for that time.
+    # A delay of `beyond_s` would explain the error, because in half of the measurements the motor
+    # would have seemed to stand for that time.
     beyond_s = 2 * GLANCE_S * (channel.error - TOLERANCE) if channel.kind == "size" else 0.0
     loose = channel.kind in FOLLOWS and channel.wheel == ""
     return outcomes.find(
@@ -116,7 +119,7 @@ def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
 
 
 def _whose(mcu: McuConfig, channel: Channel) -> str:
-    """Return the end of the outcome's name, which depends on the operator's answer, or ""."""
+    """Return the last part of the outcome's name, which says what the operator saw, or ""."""
     wheel, sign = wheel_of(mcu, channel.motor)
     seen = channel.wheel
     match channel.kind:
@@ -137,8 +140,8 @@ def _whose(mcu: McuConfig, channel: Channel) -> str:
 def wheel_map(mcu: McuConfig, found: Sequence[Channel]) -> Finding:
     """Return the finding that compares `[mcu.wheels]` with the wheels that the operator saw turn.
 
-    A channel that must be repaired first keeps its configured entry. So does a channel for which
-    the operator saw no wheel turn.
+    If a channel must be repaired first, or if the operator saw no wheel turn, the finding keeps the
+    configured entry of this channel.
     """
     if any(channel.wheel is None for channel in found):
         return outcomes.find("wheel map: not seen")
@@ -160,14 +163,14 @@ def wheel_map(mcu: McuConfig, found: Sequence[Channel]) -> Finding:
 
 
 NEAR = 0.8
-"""If the error of a speed exceeds this fraction of `OFF`, the speed is measured again for longer,
-because the first measurement is too inaccurate."""
+"""If the error of a speed exceeds this fraction of `OFF`, the speed is measured again over a longer
+time, because the first measurement is too inaccurate."""
 
 LOOK_S = 0.75 * motion.MOTOR_S
 """Time over which the second measurement averages the speed, s."""
 
 LOOKS = 8
-"""Largest number of short measurements whose mean `run_up` takes as the present speed."""
+"""`run_up` takes the mean of at most this many short measurements as the present speed."""
 
 ANSWERS = {
     "fr": "front_right", "fl": "front_left", "rl": "rear_left", "rr": "rear_right", "none": "",
@@ -182,8 +185,8 @@ def one(motor: int, speed: float) -> Motors:
 def turn(board: Board, motor: int, speed: float) -> tuple[Motors, float]:
     """Bring a motor to `speed`, rad/s, and measure the speeds of all encoders.
 
-    Returns these speeds, rad/s, and the possible relative error of the motor's measured speed. The
-    error can arise because an encoder counts only whole steps.
+    Returns a pair: these speeds, rad/s, and the possible relative error of the motor's measured
+    speed. The error comes from the encoder, which counts only whole steps.
     """
     means = run_up(board, one(motor, speed))
     unsure = _unsure(board, motor, 2 * _look_s(board))
@@ -207,8 +210,8 @@ def _look_s(board: Board) -> float:
 def run_up(board: Board, motors: Motors) -> Motors:
     """Ramp up to the speeds `motors`, rad/s, and return each encoder's mean speed, rad/s.
 
-    The function waits for steady speeds. It gives up after some time, or earlier if no encoder
-    moves.
+    The function waits until the speeds are steady. It stops waiting after some time, or earlier if
+    no encoder moves.
     """
     steps = max(1, int(motion.GLANCE_S / board.period_s))
     for step in range(1, steps + 1):
@@ -220,18 +223,21 @@ def run_up(board: Board, motors: Motors) -> Motors:
     while steady < 2 and board.now_s - began_s < _patience_s(board, told):
         board.drive(motors, look_s)
         looks += 1
-        # A coarse encoder needs more measurements; a fine one is steady sooner.
+        # A coarse encoder needs more measurements than a fine one.
         last = min(LOOKS, max(1, looks - 1))
         means = motion.mean(motion.since(board.replies, board.now_s - last * look_s))
         near = [m for m in moving(means) if abs(abs(means[m]) / motion.SPEED - 1) < 0.4 * TOLERANCE]
         steady = steady + 1 if len(near) >= len(told) else 0
         if looks * look_s >= motion.CUT_S and not moving(means, motion.STANDING):
-            break  # do not go on: a control loop without an encoder may be winding up
+            break  # do not go on: without an encoder, the speed control may wind up
     return means
 
 
 def _patience_s(board: Board, told: list[int]) -> float:
-    """Return how long to wait for steady speeds, s: longer if a motor of `told` still speeds up."""
+    """Return the longest wait for steady speeds, s.
+
+    The wait is longer while one of the motors `told` still speeds up.
+    """
     shares = motion.trend(board.replies, board.now_s, board.gap_s)
     rises = any(shares[motor] > 1 / motion.FALLS for motor in told)
     return motion.PATIENCE_S if rises else motion.MOTOR_S
@@ -240,7 +246,7 @@ def _patience_s(board: Board, told: list[int]) -> float:
 def channel(board: Board, motor: int) -> Channel:
     """Turn a motor forward and backward, and return how the encoders moved.
 
-    If motor d seems dead, it is tried again with the other line ending.
+    If motor d seems dead, the test is repeated with the other line ending: a comma or none.
     """
     found = _both_ways(board, motor)
     if motor == 3 and found.kind == "dead" and not board.latched:
@@ -251,7 +257,7 @@ def channel(board: Board, motor: int) -> Channel:
 def _both_ways(board: Board, motor: int) -> Channel:
     """Turn a motor forward, then backward, stop it, and return how the encoders moved.
 
-    A motor whose own encoder does not follow the probe is not turned any further.
+    First the motor is probed. If its own encoder does not follow, the motor is not turned further.
     """
     shown = probe(board, motor)
     if shown is not None:
@@ -268,14 +274,14 @@ def _both_ways(board: Board, motor: int) -> Channel:
 
 
 def probe(board: Board, motor: int) -> Motors | None:
-    """Turn a motor slowly and briefly, to see whether its own encoder follows.
+    """Turn a motor slowly and briefly, to find out whether its own encoder follows.
 
-    If the encoder follows, returns None, possibly while the motor still turns. Otherwise stops the
-    motor and returns the speeds that the encoders showed, rad/s.
+    If the encoder follows, the result is None, and the motor may still turn. Otherwise the function
+    stops the motor and returns the speeds that the encoders showed, rad/s.
 
     The firmware may drive a motor without a working encoder to full speed, but the probe is too
     short for that. If the encoder does not follow, the probe is repeated, because a coarse encoder
-    may need more movement. It is not repeated if several readings show a reversed encoder.
+    may need more movement. If several readings show a reversed encoder, the probe is not repeated.
     """
     began_s = board.now_s
     shown = _probe(board, motor, motion.SPEED / 2)
@@ -286,7 +292,7 @@ def probe(board: Board, motor: int) -> Motors | None:
     if not moving(shown, motion.PROBE_MOVES):
         return _probe(board, motor, motion.SPEED)
     again = _probe(board, motor, motion.SPEED / 2)
-    # If only the first probe showed a movement, a motor may still have coasted in it.
+    # If only the first probe showed a movement, a motor may have coasted during that probe.
     return again if again is None or any(again) else _probe(board, motor, motion.SPEED)
 
 
@@ -295,7 +301,7 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
     began_s = board.now_s
 
     def shown() -> Motors:
-        """Return each encoder's mean speed in the probe without the part due to coasting, rad/s."""
+        """Return each encoder's mean speed in the probe, less the speed due to coasting, rad/s."""
         seconds = board.now_s - began_s
         ran = motion.covered(board.replies, began_s)
         sure = [max(0.0, abs(ran[m]) - abs(coasting[m]) * seconds) for m in range(4)]
@@ -307,8 +313,8 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
         own = shown()[motor]
     if own >= motion.PROBE_MOVES:
         return None
-    # The firmware may drive a motor to full speed on zeros until its watchdog cuts it. A motor that
-    # was seen to turn must stand before the next zeros are sent.
+    # The firmware may drive a motor to full speed although it receives zeros, until its watchdog
+    # cuts the motor. So a motor that was seen to turn must stand before the next zeros are sent.
     moved = moving(shown(), motion.PROBE_MOVES)
     board.let_go(motion.STOOD_S if moved else motion.CUT_S)
     board.rest()
@@ -317,9 +323,9 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
 
 
 def _with_other_comma(board: Board, dead: Channel) -> Channel:
-    """Test motor d, which does not move, with the other line ending: a comma or none.
+    """Test motor d, which did not move, again with the other line ending: a comma or none.
 
-    Returns the new result if the motor moves, else `dead`.
+    Returns the new result if the motor moves now, else the old result `dead`.
     """
     configured, board.comma = board.comma, not board.comma
     channel = _both_ways(board, dead.motor)
@@ -335,7 +341,8 @@ def _with_other_comma(board: Board, dead: Channel) -> Channel:
 def seen(board: Board, operator: Operator, channel: Channel) -> Channel:
     """Ask the operator which wheel turned, and return the channel with the answer.
 
-    The wheels stand during the question. If no person watches, the channel is unchanged.
+    The wheels stand during the question. If no person watches the robot, the function returns
+    `channel` unchanged.
     """
     question = (
         f"which wheel did motor {LETTERS[channel.motor]} turn: front right (fr), front left (fl), "

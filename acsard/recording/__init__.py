@@ -6,18 +6,19 @@ These modules are pure, so they do no I/O:
 - `replay`: runs recorded inputs through `Robot.step` again and compares the outputs.
 - `replay_text`: describes the result of a replay in lines of text.
 - `state`: encodes a `Robot` as bytes, decodes it, and applies another configuration to it.
-- `unpickling`: rebuilds a `Robot` from bytes that a stranger may have written.
+- `unpickling`: rebuilds a `Robot` from bytes that may be forged.
 - `timeline`: describes a recording in sentences.
 - `retention`: decides which recordings are deleted and which are retained.
 - `published`: rebuilds the messages that the robot published.
 
 These modules do I/O:
 - `recorder`: queues the steps of the control loop. `step_writer` writes them in a thread.
-- `directory`: limits the directory of recordings in bytes and in days.
+- `directory`: manages the directory of recordings, and limits its size and the age of its files.
 - `file`: writes and reads one MCAP file; `mcap_records` and `end_record` are its parts.
 - `series`: finds the recordings of a range of time, and joins the files of one run of the daemon.
-- `time_span`: reads the times that a person types, and finds them in a recording.
+- `time_span`: parses the times that a person types, and finds them in a recording.
 - `recovery`: finishes a file that was cut off.
-- `file_replay`: replays a file, and compares the two copies of each event in it.
-- `export`: writes files for other programs. `atomic_output` renames each when it is complete.
+- `file_replay`: replays a file, and compares the two copies of each event in the file.
+- `export`: writes files for other programs. `atomic_output` gives each file its name when the file
+  is complete.
 """

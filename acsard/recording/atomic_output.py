@@ -1,8 +1,8 @@
 """Writes a file or a directory atomically, and protects recordings from being overwritten.
 
-The target is complete or absent, because it gets its name by a rename at the end. With `force` an
-existing target is replaced, but only if it is a regular file or a ROS bag. A recording is replaced
-only by another recording that contains all of it.
+The target never holds partial data, because its content is written to a temporary path that is
+renamed at the end. With `force` an existing target is replaced, but only if it is a regular file or
+a ROS bag. A recording is replaced only by another recording that contains all of its data.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ BAG_SUFFIXES = (".mcap", ".db3")
 
 
 def never(recording: Recording) -> bool:
-    """Return False for every recording, so that by default `replacing` replaces no recording."""
+    """Return False. As the default of `may_replace`, this function protects every recording."""
     return False
 
 
@@ -36,8 +36,8 @@ def replacing(
     """Yield a temporary path to write to, and rename it to `new` when the block succeeds.
 
     Raises `FileExistsError` if `new` must not be replaced, for example because `force` is not set.
-    `may_replace` says whether `force` may replace the recording at `new`. After an error `new` is
-    unchanged and the temporary file is removed.
+    If `new` is a recording, `may_replace` takes it and returns whether `force` may replace it.
+    After an error `new` is unchanged and the temporary file is removed.
     """
     _require_free(new, force, may_replace)
     part = _near(new, "part")
@@ -59,7 +59,8 @@ def synced(stream: BinaryIO) -> None:
 def _put(part: Path, new: Path) -> None:
     """Rename `part` to `new`.
 
-    No system call replaces a directory with files, so an existing directory is renamed first.
+    No system call replaces a directory that contains files. Therefore an existing directory `new`
+    is first renamed, and is removed after `part` has its name.
     """
     if not new.is_dir():
         os.replace(part, new)
@@ -123,7 +124,10 @@ def _recording(path: Path) -> Recording | None:
 
 
 def _remove(path: Path) -> None:
-    """Remove a file or a ROS bag. A recursive removal could delete more than a bag."""
+    """Remove a file, or the directory of a ROS bag with its files.
+
+    Raises `OSError` if the directory has a subdirectory, because a ROS bag never has one.
+    """
     if path.is_dir() and not path.is_symlink():
         for file in path.iterdir():
             file.unlink()

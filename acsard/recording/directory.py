@@ -1,4 +1,4 @@
-"""The directory of recordings, bounded in bytes, in days and by the free space of the disk.
+"""Manages the directory of recordings, and limits its size, file ages and use of the disk.
 
     000012-20261121T070027Z.mcap.part   being written, or cut off
     000012-20261121T070027Z.mcap        finished
@@ -44,11 +44,11 @@ from acsard.recording.retention import (
 DIRECTORY_MODE = 0o750
 
 OPEN_DIRECTORY_MODE, OPEN_MODE = 0o755, 0o644
-"""Modes of the directory (0o755) and its files (0o644) when the daemon records as a systemd
-service. Every user may read them, but only root can enter the parent directory. The robot's web
-page gets the directory as a read-only mount of its unit. Group permissions cannot give the page
-access: a dynamic group has no name, and systemd 257 makes the user `nobody` the owner of state
-directories."""
+"""Modes of the directory (0o755) and of its files (0o644) when the daemon records as a systemd
+service. The modes let every user read the files, but the parent directory lets only root enter. The
+service of the robot's web page reads the directory through a read-only mount. Group permissions
+cannot give the page access: a dynamic group has no name, and systemd 257 makes the user `nobody`
+the owner of state directories."""
 
 PRIVATE = Path("/var/lib/private")
 """Parent of the state directories of services with a dynamic user. Only root can enter it."""
@@ -89,7 +89,10 @@ def listed(directory: Path) -> list[Path]:
 
 
 def is_being_recorded(path: Path, now_s: float) -> bool:
-    """Return whether a daemon writes to the file at `now_s`, s since 1970. Raises `OSError`."""
+    """Return whether a daemon is still writing to the file.
+
+    `now_s` is the present time, s since 1970. Raises `OSError` if the file cannot be examined.
+    """
     return path.name.endswith(PART) and abs(now_s - path.stat().st_mtime) < FRESH_S
 
 
@@ -107,17 +110,20 @@ def _stem(path: Path) -> str:
 
 
 def mark_cut(part: Path, kind: Kind, cut: Literal["late", "disk"]) -> None:
-    """Create a marker file for a `.part` file whose end could not be written, or raise `OSError`.
+    """Create a marker file for a `.part` file whose end could not be written.
 
-    Without the marker, the next start would treat the `.part` file as cut off by a crash. The
-    marker is an empty file with `kind` and `cut` in its name, because even a full disk usually
-    accepts a new name.
+    Raises `OSError` if the disk does not accept the marker. Without the marker, the next
+    start would treat the `.part` file as cut off by a crash. The marker is an empty file with
+    `kind` and `cut` in its name, because even a full disk usually accepts a new name.
     """
     part.with_name(f".{part.name}.{kind}.{cut}{MARKER}").touch()
 
 
 def _marked(part: Path) -> tuple[Kind, str] | None:
-    """Return the retention class and the cause from the marker of a `.part` file, if it has one."""
+    """Return the pair (retention class, cause) that the marker of a `.part` file names.
+
+    Returns None if the file has no marker.
+    """
     for marker in part.parent.glob(f".{part.name}.*{MARKER}"):
         words = marker.name.removeprefix(f".{part.name}.").removesuffix(MARKER)
         first, _, cut = words.partition(".")
@@ -128,15 +134,16 @@ def _marked(part: Path) -> tuple[Kind, str] | None:
 
 
 class Run(Struct):
-    """State that lasts until the daemon ends. After a disk error the next `Ring` takes it over."""
+    """State of one run of the daemon. After a disk error, a new `Ring` continues with it."""
 
     numbers: set[int] = field(default_factory=set)
-    """The numbers in the names of the files that ended in this run of the daemon."""
+    """Numbers, from the file names, of the files that ended in this run of the daemon."""
     cut: dict[str, Kind] = field(default_factory=dict)
     """Retention class of each file that a disk error cut off in this run, by the file's name. Any
     other `.part` file without a marker was cut off by a crash before this run."""
     freed: int = 0
-    """Number of bytes deleted because the disk refuses to write; 0 after a successful write."""
+    """Number of bytes that were deleted, since the last successful write, because the disk refused
+    to write."""
     clock: ClockWatch = field(default_factory=ClockWatch)
 
 
@@ -177,13 +184,13 @@ class Ring:
             os.close(self._lock)
             raise OSError(
                 error.errno,
-                "another daemon records into this directory: set record.directory to another one",
+                "another daemon records into this directory: choose another record.directory",
             ) from None
         try:
             for copy in self._directory.glob(f".*{PART}.new"):
                 # A crash interrupted the writing of this copy.
                 copy.unlink()
-            # Make room first, because finishing a file needs some.
+            # Make room first, because finishing a file needs disk space.
             self.trim(None, refused)
             self._recover()
             for marker in self._directory.glob(f".*{PART}.*{MARKER}"):
@@ -227,12 +234,12 @@ class Ring:
                 before_ns = cut_ns - path.stat().st_mtime_ns
                 earlier = (_number(path) or 0) < (_number(part) or 0)
                 # The clock of a computer without a battery-backed clock starts in the past. Then
-                # all older files seem to have ended long after the crash.
+                # all older files seem to have ended long after the crash, and must not match.
                 if earlier and abs(before_ns) < AROUND_NS:
                     self.retain(path)
 
     def _open_files(self) -> None:
-        """Let every user read the directory and all its files, also those of an earlier acsard."""
+        """Let every user read the directory and all its files, even files of an older acsard."""
         for path in (self._directory, *listed(self._directory)):
             mode = OPEN_DIRECTORY_MODE if path == self._directory else OPEN_MODE
             # The file may belong to another user. Recording goes on in any case.
@@ -258,7 +265,8 @@ class Ring:
     def end(self, writing: Writing, kind: Kind, cut: str = "", why: str = "") -> Path:
         """Finish a file, rename it for its retention class `kind`, and return its new path.
 
-        `cut` is a key of `CUTS` with the explanation `why`, or "" after an ordinary end.
+        `cut` is the cause that cut off the recording, a key of `CUTS`, and `why` explains this
+        cause in words. Both are "" after an ordinary end.
         """
         writing.finish(cut, why)
         path = writing.path.with_name(_stem(writing.path) + ENDINGS[kind])
@@ -268,9 +276,10 @@ class Ring:
         return path
 
     def just_ended(self, now: Instant) -> Iterator[tuple[Path, Kind, int]]:
-        """Yield each file that ended less than a minute ago.
+        """Yield a tuple for each file that ended less than a minute ago.
 
-        An item is the path, the retention class and the monotonic time of the end, ns.
+        The tuple contains the file's path, its retention class and the monotonic time of its end,
+        ns.
         """
         for file in self._ended():
             ago_ns = now.wall_ns - int(file.at_s * NS_PER_S)
@@ -278,7 +287,10 @@ class Ring:
                 yield self._directory / file.name, file.kind, now.mono_ns - ago_ns
 
     def retain(self, path: Path) -> None:
-        """Give a finished file the retention class `near`, because an incident was close to it."""
+        """Give a finished `plain` file the retention class `near`.
+
+        The caller has seen an incident within a minute after the end of the file.
+        """
         if path.name.endswith(WHOLE) and _kind(path) == "plain":
             # Another process may have removed the file.
             with suppress(FileNotFoundError):
@@ -288,8 +300,8 @@ class Ring:
     def tend(self, now: Instant) -> None:
         """Delete old files every ten minutes, and whenever the disk is nearly full.
 
-        After a jump of the wall clock, also correct the times of the files of this run. Call this
-        method once a second.
+        After a jump of the wall clock, also correct the modification times of the files of this
+        run. Call this method once a second.
         """
         jumped_ns = self._run.clock.jump_ns(now)
         if jumped_ns:
@@ -309,11 +321,12 @@ class Ring:
                     os.utime(path, ns=(found.st_atime_ns, at_ns))
 
     def trim(self, now: Instant | None, refused: bool = False) -> None:
-        """Delete files that exceed the limits of total size, of age or of free disk space.
+        """Delete files to keep the limits on total size, on age and on free disk space.
 
-        The file that is being written is never deleted. This method sets `file_bytes`, the size
-        above which that file should end. If `now` is None, the time is not known and no file counts
-        as too old. `refused` is true if the last write failed because the disk was full.
+        The file that is being written is never deleted. This method also sets `file_bytes`, the
+        size above which the file that is being written should end. If `now` is None, the time is
+        not known, so no file counts as too old. `refused` is true if the last write failed because
+        the disk was full.
         """
         ended, disk = self._ended(), self._disk()
         oldest_s = -math.inf

@@ -50,7 +50,7 @@ recovered."""
 
 
 class EndRecord(Struct, frozen=True):
-    """The end record of a recording. To list recordings, only this record of each is read."""
+    """The end record of a recording. A list of recordings needs no other part of each file."""
 
     wall_ns: Ns
     """Wall-clock time at which the recording began, ns since 1970."""
@@ -62,14 +62,14 @@ class EndRecord(Struct, frozen=True):
     cut: str = ""
     """Why the recording was cut off: a key of `CUTS`, or "" if the daemon ended normally."""
     why: str = ""
-    """For the cause `bug`, the step in which the daemon failed and the exception; otherwise ""."""
+    """If `cut` is "bug", text that names the failed step and the exception; otherwise ""."""
     earliest_ns: Ns | None = None
     """Earliest wall-clock time of a message, ns since 1970; None if it is not known. It is before
     `wall_ns` if the clock was set back during the recording."""
 
 
 CRASHES = frozenset({"bug", "crash"})
-"""The keys of `CUTS` for failures after which the robot had no daemon."""
+"""The keys of `CUTS` that stand for a failure of the daemon or of its computer."""
 
 
 def how_it_ends(cut: str, why: str = "") -> str:

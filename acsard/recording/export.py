@@ -116,7 +116,7 @@ def _quoted(text: str) -> str:
 
 
 MEASURED = ("t [s]", "fr [rad/s]", "fl [rad/s]", "rl [rad/s]", "rr [rad/s]", "yaw_rate [rad/s]")
-"""Columns that calibration reads: the wall-clock time, s since 1970, the speeds of the wheels
+"""Columns that calibration reads: the wall-clock time (s since 1970), the speeds of the wheels
 (front right, front left, rear left and rear right), and the yaw rate from a gyro."""
 
 OUTPUT_COLUMNS = (
@@ -184,7 +184,7 @@ SUFFIX: dict[Kind, str] = {"mcap": ".ros2.mcap", "csv": ".csv", "rosbag2": ".ros
 
 class ExportResult(Struct, frozen=True):
     count: int
-    """Number of messages, or of rows of a CSV table."""
+    """Number of exported messages, or of exported rows of a CSV table."""
     gaps: list[Gap]
     """Gaps of the recording that overlap the exported time span. The steps in a gap are missing."""
 
@@ -199,10 +199,16 @@ class _Writer:
         raise NotImplementedError
 
     def skip(self, step: Step, inside: bool) -> None:
-        """Process a step that is not exported. If it is `inside` the span, export its log lines."""
+        """Process a step whose outputs are not exported.
+
+        `inside` is true if the step is in the time span. Then its log lines are exported anyway.
+        """
 
     def end(self, ending: str = "") -> None:
-        """Write the log lines after the last step; `ending` says how the recording was cut off."""
+        """Write the log lines that follow the last step.
+
+        `ending` says how the recording was cut off, or is "" if the daemon ended normally.
+        """
 
     def finish(self) -> None:
         """Write the end of the file."""
@@ -296,10 +302,11 @@ def export(
     progress: Progress = no_progress,
     force: bool = False,
 ) -> ExportResult:
-    """Replay a recording and write its messages to `new`: a file, or a directory for `rosbag2`.
+    """Replay a recording, and write its messages or its CSV table to `new`.
 
     Args:
-        other: the configuration to replay with; None for the recorded one.
+        new: the file to write, or the directory if `kind` is `rosbag2`.
+        other: the configuration to replay with; None means the recorded configuration.
         progress: called every `PROGRESS_STEPS` steps.
         force: overwrite `new`, as far as `atomic_output.replacing` allows it.
 
@@ -343,11 +350,11 @@ def export(
 def _write_steps(
     run: RecordedRun, writer: _Writer, recording: Recording, span: Span, progress: Progress
 ) -> None:
-    """Replay all steps, because each one changes the robot. Write only those in the time span."""
+    """Replay all steps, because each step changes the robot, but write only steps in `span`."""
     began_ns, over = recording.about.mono_ns, False
 
     def is_inside(step: Step) -> bool:
-        """Return whether a step is in the time span. The first step after it ends the output."""
+        """Return whether a step is in the span. End the output at the first step after the span."""
         nonlocal over
         seconds = (step.inputs.now.mono_ns - began_ns) / NS_PER_S
         if seconds > span.end and not over:
@@ -380,7 +387,10 @@ def _gaps(run: RecordedRun, span: Span, about: About) -> list[Gap]:
 
 
 def measured(recording: Recording) -> bytes:
-    """Return the CSV table for `acsard calibrate`. Raises `RecordingError` without gyro samples."""
+    """Return the CSV table that `acsard calibrate` reads.
+
+    Raises `RecordingError` if the recording has no gyro samples.
+    """
     run = RecordedRun(recording)
     lines, has_gyro = [MEASURED_CSV_HEADER], False
     with run.state_errors():

@@ -1,4 +1,6 @@
-"""One recording as an MCAP file: written every second, and readable even if cut off or damaged.
+"""Writes and reads one recording as an MCAP file.
+
+The writer adds data every second. If a file is cut off or damaged, its other data stays readable.
 
 A file has four channels:
 - `steps`: batches of steps, as `rows.py` encodes them.
@@ -151,7 +153,10 @@ class EndRecordBuilder:
             self._incidents.append(event)
 
     def end_record(self, cut: str = "", why: str = "") -> EndRecord:
-        """Return the end record so far. `cut` is the kind of end; `why` explains it in words."""
+        """Return the end record of the messages that were added so far.
+
+        `cut` and `why` become the fields of these names in the end record.
+        """
         text = summary(self._incidents, self._starts)
         return EndRecord(self._wall_ns, self._last_ns, text, cut, why, self._earliest_ns)
 
@@ -187,7 +192,10 @@ class Index:
         self._totals.chunk_count += 1
 
     def record(self, record: McapRecord, at: int, length: int) -> None:
-        """Add metadata or an attachment to the index. Its offset `at` and `length` are in bytes."""
+        """Add a metadata record or an attachment to the index, and ignore other records.
+
+        `at` is the offset of the record in the file, and `length` its length, both in bytes.
+        """
         if isinstance(record, Metadata):
             self._totals.metadata_count += 1
             self._places.append(MetadataIndex(at, length, record.name))
@@ -203,7 +211,7 @@ class Index:
 
 
 class Writing:
-    """A recording that is being written. After an `OSError` of any method, call only `close`."""
+    """A recording that is being written. After a method has raised `OSError`, call only `close`."""
 
     def __init__(self, path: Path, about: About, mode: int = MODE) -> None:
         self.path, self._mode = path, mode
@@ -265,7 +273,7 @@ class Writing:
         self._end_builder.event(event)
 
     def flush(self) -> None:
-        """Write all added messages so that they can be read from now on, and sync the file."""
+        """Write all added messages to the file in readable form, and sync it to the disk."""
         if self._chunk is not None and self._chunk.has_unwritten:
             self._put(self._chunk.take())
         self._sync()
@@ -368,33 +376,42 @@ class Recording:
                 f"cannot read {path}: {error.strerror}; `acsard recording` lists the recordings"
             ) from None
         self.ended = False
-        """True if the file is finished (known only after `messages` has ended). A finished file may
-        be damaged just before its end. `damaged` counts this place too."""
+        """True if the file is finished; valid only after the last message of `messages()`. A
+        finished file may be damaged just before its end. `damaged` counts this place too."""
         self.damaged = 0
         """Number of damaged places, mostly MCAP chunks, that are followed by readable data."""
         self.cut = ""
         """Cause that cut off the recording, a key of `CUTS`; "" if the daemon ended normally."""
         self.why = ""
-        """For the cause `bug`, the step in which the daemon failed and the exception, else ""."""
+        """If `cut` is "bug", text that names the failed step and the exception; otherwise ""."""
         self.unfinished: bytes | None = None
         """Encoded inputs of the step in which the daemon failed; None if it did not fail."""
         self.about = self._about()
 
     @property
     def whole(self) -> bool:
-        """True if the file is finished and undamaged (known only after `messages` has ended)."""
+        """True if the file is finished and undamaged.
+
+        This property is valid only after the last message of `messages()`.
+        """
         return self.ended and not self.damaged
 
     @property
     def ending(self) -> str:
-        """How the recording ended; "" for a normal end (known only after `messages` has ended)."""
+        """Text that says how the recording ended; "" if the daemon ended normally.
+
+        This property is valid only after the last message of `messages()`.
+        """
         if not self.ended:
             return UNFINISHED
         return how_it_ends(self.cut, self.why)
 
     @property
     def missing(self) -> str:
-        """Damage and abnormal ending in words, or "" (known only after `messages` has ended)."""
+        """Text that describes the damage and an abnormal ending; "" if there is neither.
+
+        This property is valid only after the last message of `messages()`.
+        """
         places = many(self.damaged, "damaged place is", "damaged places are")
         damaged = f"{places} left out" if self.damaged else ""
         return "; ".join(filter(None, [damaged, self.ending]))
@@ -410,9 +427,9 @@ class Recording:
         return builder.end_record()
 
     def messages(self) -> Iterator[tuple[Topic, int, bytes]]:
-        """Yield the topic, the wall-clock time in ns since 1970 and the bytes of each message.
+        """Yield the triple (topic, wall-clock time in ns since 1970, data) of each message.
 
-        This also sets `ended`, `damaged`, `cut`, `why` and `unfinished`.
+        After the last message, `ended`, `damaged`, `cut`, `why` and `unfinished` are valid.
         """
         self.ended, self.damaged, self.cut, self.why = False, 0, "", ""
         self.unfinished = None
@@ -472,9 +489,9 @@ class Recording:
 def rewrite(recording: Recording, path: Path, cut: str = "open") -> int:
     """Write all readable messages to a new, finished file at `path`, and return their number.
 
-    If the recording is not finished, the new file says that it was cut off for the cause `cut`, a
-    key of `CUTS`. Raises `OSError`, or `RecordingError` if an event cannot be decoded; then no file
-    is left at `path`.
+    If the recording is not finished, the end record of the new file names the cause `cut`, a key of
+    `CUTS`. Raises `OSError`, or `RecordingError` if an event cannot be decoded. After such an error
+    there is no file at `path`.
     """
     writing = Writing(path, recording.about)
     try:

@@ -29,7 +29,7 @@ from acsard.recording.timeline import TimelineEntry, entry_of
 from acsard.recording.unpickling import MAX_BYTES
 
 Progress = Callable[[int], None]
-"""Callback that takes the wall-clock time which the replay has reached, ns since 1970."""
+"""Callback that shows progress. Its argument is the wall-clock time of a step, ns since 1970."""
 
 PROGRESS_STEPS = 1024
 """Number of replayed steps between two calls of the progress callback."""
@@ -52,16 +52,17 @@ class Gap(Struct):
     """
 
     begin_ns: int
-    """Monotonic time of the last replayed step before the gap, ns."""
+    """Monotonic time of the last replayed step before the gap, ns. If no step was replayed before
+    the gap, it is the time at which the recording began."""
     end_ns: int
     """Monotonic time of the first replayed step after the gap, or of the recording's end, ns."""
     unreadable: int = 0
-    """Number of unreadable steps, computed from the numbers of the readable steps around them."""
+    """Number of steps that cannot be read. It follows from the numbers of the steps around them."""
     skipped: int = 0
     """Number of readable steps that are not replayed, because the next recorded robot state comes
     later."""
     lines: int = 0
-    """Number of skipped steps in which the robot decided to send a line to the board."""
+    """How many of the `skipped` steps contain a line that the robot decided to send."""
     end_lost: bool = False
     """True if the last steps of the recording cannot be read."""
 
@@ -71,8 +72,8 @@ class ReplayResult(NamedTuple):
     gaps: list[Gap]
     """The parts of the recording that were not replayed, so their outputs were not compared."""
     failed_step: str = ""
-    """Sentence that says whether the step that ended the recorded daemon also ends this version. It
-    is "" if the daemon did not fail."""
+    """Sentence that says whether the step in which the recorded daemon failed also fails in this
+    version. It is "" if the daemon did not fail."""
     event_copies: str = ""
     """Sentence about the first event that differs from its copy in the channel `events`. It is ""
     if every event equals its copy."""
@@ -105,7 +106,10 @@ def steps(recording: Recording) -> Iterator[Step]:
 def _items(
     recording: Recording, copies: EventCopies | None = None
 ) -> Iterator[list[Step] | Checkpoint]:
-    """Yield the readable batches of steps and the checkpoints. `copies` gets steps and events."""
+    """Yield the readable batches of steps and the checkpoints, in the order of the file.
+
+    If `copies` is not None, it receives each batch and each message of the channel `events`.
+    """
     for topic, _, data in recording.messages():
         if topic == "events" and copies is not None:
             copies.copy(data)
@@ -122,13 +126,13 @@ def _items(
 
 
 MAX_STATE_BYTES = 8
-"""Number of bytes of robot states that may be decoded after gaps, for each byte of the file.
-`MAX_BYTES` are allowed in addition. A genuine file stays below this limit. Without the limit, the
-replay of a forged file of 5 kB took 4 s."""
+"""Limit on the size of the robot states that are decoded after gaps, in bytes for each byte of the
+file. `MAX_BYTES` are allowed in addition. A genuine file stays below this limit. Without the limit,
+the replay of a forged file of 5 kB took 4 s."""
 
 
 class _Source:
-    """Base class of the replays, with the recording and the robot state last decoded from it."""
+    """Base class of the replays. It decodes the robot states in the recording."""
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
@@ -144,11 +148,11 @@ class _Source:
 
     @contextmanager
     def state_errors(self) -> Iterator[None]:
-        """Raise `RecordingError` if the `with` block fails because the state is incomplete.
+        """Convert errors in the `with` block that an incomplete robot state causes.
 
-        Use this context around every use of the robot, because a forged recorded state may lack any
-        part. If the robot is not from the file, an error in the block is a defect and is raised
-        unchanged.
+        Such an error becomes a `RecordingError`. Use this context around every use of the robot,
+        because a forged recorded state may lack any part. If the robot is not from the file, an
+        error in the block is a defect and is raised unchanged.
         """
         try:
             yield
@@ -223,7 +227,7 @@ class RecordedRun(_Source):
                 adopt(self.robot, Robot(self._recorded), Robot(self.config))
 
     def steps(self) -> Iterator[Step]:
-        """Yield the steps that can be replayed; raise `RecordingError` if no step can be."""
+        """Yield the steps that can be replayed. Raises `RecordingError` if there are none."""
         recording = self._recording
         replayed_ns = recording.about.mono_ns
         read, damaged = self._next, 0
@@ -290,10 +294,11 @@ class RecordedRun(_Source):
 
 
 def _with_changes(other: Config, recorded: Config, present: Config) -> Config:
-    """Return `other` with the settings that the robot changed while it ran.
+    """Return `other` with the settings that clients changed while the recorded robot ran.
 
-    These are the settings in which `present` differs from `recorded`. If their values are invalid
-    in `other`, return `other` unchanged, because its robot would have refused them.
+    These are the settings in which `present` differs from `recorded`. If `other` does not permit
+    their values, return `other` unchanged, because a robot with the configuration `other` would
+    have refused the changes.
     """
     before = dict(flat(effective(recorded)))
     changes = {k: v for k, v in flat(effective(present)) if before.get(k) != v}
@@ -325,10 +330,10 @@ def replay_file(
 
 
 def _failed_step(recording: Recording, robot: Robot, last: int | None) -> str:
-    """Replay the step in which the daemon failed; return the text of `ReplayResult.failed_step`.
+    """Replay the step in which the daemon failed, and return the text for `failed_step`.
 
     `robot` is the robot after the step with the number `last`. The failed step is replayed only if
-    it directly follows that step.
+    it has the number `last` + 1.
     """
     if recording.unfinished is None:
         return ""
@@ -350,9 +355,9 @@ def _failed_step(recording: Recording, robot: Robot, last: int | None) -> str:
 
 
 class DisplayReplay(_Source):
-    """Replay of a recording for display, which replays every readable step.
+    """Replays every readable step of a recording, to display the recorded drive.
 
-    After missing steps, the replayed robot may be wrong until the next robot state in the file.
+    If steps are missing, the replayed robot may be wrong until the next robot state in the file.
     """
 
     def __init__(self, recording: Recording) -> None:
@@ -377,7 +382,9 @@ class DisplayReplay(_Source):
             )
 
     def steps(self) -> Iterator[tuple[Step, Outputs, Robot]]:
-        """Yield each recorded step, its replayed outputs, and the robot after the step.
+        """Yield a triple for each step: the recorded step, its replayed outputs, and the robot.
+
+        The robot is in its state after the step.
 
         Raises `RecordingError` if the recorded state lacks a part that a step uses.
         """
@@ -406,10 +413,10 @@ class DisplayReplay(_Source):
 
 
 def _first_state(recording: Recording) -> tuple[int, State | None]:
-    """Return the number of the first step, and the recorded robot before that step.
+    """Return a pair: the number of the first step, and the recorded state before that step.
 
-    Returns 0 and None if the recording has no state before its first step. Raises `RecordingError`
-    if the state is damaged, or if this version cannot read it.
+    The pair is (0, None) if the recording has no state before its first step. Raises
+    `RecordingError` if the state is damaged, or if this version cannot read it.
     """
     for topic, _, data in recording.messages():
         if topic == "state":
@@ -445,9 +452,9 @@ class EventCopies:
         self._events: list[TimelineEntry] = []
         self._copies: list[TimelineEntry] = []
         self._number: int | None = None
-        """Number that the first step of the next batch must have; None before the first batch."""
+        """Number of the step that follows the most recent batch; None before the first batch."""
         self._damaged = 0
-        """Number of damaged places that were found up to the last batch."""
+        """Value of `Recording.damaged` when the most recent batch was read."""
 
     def batch(self, steps: list[Step]) -> None:
         """Compare the previous batch with its copies, and store the events of the new batch."""
@@ -461,16 +468,16 @@ class EventCopies:
         self._copies = []
 
     def copy(self, data: bytes) -> None:
-        """Store a message of the channel `events`: the copy of an event in the last batch."""
+        """Store the copy of an event of the most recent batch. `data` encodes the copy."""
         try:
             self._copies.append(event_of(self._recording, data))
         except RecordingError as error:
             self._differs(str(error))
 
     def end(self) -> None:
-        """Compare the events of the last batch with their copies.
+        """Compare the events of the last batch with their copies, and check the end record.
 
-        In a complete file, also compare the summary in the end record with the events.
+        If the file is complete, the summary in its end record must agree with the events.
         """
         recording = self._recording
         self._compare(last=True)
@@ -485,10 +492,11 @@ class EventCopies:
             )
 
     def _compare(self, last: bool, follows: bool = True) -> None:
-        """Compare the events of the batch with their copies, unless damage makes this unreliable.
+        """Compare the events of the most recent batch with their copies.
 
-        `last` is true for the last batch, whose copies may be missing if the file was cut off.
-        `follows` is true if no step is missing before the next batch.
+        Nothing is compared if steps or copies may be missing because of damage. `last` is true if
+        no batch follows; copies may then be missing because the file was cut off. `follows` is true
+        if no step is missing between this batch and the next one.
         """
         recording = self._recording
         if recording.damaged > self._damaged or not follows:

@@ -1,12 +1,12 @@
-"""Writes MCAP chunks second by second, and reads MCAP records of files that may be damaged.
+"""Writes MCAP chunks in small pieces, and reads the MCAP records of files that may be damaged.
 
 The header of an MCAP chunk holds the chunk's length and checksum. Most programs therefore write a
-chunk only when it is complete, and a power cut costs the whole chunk. A recording writes its chunk
-while it grows:
+chunk only when it is complete, so that a power cut destroys the whole chunk. The recorder writes
+each chunk while the chunk grows:
 
-1. First it writes a header whose length field is larger than any file.
+1. First the recorder writes a header whose length field is larger than any file.
 2. Once a second it appends a zstd block with the new messages.
-3. When the chunk is complete, it replaces this header by the true header.
+3. When the chunk is complete, the recorder replaces the header by the true header.
 
 The reader does not need the header. Each zstd block holds its own length, and the field for the
 sequence number of each message holds the message's checksum. After a damaged chunk or a record
@@ -30,16 +30,16 @@ from mcap.records import Attachment, DataEnd, Footer, Header, McapRecord, Metada
 from zstandard import COMPRESSOBJ_FLUSH_BLOCK, ZstdCompressionParameters
 
 LEVEL = 9
-"""Compression level of zstd. Ten seconds of steps take 2 to 8 ms to compress, and become 13 to 16 %
-smaller than at level 3."""
+"""Compression level of zstd. At this level, ten seconds of steps are compressed in 2 to 8 ms. The
+result is 13 to 16 % smaller than at level 3."""
 
 PARAMETERS = ZstdCompressionParameters.from_level(
     LEVEL, source_size=1 << 18, write_content_size=False
 )
-"""Parameters of zstd for a chunk of 256 KiB. The compressor then needs 3 MB of memory."""
+"""Parameters of zstd for chunks of 256 KiB. With them the compressor needs 3 MB of memory."""
 
 LAST_BLOCK = b"\x01\0\0"
-"""The empty zstd block that ends a chunk. It completes a chunk that was cut off after a block."""
+"""An empty zstd block with the mark of a last block. It completes a chunk that was cut off."""
 
 MAX_CHUNK_BYTES = 1 << 23
 """Largest uncompressed chunk that is read, bytes. Recorders write up to 1 MiB plus one message."""
@@ -82,8 +82,8 @@ _BLOCK_BYTES = 1 << 17
 """Largest size of a zstd block, compressed or uncompressed, bytes."""
 
 _BLOCK_EFFORT = 1 << 10
-"""Work that each block costs in addition to its unpacked bytes. Even an empty block takes about as
-long as 1 KiB of data."""
+"""Number of unpacked bytes that each block counts as, in addition to its own. Even an empty block
+takes about as long as 1 KiB of data."""
 
 _REPEATED = 1
 """Type of a zstd block that holds a single byte and says how often to repeat this byte."""
@@ -142,7 +142,7 @@ class GrowingChunk:
         return self._taken()
 
     def end(self) -> tuple[bytes, bytes]:
-        """End the chunk. Return its last bytes, and the header that must replace `GROWING_HEAD`."""
+        """End the chunk. Return a pair: its last bytes, and the header for its beginning."""
         self._out.append(self._compressor.flush())
         last = self._taken()
         return last, _head(self.first_ns, self._last_ns, self.size, self._crc, self._length)
@@ -155,7 +155,7 @@ class GrowingChunk:
 
 
 class ReadChunk(NamedTuple):
-    """The readable part of a chunk."""
+    """The readable part of a chunk. `complete` is true if it includes the chunk's last block."""
 
     begin: int
     """Offset of the chunk's header in the file."""
@@ -164,7 +164,7 @@ class ReadChunk(NamedTuple):
     messages: list[Message]
     complete: bool
     effort: int = 0
-    """Work of reading the chunk: its unpacked bytes, plus `_BLOCK_EFFORT` for each block."""
+    """Work of reading the chunk: its number of unpacked bytes, plus `_BLOCK_EFFORT` per block."""
 
     def head(self, data: bytes) -> bytes:
         """Return a header with the lengths and the checksum of the readable part of the chunk.
@@ -182,7 +182,7 @@ class ReadChunk(NamedTuple):
 
 
 def chunk_places(data: bytes, begin: int) -> Iterator[int]:
-    """Yield the offsets in the file, from `begin` on, at which a chunk may begin."""
+    """Yield each offset in the file, not smaller than `begin`, at which a chunk may begin."""
     at = data.find(ZSTD, begin + _NAME_AT)
     while at >= 0:
         yield at - _NAME_AT
@@ -190,7 +190,7 @@ def chunk_places(data: bytes, begin: int) -> Iterator[int]:
 
 
 def read_chunk(data: bytes, begin: int) -> ReadChunk | None:
-    """Read the chunk whose header begins at offset `begin`. Returns None if there is no chunk."""
+    """Read the chunk whose header begins at the offset `begin`; return None without a chunk."""
     at = begin + _HEAD.size
     named = data.startswith(ZSTD, begin + _NAME_AT)
     if at > len(data) or not (named or data[begin] == Opcode.CHUNK):
@@ -225,9 +225,9 @@ def read_chunk(data: bytes, begin: int) -> ReadChunk | None:
 
 
 def _blocks(data: bytes, at: int) -> Iterator[tuple[int, bytes, bool]]:
-    """Yield the end offset and the data of each zstd block, and whether this block is the last one.
+    """Yield the triple (end offset, unpacked data, is the last block) of each zstd block.
 
-    Raises `ZstdError` for a damaged block.
+    `at` is the offset at which the zstd frame begins. Raises `ZstdError` for a damaged block.
     """
     begin = at + zstandard.frame_header_size(data[at : at + _LONGEST_FRAME_HEAD])
     unpacker = zstandard.ZstdDecompressor(max_window_size=1 << PARAMETERS.window_log)
@@ -246,10 +246,10 @@ def _blocks(data: bytes, at: int) -> Iterator[tuple[int, bytes, bool]]:
 
 
 def _messages(data: bytearray) -> tuple[list[Message], int, int]:
-    """Decode the complete messages at the beginning of the data.
+    """Decode the complete messages at the beginning of `data`.
 
-    Returns the messages, their total size, and the number of bytes that the next message needs.
-    That number is greater than `MAX_MESSAGE_BYTES` if the next message is damaged.
+    Returns a triple: the messages, their total size in bytes, and the number of bytes that the next
+    message needs. The last number exceeds `MAX_MESSAGE_BYTES` if the next message is damaged.
     """
     messages: list[Message] = []
     at = 0
@@ -279,8 +279,8 @@ MAGIC = b"\x89MCAP0\r\n"
 MAX_EFFORT = 256
 """Limit on the work of unpacking damaged chunks, in unpacked bytes for each byte of the file.
 
-The chunks in the test recordings unpack to 5 to 13 bytes for each byte. Damaged chunks may need
-more work, because a damaged chunk is read up to three times, and a damaged block counts as 128 KiB.
+Each byte of a chunk in the test recordings unpacks to 5 to 13 bytes. Damaged chunks may need more
+work, because a damaged chunk is read up to three times, and a damaged block counts as 128 KiB.
 """
 
 HEAD = struct.Struct("<BQ")
@@ -314,7 +314,7 @@ class Found(NamedTuple):
     chunk: ReadChunk | None
     """The readable part of a chunk, even if the chunk is damaged; None for other records."""
     end: int
-    """Offset at which this item ends and the reader goes on, bytes."""
+    """Offset in the file at which this item ends and the next one begins, bytes."""
     damaged: bool = False
     """True for a damaged place. If a file was cut off, its incomplete end does not count as
     damaged."""
@@ -361,9 +361,10 @@ def walk(data: bytes) -> Iterator[Found]:
 
 
 def _read(stream: io.BytesIO, at: int, opcode: int, claimed: int, size: int) -> Found | None:
-    """Decode the record at the offset `at`. Its length field says that it ends at `claimed`.
+    """Decode the record at the offset `at`, whose length field says that it ends at `claimed`.
 
-    Returns None if the record is not one of `READ`, is damaged or is cut off.
+    `size` is the size of the file, bytes. Returns None if the opcode is not a key of `READ`, or if
+    the record is damaged or cut off.
     """
     read = READ.get(opcode)
     if read is None:
@@ -388,10 +389,11 @@ def _is_intact(stream: io.BytesIO, at: int, end: int) -> bool:
 
 
 class _Chunks:
-    """Reads chunks, and searches for the next complete chunk without searching a place twice.
+    """Reads chunks, and finds the next complete chunk. No part of the file is searched twice.
 
-    In a hostile file thousands of incomplete chunks may share the same blocks, and each unpacks to
-    megabytes. So the work for incomplete chunks is limited in proportion to the file's size.
+    In a hostile file thousands of incomplete chunks may share the same blocks, and each chunk
+    unpacks to megabytes. So the work for incomplete chunks is limited in proportion to the file's
+    size.
     """
 
     def __init__(self, data: bytes) -> None:
@@ -407,7 +409,7 @@ class _Chunks:
         return self._effort < 0
 
     def read(self, begin: int) -> ReadChunk | None:
-        """Read the chunk that begins at the offset `begin`. Returns None if there is no chunk.
+        """Read the chunk that begins at the offset `begin`; return None without a chunk there.
 
         The work for an incomplete or empty chunk counts towards the limit.
         """
@@ -417,10 +419,10 @@ class _Chunks:
         return chunk
 
     def later(self, begin: int) -> int | None:
-        """Return the offset of the first complete chunk from the offset `begin` on.
+        """Return the offset of the first complete chunk that begins at `begin` or later.
 
-        Returns None if there is no complete chunk, or if the limit of work is reached. `begin` must
-        not be smaller than in the previous call.
+        Returns None if there is no such chunk, or if the work exceeds its limit. `begin` must not
+        be smaller than in the previous call.
         """
         if self._found is not None and self._found >= begin:
             return self._found

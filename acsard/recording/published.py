@@ -1,9 +1,9 @@
 """Rebuilds the messages that a robot published, while its recording is replayed.
 
-The daemon's class `Report` builds the messages, as if a client had subscribed to every topic all
-the time. A recording does not hold the daemon's measurements of itself, so the rows of
+The daemon's class `Report` builds the messages as if a client had subscribed to every topic for the
+whole time. A recording does not hold the daemon's measurements of itself, so the rows of
 `diagnostics` with such measurements are omitted. The messages of `log` are the entries of
-`timeline.py`, which include entries that the robot does not publish, such as `drive` and `reason`.
+`timeline.py`. Some of these entries, such as `drive` and `reason`, were not published by the robot.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ MEASURED = frozenset({"acsard: control loop", "acsard: certificate"})
 
 
 ROUNDED_NS = 1000
-"""Limit of the rounding error of `TimelineEntry.seconds`, ns. Steps are at least this far apart."""
+"""Upper bound of the rounding error of `TimelineEntry.seconds`, ns. Two steps are never closer."""
 
 
 class Published(NamedTuple):
@@ -52,7 +52,7 @@ class Publisher:
         """
         self.robot = robot
         """The robot that replays the steps. If the replay resumes with another robot, the caller
-        must set this attribute to it."""
+        must assign that robot to this attribute."""
         self._config = robot.config
         self._report = Report(robot.config, Instant(0, started_ns))
         self._wanted = self._wanted_keys()
@@ -87,7 +87,7 @@ class Publisher:
         yield from self.skip(step)
 
     def skip(self, step: Step) -> Iterator[Published]:
-        """Yield only the log lines of a step. This step need not have been replayed."""
+        """Yield only the log lines of a step, which may be a step that was not replayed."""
         self._now = step.inputs.now
         yield from map(self._line, self._timeline.step(step))
 
@@ -100,8 +100,8 @@ class Publisher:
 
     def _line(self, entry: TimelineEntry) -> Published:
         wall_ns = round(entry.seconds * NS_PER_S)
-        # An entry's time is rounded to fractions of a us. The exact time of its step agrees with
-        # the stamps of events, which are exact.
+        # An entry's time is rounded to a fraction of a us. Use the exact time of its step instead,
+        # so that the log agrees with the stamps of the other messages.
         if abs(wall_ns - self._now.wall_ns) < ROUNDED_NS:
             wall_ns = self._now.wall_ns
         line = Log(Time.from_ns(wall_ns), LEVELS[entry.level], entry.name, entry.sentence)

@@ -1,7 +1,7 @@
 """One control step as a recording stores it: all of its inputs, and its outputs.
 
-Poses from odometry are stored in um and urad. A checksum covers every bit of the exact values.
-`rows.py` encodes batches of steps.
+Poses from odometry are rounded to um and urad. A checksum of the exact values lets a replay detect
+differences that are smaller than this rounding. `rows.py` encodes batches of steps.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ from acsard.core.values import (
 MICRO = 1e6
 
 Status = tuple[str, str, str, str]
-"""Mode of the robot, its reason in words, state of the link, and commanding source ("" if none)."""
+"""Tuple: mode of the robot, reason of the mode in words, state of the link, and source that
+commands the robot ("" if there is none)."""
 
 Micropose = tuple[int, int, int]
 """Pose as integers: x and y in um, yaw in urad."""
@@ -48,9 +49,10 @@ class Taken(NamedTuple):
 
 
 class Start(NamedTuple):
-    """State of the robot before step `number`.
+    """State of the robot before the step `number`.
 
-    A `Start` begins a new file, or becomes a checkpoint in a file.
+    The recorder begins a new file with a `Start`, or writes it as a checkpoint into the present
+    file.
     """
 
     number: int
@@ -61,9 +63,10 @@ class Start(NamedTuple):
 
 
 def runs(items: list[Taken | Start]) -> Iterator[tuple[Start | None, list[Taken]]]:
-    """Split the recorder's queue at each `Start`, and yield each `Start` with the steps after it.
+    """Split the recorder's queue at each `Start`, and yield a pair for each part.
 
-    The first group has None instead of a `Start`.
+    The pair is a `Start` and the steps that follow it. The first pair has None instead of a
+    `Start`: its steps continue those that were taken from the queue before.
     """
     start: Start | None = None
     steps: list[Taken] = []
@@ -125,7 +128,7 @@ class Step(Struct, frozen=True):
     inputs: Inputs
     recorded: RecordedOutputs
     begins: bool = False
-    """True for the first step of a batch, at which the checksum restarts."""
+    """True for the first step of a batch, at which both checksums restart from 0."""
 
 
 class UnfinishedError(AcsardError):
@@ -147,7 +150,10 @@ _unfinished = msgspec.msgpack.Decoder(Unfinished)
 
 
 def unfinished(data: bytes) -> Unfinished:
-    """Decode an unfinished step; raise `UnfinishedError` if the bytes are damaged."""
+    """Decode the step in which the daemon failed.
+
+    Raises `UnfinishedError` if the bytes are damaged.
+    """
     try:
         return _unfinished.decode(data)
     except msgspec.MsgspecError as error:
@@ -157,9 +163,10 @@ def unfinished(data: bytes) -> Unfinished:
 
 
 def checksum(estimates: Sequence[Estimate], before: int) -> int:
-    """Extend the CRC-32 `before` by the exact poses, twists and angles that the wheels rolled.
+    """Extend the CRC-32 `before` by the estimates of a step, and return the new CRC-32.
 
-    `before` is 0 at the beginning of a batch.
+    The CRC-32 covers all bits of the poses, twists and angles that the wheels rolled. `before` is 0
+    for the first step of a batch.
     """
     for e in estimates:
         pose, twist = e.pose, e.twist
@@ -169,9 +176,10 @@ def checksum(estimates: Sequence[Estimate], before: int) -> int:
 
 
 def input_names(inputs: Inputs, before: int) -> int:
-    """Extend the CRC-32 `before` by the names of sources, senders and clients in the inputs.
+    """Extend the CRC-32 `before` by the names in the inputs of a step, and return the new CRC-32.
 
-    `before` is 0 at the beginning of a batch.
+    The names are those of sources, senders and clients. `before` is 0 for the first step of a
+    batch.
     """
     names = [
         *[name for command in inputs.commands for name in (command.source, command.sender)],

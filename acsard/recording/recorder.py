@@ -23,22 +23,22 @@ from acsard.recording.state import freeze
 from acsard.recording.step_writer import Bug, StepWriter
 
 MAX_QUEUED_STEPS = 4096
-"""Largest number of queued steps. At 400 steps a second, the disk may hang for 10 s."""
+"""Largest number of queued steps. At 400 steps a second, the queue is full after 10 s."""
 
 SLOW_NS = 3 * NS_PER_S
-"""Duration of a sync above which the log reports that the disk hangs, ns."""
+"""If a sync takes longer than this time, ns, the log reports that the disk hangs."""
 
 SLOW = "the disk has accepted no data for 3 s"
 
 PAUSE_NS = NS_PER_S // 4
-"""Limit on the time between two steps that counts as a wait for the disk, ns.
+"""Longest time between two steps that counts as a wait for the disk, ns.
 
-Only this part of a longer time counts. During the rest the process was stopped, so the disk is not
-the cause.
+A longer time counts only up to this limit. The process must have been stopped for the rest of the
+time, so the disk is not the cause of it.
 """
 
 FLUSH_S = 0.98
-"""Pause between two syncs, s. The pause and a sync together take about one second."""
+"""Pause between two syncs of the file, s. The pause and one sync together take about a second."""
 
 MAX_TEXT = 200
 """Number of characters to which the text of an exception is cut."""
@@ -54,11 +54,11 @@ class Recorder:
     def __init__(
         self, config: Config, report: Callable[[Event], None], started_ns: int = 0
     ) -> None:
-        """Start the thread.
+        """Start the thread that writes to the disk.
 
-        Only `step()` calls `report`, with events about the recorder itself. `started_ns` is the
-        wall-clock time of the daemon's start, ns since 1970. An export stamps the messages that
-        never change with this time.
+        `report` receives events about the recorder itself. Only `step()` calls it, so it runs in
+        the thread of the control loop. `started_ns` is the wall-clock time of the daemon's start,
+        ns since 1970. An export uses it as the stamp of the messages that never change.
         """
         self._queue: deque[Taken | Start] = deque()
         self._report = report
@@ -71,7 +71,7 @@ class Recorder:
         self._syncs = 0
         """Value of `StepWriter.syncs` at the last step."""
         self._waited_ns = self._now_ns = 0
-        """Duration of the present sync so far, and monotonic time of the last step, ns."""
+        """Duration of the present sync so far, and monotonic time of the last step, both in ns."""
         self._slow = False
         """True from the report that the disk hangs until the report that it accepts data again."""
         self._lost_before = 0
@@ -199,7 +199,7 @@ class Recorder:
 
     def _bug(self, error: Exception) -> Bug:
         why = type(error).__name__
-        # Python may fail to produce the text of an exception. Then its type must be enough.
+        # Python may fail to produce the text of an exception. Then only its type is recorded.
         with suppress(Exception):
             why = f"{why}: {error}"[:MAX_TEXT].encode(errors="replace").decode()
         if self._failed_inputs is None:

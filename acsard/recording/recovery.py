@@ -1,7 +1,7 @@
 """Finishes a recording that was cut off: as a copy, or in place if the disk has no room for a copy.
 
-No readable data is thrown away. If this version cannot read a file, or the disk has no room even
-for the end record of a file, the file is only renamed.
+Recovery deletes no readable data. A file is only renamed if this version cannot read it, or if the
+disk has no room even for the end record of the file.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ A larger file has more than a header and one second of steps, so it is never del
 def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
     """Make the finished file `whole` from the recording `part`, which was cut off.
 
-    A file without data is deleted. A file that cannot be read is only renamed. Returns a message
-    for the log, or "" if the recovery succeeded completely. Raises `OSError` if the disk refuses to
-    read or write.
+    A small file without readable data is deleted. A file that cannot be read is only renamed.
+    Returns a message for the log, or "" if there is nothing to report. Raises `OSError` if the disk
+    refuses to read or write.
 
     Args:
         part: the file that was cut off; it is removed or renamed.
@@ -48,7 +48,7 @@ def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
             if before.st_size > NOTHING_BYTES or _has_chunks(part):
                 raise RecordingError(f"{part} has no readable beginning: nothing can be recovered")
             part.unlink()
-            return f"{part.name} is removed: it has no beginning" if before.st_size else ""
+            return f"{part.name} was deleted: its beginning is missing" if before.st_size else ""
         recording = Recording(part)
         if not any(True for _ in recording.messages()):
             if recording.damaged or before.st_size > NOTHING_BYTES or _has_chunks(part):
@@ -78,7 +78,10 @@ def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
 
 
 def _has_configuration(part: Path) -> bool:
-    """Return whether the file has a configuration. `Recording` refuses a file without one."""
+    """Return whether the file has an attachment, which holds the configuration.
+
+    `Recording` refuses a file without a configuration.
+    """
     return any(isinstance(place.record, Attachment) for place in walk(part.read_bytes()))
 
 
@@ -103,12 +106,12 @@ def _copy(recording: Recording, part: Path, whole: Path, cut: str) -> bool:
 
 
 def _finish_in_place(recording: Recording, part: Path, cut: str) -> bool:
-    """Write the end of the file after its last readable second, over the incomplete data there.
+    """Write the end of the file directly after its last readable data, over any incomplete data.
 
     Also replace each `GROWING_HEAD` by the true header of its chunk. Returns False if the disk has
-    no room; the file is then unchanged. No recorded second is removed to gain room, because on some
-    disks this does not gain any room. If a power cut interrupted an earlier recovery after it had
-    written the end, only the headers are written.
+    no room; the file is then unchanged. No readable data is removed to gain room, because some
+    disks do not gain room in this way. If an earlier recovery wrote the end before a power cut
+    interrupted it, only the headers are written.
     """
     builder = EndRecordBuilder(recording.about)
     for topic, wall_ns, data in recording.messages():
@@ -137,10 +140,10 @@ def _finish_in_place(recording: Recording, part: Path, cut: str) -> bool:
 
 
 def _writes(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], int]:
-    """Return the writes (offset and bytes) that finish a file, and its size after these writes.
+    """Return a pair: the writes that finish a file, and the size of the finished file in bytes.
 
-    `before` is the content of the file. The end of the file is the first write, because the disk
-    may have no room for it.
+    Each write is a pair (offset, data). `before` is the present content of the file. The first
+    write is the end of the file, because it is the only write for which the disk may have no room.
     """
     heads: list[tuple[int, bytes]] = []
     chunk, index = None, Index()
@@ -171,7 +174,7 @@ def _writes(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], in
 
 
 def _put(stream: FileIO, at: int, data: bytes) -> None:
-    """Write `data` at the offset `at` and sync it. If this fails, a part may be written."""
+    """Write `data` at the offset `at` and sync it. After an error, a part of it may be written."""
     stream.seek(at)
     while data:
         data = data[stream.write(data) :]
@@ -179,7 +182,7 @@ def _put(stream: FileIO, at: int, data: bytes) -> None:
 
 
 def _end(last: EndRecord, index: Index, at: int) -> bytes:
-    """Return the end of an MCAP file, to be written at the offset `at`.
+    """Return the bytes that end an MCAP file, which the caller writes at the offset `at`.
 
     The summary section does not repeat the schema and the channels, because the disk may be nearly
     full. It has the statistics, because some readers treat a file without statistics as empty.

@@ -1,6 +1,6 @@
 """Replays steps: runs `Robot.step` over the recorded inputs and compares the outputs.
 
-A robot's behaviour depends only on its inputs and its configuration. So the same code with the same
+A robot's behavior depends only on its inputs and its configuration. So the same code with the same
 configuration reproduces every line, mode and pose. With other code or another configuration, the
 differences show how the robot would have behaved.
 """
@@ -49,10 +49,10 @@ Output = Literal[
 ]
 """Name of an output whose recorded and replayed values are compared.
 
-`line` is the line that the robot decided to send, and `sent line` the line after the check by the
-guard. `event` is the name, level, kind or count of an event, and `client` the name of the client in
-an event. `input names` are compared by a checksum of the whole batch, so a difference is reported
-at the last step of the batch.
+`line` is the line that the robot decided to send, and `sent line` is the line after the check by
+the guard. `event` is any property of an event except its text and its client. `client` is the name
+of the client in an event. `input names` are compared by a checksum of the whole batch, so a
+difference is reported at the last step of the batch.
 """
 
 WORDING: frozenset[Output] = frozenset({"reason", "event text"})
@@ -72,7 +72,8 @@ class Difference(Struct, frozen=True):
 
 
 class Comparison(Struct):
-    """Result of a replay so far: the numbers of compared and of equal outputs, and differences."""
+    """Result of a replay so far: how many outputs were compared, how many are equal, and the first
+    differences."""
 
     steps: int = 0
     lines: int = 0
@@ -94,13 +95,13 @@ class Comparison(Struct):
     first_by_output: dict[Output, Difference] = {}
     """Maps each output that differs to the first step in which it differs."""
     fault: Difference | None = None
-    """First step in which only the replayed robot is in the mode `fault`."""
+    """First step in which the replayed robot, but not the recorded one, is in the mode `fault`."""
     apart: float = 0.0
     """Largest distance between the recorded and the replayed pose, m."""
     fastest: tuple[int, int] = (0, 0)
-    """Highest wheel speed in the recorded lines, and in the replayed lines, hundredths of rad/s."""
+    """Pair: the highest wheel speed in the recorded lines and in the replayed lines, 0.01 rad/s."""
     end: tuple[Micropose, Micropose] | None = None
-    """The last recorded pose, and the replayed pose at the same step; None before any pose."""
+    """Pair: the last recorded pose, and the replayed pose at that step; None before any pose."""
 
     @property
     def same(self) -> bool:
@@ -109,12 +110,12 @@ class Comparison(Struct):
 
     @property
     def only_words(self) -> bool:
-        """True if there are differences, but only in the words of reasons or events."""
+        """True if outputs differ, but only in the wording of reasons and event texts."""
         return not self.same and self.first_by_output.keys() <= WORDING
 
 
 def replay_step(robot: Robot, step: Step) -> Outputs:
-    """Run a recorded step on the robot, and return its outputs.
+    """Run `robot.step` with the inputs of a recorded step, and return the outputs.
 
     Also update the robot's counters of lines and commands, as the daemon's control loop did.
     """
@@ -153,7 +154,10 @@ class Replay:
         self._guard = Guard(robot.session.codec.stop, robot.config, memory)
 
     def step(self, step: Step) -> Difference | None:
-        """Replay a step. Return how its outputs differ from the recorded ones, or None if equal."""
+        """Replay a step, and return how its outputs differ from the recorded outputs.
+
+        Returns None if they are equal.
+        """
         if step.begins:
             self._checksum = self._names = 0
         outputs = self.outputs = replay_step(self.robot, step)
@@ -253,7 +257,7 @@ def _different_parts(
 
 @lru_cache(64)
 def fastest(line: bytes | None) -> int:
-    """Return the highest wheel speed in a line, hundredths of rad/s; 0 if there is no speed."""
+    """Return the highest wheel speed in a line, in hundredths of rad/s; 0 if `line` is None."""
     if line is None:
         return 0
     tokens = [line[start + 2 : start + 7].replace(b".", b"") for start in (0, 8, 16, 24)]

@@ -18,7 +18,7 @@ HUNDREDTHS = 100.0
 """Divisor that converts the wheel speeds in a line to rad/s."""
 
 LINE_SETTINGS = ("limits.", "drive.", "mcu.wheels.")
-"""Prefixes of the settings that affect the line to the board for a given command."""
+"""Prefixes of the settings that change the line which a given command leads to."""
 
 MAX_KEYS = 8
 """Largest number of changed settings that a line of text names."""
@@ -46,7 +46,7 @@ def _share(same: int, total: int) -> str:
 
 
 def explain_verdict(other: bool) -> str:
-    """Explain the figures of `verdict()`.
+    """Return a sentence that explains the figures of `verdict()`.
 
     `other` is true if the replay used another configuration than the recorded one.
     """
@@ -61,7 +61,7 @@ def explain_verdict(other: bool) -> str:
 
 
 def describe_gaps(gaps: Sequence[Gap], how: str) -> str:
-    """Describe how many seconds and steps are in the gaps, or return "" if there is no gap.
+    """Return a sentence with the number of seconds and steps in the gaps, or "" without a gap.
 
     The sentence begins with `how`, for example "not compared".
     """
@@ -85,7 +85,9 @@ def describe_gaps(gaps: Sequence[Gap], how: str) -> str:
 
 
 def describe_difference(difference: Difference, began_ns: int) -> list[str]:
-    """Return lines of text with the recorded and the replayed outputs of the first different step.
+    """Return lines of text with the recorded and the replayed outputs of a step.
+
+    The step is the first step whose recorded and replayed outputs differ.
 
     `began_ns` is the monotonic time at which the recording began, ns.
     """
@@ -120,7 +122,9 @@ def _event(event: Event) -> str:
 def explain_settings(
     recorded: Config, other: Config, comparison: Comparison, began_ns: int
 ) -> list[str]:
-    """Explain in lines of text why another configuration leads to other results.
+    """Return lines of text that relate the differences of a replay to the changed settings.
+
+    The replay used the configuration `other` instead of `recorded`.
 
     `began_ns` is the monotonic time at which the recording began, ns.
     """
@@ -143,7 +147,7 @@ def explain_settings(
     if fault is not None:
         seconds = (fault.at.mono_ns - began_ns) / 1e9
         rows.append(
-            f"the replayed robot is in the mode fault from {seconds:.3f} s after the beginning on: "
+            f"the replayed robot is in the mode fault from t = {seconds:.3f} s onward: "
             f"{printable(fault.replayed.status[1])}"
         )
         if first is not None and first.number < fault.number:
@@ -164,7 +168,7 @@ def _speeds(recorded: int, replayed: int) -> str:
 
 
 def describe_outcome(comparison: Comparison) -> list[str]:
-    """Describe in lines of text how the replayed robot moved, compared with the recorded one."""
+    """Return lines of text that compare the motion of the replayed and the recorded robot."""
     rows = [
         f"{comparison.lines - comparison.lines_same} of {comparison.lines} lines to the board "
         f"differ from the recorded ones, and {comparison.steps - comparison.modes_same} of "

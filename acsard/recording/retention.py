@@ -1,9 +1,10 @@
 """Decides which recordings are deleted, and which are retained because of an incident.
 
 A recording is protected if an incident, such as a fault, happened in it or within a minute of it.
-If less than `Disk.spare` is free, old unprotected recordings are deleted, but not the newest
-recording. Protected recordings and the newest recording are deleted only if less than a fifth of
-`Disk.spare` is free, or if the limit of the total size is exceeded.
+`Disk.spare` is the free space that recordings leave to other programs. If less than that is free,
+old unprotected recordings are deleted, but not the newest recording. Protected recordings and the
+newest recording are deleted only if less than a fifth of `Disk.spare` is free, or if the limit on
+the total size is exceeded.
 """
 
 from __future__ import annotations
@@ -22,34 +23,35 @@ Kind = Literal["plain", "near", "kept"]
 (`near`), or neither (`plain`)."""
 
 AROUND_NS = 60 * NS_PER_S
-"""Time before and after an incident within which recordings are retained, ns."""
+"""A recording is retained if it ended or began within this time of an incident, ns."""
 
 KEPT_FILES = 50
 """Largest number of `kept` recordings that are protected."""
 
 FILES = 100
-"""Divisor of the limit of the total size. The quotient is the limit of one file, so that 50
-protected files take about half of the total size."""
+"""The size limit of one file is the limit on the total size divided by this number. So 50 protected
+files take about half of the total size."""
 
 LEAST_BYTES = 100_000
-"""Size up to which a recording file may grow even if the disk is nearly full, bytes."""
+"""Size to which a recording file may always grow, even if the disk is nearly full, bytes."""
 
 SPARE = 0.05
-"""Fraction of the disk's size that the recordings leave to other programs. The reserve is at most
-`SPARE_BYTES`."""
+"""Fraction of the disk's size that the recordings leave to other programs. On a large disk they
+leave only `SPARE_BYTES`."""
 
 SPARE_BYTES = 1_000_000_000
-"""Largest reserve for other programs, bytes. Only a disk of less than 20 GB has a smaller one."""
+"""Largest space that the recordings leave to other programs, bytes. They leave less space only on a
+disk of less than 20 GB."""
 
 NEEDED = 0.2
 """If less than this fraction of `Disk.spare` is free, protected recordings are deleted too."""
 
 JUMP_NS = 60 * NS_PER_S
-"""Limit between a small correction and a jump of the wall clock, ns. It applies to the change of
-the offset from the monotonic clock between two calls of `ClockWatch.jump_ns()`."""
+"""Largest change of the wall clock that counts as a correction and not as a jump, ns. The change is
+measured against the monotonic clock, between two calls of `ClockWatch.jump_ns()`."""
 
 STEADY_NS = 600 * NS_PER_S
-"""Time without a jump after which the wall clock is trusted for the age of a recording, ns."""
+"""After this time without a jump, ns, the wall clock is trusted to tell the age of a recording."""
 
 
 class Disk(NamedTuple):
@@ -77,7 +79,7 @@ class Ended(NamedTuple):
     at_s: float
     """Wall-clock time at which the recording ended, s since 1970."""
     this_run: bool = False
-    """True if the recording ended in this run of the daemon. Then it never counts as too old."""
+    """True if the recording ended in this run of the daemon. It then never counts as too old."""
 
 
 class Bounds(NamedTuple):
@@ -93,7 +95,7 @@ class Bounds(NamedTuple):
 def share(bound: int, own: int, disk: Disk) -> int:
     """Return how large one recording file may become, bytes.
 
-    `bound` is the limit of the total size of all recordings, and `own` is their present total size.
+    `bound` is the limit on the total size of all recordings. `own` is their present total size.
     """
     return max(LEAST_BYTES, min(bound, own + disk.free - disk.spare) // FILES)
 
@@ -101,15 +103,15 @@ def share(bound: int, own: int, disk: Disk) -> int:
 def to_delete(
     ended: Sequence[Ended], bounds: Bounds, disk: Disk, freed: int | None = None
 ) -> set[str]:
-    """Return the names of the recordings to delete, so that one more file fits.
+    """Return the names of the recordings that must be deleted so that one more file fits.
 
     `ended` must be sorted by `Ended.number`. `freed` is None if the disk accepts data. Otherwise
     the disk refuses to write, although it may report free space. `freed` is then the number of
-    bytes that were already deleted without success:
+    bytes that were deleted since the disk began to refuse:
 
     - 0: delete at least one recording, even a protected one.
-    - less than `LEAST_BYTES`: delete one more recording, but not a protected one.
-    - at least `LEAST_BYTES`: the refusal is not a reason to delete a recording.
+    - below `LEAST_BYTES`: delete at least one more recording, but no protected one for this reason.
+    - `LEAST_BYTES` or more: the refusal is no longer a reason to delete a recording.
     """
     protected = _protected(ended)
     plain = [file for file in ended if file.name not in protected]
@@ -148,7 +150,7 @@ def _protected(ended: Sequence[Ended]) -> set[str]:
 
 
 def _groups(ended: Sequence[Ended]) -> Iterator[list[Ended]]:
-    """Yield the recordings that are not `plain`, in groups with consecutive numbers."""
+    """Yield groups of recordings that are not `plain`. The numbers in a group are consecutive."""
     group: list[Ended] = []
     for file in ended:
         if file.kind == "plain":
@@ -161,7 +163,7 @@ def _groups(ended: Sequence[Ended]) -> Iterator[list[Ended]]:
 
 
 class ClockWatch(Struct):
-    """Detects jumps of the wall clock. The clock is trusted `STEADY_NS` after the last jump."""
+    """Detects jumps of the wall clock, and trusts the clock again `STEADY_NS` after a jump."""
 
     _since_ns: int | None = None
     """Monotonic time of the last jump, or of the first call of `jump_ns()` if there was no jump,
@@ -170,7 +172,7 @@ class ClockWatch(Struct):
     """Offset of the wall clock from the monotonic clock at the last call of `jump_ns`, ns."""
 
     def jump_ns(self, now: Instant) -> int:
-        """Return how far the wall clock has jumped since the last call, ns; 0 without a jump."""
+        """Return by how much the wall clock jumped since the last call, ns; 0 without a jump."""
         ahead_ns = now.wall_ns - now.mono_ns
         jumped_ns = 0 if self._since_ns is None else ahead_ns - self._ahead_ns
         self._ahead_ns = ahead_ns
@@ -185,7 +187,10 @@ class ClockWatch(Struct):
 
 
 class IncidentWindow(Generic[File]):
-    """Finds the files within a minute of an incident. All times are ns of the monotonic clock."""
+    """Finds the files that an incident protects. All times are monotonic, in ns.
+
+    An incident protects the file in which it happens, and all files within a minute of it.
+    """
 
     def __init__(self) -> None:
         self.kind: Kind = "plain"

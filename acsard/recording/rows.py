@@ -1,10 +1,10 @@
 """Encodes steps as rows, in batches of about one second, and decodes them.
 
 A row is one step. Its times and poses are stored as differences from earlier times and poses.
-Similar steps therefore give equal bytes, which compress well. Each batch can be decoded alone. A
-file may come from a stranger, so `decode` refuses a batch with values that no daemon records.
+Similar steps therefore give equal bytes, which compress well. Each batch can be decoded without the
+other batches. A file may be forged, so `decode` refuses a batch with values that no daemon records.
 
-If you change one of these structs, change `FORMAT` as well.
+If you change a struct of this module, change `FORMAT` as well.
 """
 
 from __future__ import annotations
@@ -41,22 +41,22 @@ from acsard.recording.recorded_steps import (
 )
 
 FORMAT = "3"
-"""Format of the messages in a recording. A new number means a new encoding."""
+"""Version of the encoding of the messages in a recording."""
 
 MAX_ROWS = 4096
 """Largest number of rows in a batch. The recorder's queue never holds more steps."""
 
 MAX_TIME_NS = 1 << 61
-"""Limit on the age of a serial read and on `Rare.late_ns`, ns: 73 years.
+"""Largest accepted age of a serial read, and largest accepted `Rare.late_ns`, ns: 73 years.
 
-A monotonic time may be up to twice as large.
+The limit on a monotonic time is twice as large.
 """
 
 MAX_OFFSET_NS = 1 << 62
-"""Limit on the offset of the wall clock from the monotonic clock, ns. Clocks reach this limit in
-the year 2116.
+"""Limit on the offset of the wall clock from the monotonic clock, ns.
 
-The offset plus a monotonic time fits in 64 bits.
+Below this limit, the sum of the offset and a monotonic time fits in 64 bits. A clock with the right
+time reaches the limit in the year 2116.
 """
 
 
@@ -65,7 +65,7 @@ class BatchError(AcsardError):
 
 
 class Rare(Struct, frozen=True, omit_defaults=True):
-    """Values that most steps do not have.
+    """The inputs and outputs that are absent or unchanged in most steps.
 
     None in `opened`, `trouble` or `status` means that the value of the previous row still applies.
     """
@@ -106,7 +106,8 @@ class Row(Struct, frozen=True, array_like=True):
     shutting_down: bool
     superseded: bool
     now: int
-    """Time since the last earlier row with a `tick`; without such a row, since `Batch.mono_ns`."""
+    """Monotonic time of the step, minus that of the most recent earlier row with a `tick`. If no
+    earlier row of the batch has a `tick`, it is minus `Batch.mono_ns`."""
     offset: int
     """Offset of the wall clock from the monotonic clock, minus `Batch.offset_ns`."""
     reads: tuple[Read, ...]
@@ -114,8 +115,8 @@ class Row(Struct, frozen=True, array_like=True):
     sent: bytes | bool
     """True if `line` was sent, False if no line was sent, or the bytes that were sent instead."""
     poses: tuple[Micropose, ...]
-    """Poses in um and urad. Each is stored minus the previous pose of the batch, and the first pose
-    of the batch is stored as it is."""
+    """Poses in um and urad. Each pose is stored as its difference from the previous pose of the
+    batch. The first pose of the batch is stored unchanged."""
     rare: Rare | None
 
 
@@ -129,7 +130,8 @@ class Batch(Struct, frozen=True, array_like=True):
     offset_ns: int
     """Offset of the wall clock from the monotonic clock at the first step, ns."""
     unit: Annotated[int, Meta(ge=1)]
-    """Common divisor of all times, ns. It is at least 1000 if the clocks count in us."""
+    """Unit of the times in `rows`, ns: their greatest common divisor. It is at least 1000 if the
+    clocks count in us."""
     rows: Annotated[tuple[Row, ...], Meta(min_length=1, max_length=MAX_ROWS)]
     checksum: int
     """CRC-32 of all estimates (pose, twist and angles that the wheels rolled) of the batch."""
@@ -149,7 +151,7 @@ _decoder_of_first = msgspec.msgpack.Decoder(_First)
 
 
 def encode(first: int, taken: Sequence[Taken]) -> bytes:
-    """Encode 1 to `MAX_ROWS` steps; the first of them has the number `first`."""
+    """Encode 1 to `MAX_ROWS` successive steps, the first of which has the number `first`."""
     start = taken[0].inputs.now
     offset_ns = start.wall_ns - start.mono_ns
     times = list(_times(taken, start.mono_ns, offset_ns))
@@ -187,7 +189,11 @@ def encode(first: int, taken: Sequence[Taken]) -> bytes:
 
 
 def _times(taken: Sequence[Taken], mono_ns: int, offset_ns: int) -> Iterator[list[int]]:
-    """Yield the `now` and `offset` of each row, then the `age` and `offset` of its reads, in ns."""
+    """Yield a list of times, ns, for each row.
+
+    The list begins with the `now` and `offset` of the row. The `age` and `offset` of each of its
+    reads follow.
+    """
     tick_ns = mono_ns
     for inputs, _, _ in taken:
         now = inputs.now
@@ -227,7 +233,10 @@ def _rares(taken: Sequence[Taken]) -> Iterator[Rare]:
 
 
 def decode(data: bytes) -> list[Step]:
-    """Decode a batch; raise `BatchError` if it holds values that no daemon records."""
+    """Decode a batch of steps.
+
+    Raises `BatchError` if the bytes are damaged, or if they hold values that no daemon records.
+    """
     try:
         return list(_steps(_decoder.decode(data)))
     except (msgspec.DecodeError, ValueError) as error:
@@ -306,7 +315,10 @@ def _sent(row: Row) -> bytes | None:
 
 
 def _instant(batch: Batch, mono_ns: int, offset: int) -> Instant:
-    """Return the instant at `mono_ns`. Raises `ValueError` if a time is out of range."""
+    """Return the instant with the monotonic time `mono_ns`.
+
+    `offset` is a field of `Row` or `Read`. Raises `ValueError` if a time is out of range.
+    """
     ahead_ns = batch.offset_ns + offset * batch.unit
     if abs(mono_ns) >= 2 * MAX_TIME_NS or abs(ahead_ns) >= MAX_OFFSET_NS:
         raise ValueError("a time is out of range")
@@ -314,7 +326,10 @@ def _instant(batch: Batch, mono_ns: int, offset: int) -> Instant:
 
 
 def _require_finite(rare: Rare) -> None:
-    """Raise `ValueError` for a NaN or an infinity, except in commands, which the robot checks."""
+    """Raise `ValueError` if a number in requests or gyro samples is NaN or infinite.
+
+    The robot itself checks the numbers in commands.
+    """
     for request in rare.requests:
         pose = request.pose
         if pose is not None and not all(map(math.isfinite, (pose.x, pose.y, pose.yaw))):

@@ -1,8 +1,8 @@
-"""Finds the recordings of a range of time in a directory, and reads the files of a drive as one.
+"""Finds the recordings of a range of time, and reads successive files as one recording.
 
-The daemon splits the recording of one run into several files. The last step of a file and the first
-step of the next one have consecutive numbers. Such files are read as one `Series`, so that a drive
-or a replay goes on from file to file.
+The daemon splits the recording of one run into several files. The last step of one file and the
+first step of the next file have consecutive numbers. Such files are read as one `Series`, so that a
+drive or a replay goes on from file to file.
 """
 
 from __future__ import annotations
@@ -25,27 +25,34 @@ MARGIN_S = 60.0
 """Tolerance for the times in an end record, s.
 
 The end record gives the time at which the last message begins. If the disk is slow, this message
-may hold many seconds of steps. Therefore a file is also read if it lies outside the searched range
-by at most this time. Consecutive files of a series are also less than this time apart.
+may hold many seconds of steps. Therefore a file is also read if the times in its end record are
+outside the searched range, but by no more than `MARGIN_S`. In a series, the time from the last step
+of a file to the first step of the next file is also less than `MARGIN_S`.
 """
 
 GAP_S = 2.0
-"""Longest time between two recordings that is not reported as a gap, s."""
+"""Longest time without a recording, s, that the search does not report as a gap."""
 
 
 class Series(Recording):
-    """Several files of one run of the daemon, read as one. No step is missing between the files."""
+    """Successive files of one run of the daemon, read as one recording.
+
+    No step is missing between the files.
+    """
 
     def __init__(self, paths: Sequence[Path]) -> None:
-        """Read the first file; `messages()` reads all files. Raises the errors of `Recording`."""
+        """Read the first of the files; `messages()` reads all of them.
+
+        Raises `RecordingError` if the first file is not a recording that can be read.
+        """
         super().__init__(_present(paths[0]))
         self.paths = list(paths)
 
     def messages(self) -> Iterator[tuple[Topic, int, bytes]]:
-        """Yield the topic, wall-clock time (ns since 1970) and bytes of each message of all files.
+        """Yield the triple (topic, wall-clock time in ns since 1970, data) of each message.
 
-        `damaged` counts the damaged places of all files. `ended`, `cut`, `why` and `unfinished`
-        describe the last file.
+        The messages are those of all files. `damaged` counts the damaged places of all files.
+        `ended`, `cut`, `why` and `unfinished` describe the last file.
         """
         self.damaged, self.ended, self.cut, self.why = 0, False, "", ""
         self.unfinished = None
@@ -61,7 +68,7 @@ class Series(Recording):
 
 
 class Found(NamedTuple):
-    """A recording with steps in the searched range of time, and its `part` in that range."""
+    """A recording with steps in the searched range of time. `part` is its part in that range."""
 
     recording: Recording
     part: Span
@@ -85,7 +92,7 @@ class NothingRecordedError(AcsardError):
 
 
 class _Piece(NamedTuple):
-    """A range of time that a file covers, from `begin` to `end`, s since 1970."""
+    """A range of time, from `begin` to `end`, s since 1970, that the file `path` covers."""
 
     begin: float
     end: float
@@ -95,8 +102,9 @@ class _Piece(NamedTuple):
 def search(files: Sequence[Path], first: float, last: float) -> Search:
     """Find the recordings that have steps between the times `first` and `last`, s since 1970.
 
-    `files` are sorted, oldest first. If a found file begins during a drive, the files with the
-    earlier part of this drive are read too. Raises `NothingRecordedError` if no recording is found.
+    `files` are sorted, oldest first. If a file that is found begins during a drive, the result also
+    includes the files with the earlier part of this drive. Raises `NothingRecordedError` if no
+    recording is found.
     """
     result, pieces = Search(), list[_Piece]()
     chosen: dict[int, Contents] = {}
@@ -129,7 +137,10 @@ def search(files: Sequence[Path], first: float, last: float) -> Search:
 
 
 def _gaps(pieces: Sequence[_Piece], first: float, last: float) -> list[tuple[float, float]]:
-    """Return the ranges longer than `GAP_S` between `first` and `last` that no piece covers."""
+    """Return the ranges of time from `first` to `last` that no piece covers, s since 1970.
+
+    Ranges that are not longer than `GAP_S` are left out.
+    """
     inside = sorted(piece for piece in pieces if piece.begin <= last and first <= piece.end)
     ends = [first]
     for piece in inside:
@@ -140,7 +151,11 @@ def _gaps(pieces: Sequence[_Piece], first: float, last: float) -> list[tuple[flo
 
 
 def _groups(files: Sequence[Path], chosen: dict[int, Contents]) -> list[list[int]]:
-    """Return the indices of the chosen and the `_earlier()` files, grouped into series."""
+    """Group the chosen files into series, and return the indices in `files` of each series.
+
+    `chosen` maps the index of each chosen file to its contents. Each series begins with the files
+    that `_earlier()` finds.
+    """
     groups: list[list[int]] = []
     for number, contents in sorted(chosen.items()):
         if groups and number - 1 in chosen and _continues(chosen[number - 1], contents):
@@ -151,7 +166,11 @@ def _groups(files: Sequence[Path], chosen: dict[int, Contents]) -> list[list[int
 
 
 def _earlier(files: Sequence[Path], number: int, contents: Contents) -> list[int]:
-    """Return the indices of the earlier files of the drive during which file `number` begins."""
+    """Return the indices of the files with the earlier part of a drive, oldest first.
+
+    It is the drive during which the file with the index `number` begins. The list is empty if that
+    file does not begin during a drive.
+    """
     found: list[int] = []
     while number > 0 and contents.first.recorded.status[0] == "driving":
         number -= 1
@@ -167,21 +186,21 @@ def _earlier(files: Sequence[Path], number: int, contents: Contents) -> list[int
 
 
 def _continues(before: Contents, contents: Contents) -> bool:
-    """Return whether the steps of two files follow each other in one run of the daemon."""
+    """Return whether `contents` continues `before` without a missing step, in the same run."""
     follows = contents.first.number == before.last.number + 1
     mono_ns = contents.first.inputs.now.mono_ns - before.last.inputs.now.mono_ns
     return follows and 0 <= mono_ns < MARGIN_S * NS_PER_S
 
 
 def _covered(path: Path) -> _Piece:
-    """Return the range of time that a file covers. Without an end record, read the whole file."""
+    """Return the range of time that a file covers. If it has no end record, read the whole file."""
     end = read_end(path) or Recording(_present(path)).compute_end_record()
     earliest_ns = end.wall_ns if end.earliest_ns is None else end.earliest_ns
     return _Piece(min(earliest_ns, end.wall_ns) / NS_PER_S, end.last_ns / NS_PER_S, path)
 
 
 def _present(path: Path) -> Path:
-    """Return the present path of a recording, which the daemon may have renamed at its end."""
+    """Return the present path of a recording. The daemon renames the file when it is finished."""
     if path.exists() or not path.parent.is_dir():
         return path
     stem = path.name.partition(".")[0]
@@ -189,7 +208,7 @@ def _present(path: Path) -> Path:
 
 
 def _nearest(pieces: Sequence[_Piece], first: float, last: float) -> str:
-    """Return a sentence that says that nothing was recorded and names the nearest recordings."""
+    """Return a sentence that says that nothing was recorded, and names the nearest recordings."""
     before = max([p for p in pieces if p.end < first], key=lambda p: p.end, default=None)
     after = min([p for p in pieces if p.begin > last], key=lambda p: p.begin, default=None)
     text = f"nothing was recorded {in_words(first, last)}"
@@ -203,7 +222,10 @@ def _described(piece: _Piece) -> str:
 
 
 def in_words(first: float, last: float) -> str:
-    """Describe the range of time from `first` to `last`, s since 1970. Each may be infinite."""
+    """Return words for the range of time from `first` to `last`, s since 1970.
+
+    Both limits may be infinite.
+    """
     parts = [
         f"{word} {clock(at, day=True)}"
         for word, at in (("from", first), ("to", last))

@@ -1,7 +1,8 @@
 """Encodes a `Robot` between two steps, decodes it, and applies another configuration to it.
 
-Each file after the first one of a run of the daemon begins with an encoded robot. In every file,
-further encoded robots follow about every 20 s, so that a replay can go on after a damaged place.
+When a run of the daemon begins a second or later file, the file begins with an encoded robot. Every
+file contains further encoded robots, about one every 20 s, so that a replay can go on after a
+damaged place.
 
 `freeze` uses pickle, which takes a fraction of a millisecond. `thaw` uses `unpickling.py` instead,
 because a forged file could run code through pickle.
@@ -30,14 +31,14 @@ PART_MODULES = (
     "acsard.core.values", "acsard.core.robot", "acsard.core.guard", "acsard.core.config.settings",
     "acsard.core.motion.", "acsard.core.link.",
 )  # fmt: skip
-"""Modules, and packages (names that end with a dot), whose classes may be parts of a robot. The
-constructors of these classes have no side effects."""
+"""Names of modules and packages whose classes may be parts of a robot. The name of a package ends
+with a dot. The constructors of these classes have no side effects."""
 
 OTHER_PARTS: dict[tuple[str, str], type] = {
     ("collections", "Counter"): Counter,
     ("collections", "deque"): deque,
 }
-"""Maps (module, name) to each class of another module that may be a part of a robot."""
+"""Other classes that may be parts of a robot, each by the names of its module and of the class."""
 
 PROTOCOL = 5
 """Version of the pickle format that `unpickling.py` reads."""
@@ -56,11 +57,14 @@ refuses.
 
 
 class StateError(AcsardError):
-    """The bytes do not hold a robot, or this version cannot make that robot."""
+    """The bytes do not encode a robot, or this version cannot rebuild it from them."""
 
 
 class State(NamedTuple):
-    """A robot and the memory of its guard. With the inputs they determine all further outputs."""
+    """A robot and the memory of its guard.
+
+    Together with the further inputs, they determine all further outputs.
+    """
 
     robot: Robot
     memory: Memory
@@ -70,7 +74,7 @@ class Checkpoint(Struct, frozen=True, array_like=True):
     """A robot between two steps, as the channel `state` of a recording holds it."""
 
     number: Annotated[int, Meta(ge=0)]
-    """Number of the step that follows."""
+    """Number of the step that follows the saved state."""
     data: bytes
     """The robot and its guard's memory, encoded by `freeze`."""
 
@@ -126,10 +130,11 @@ def short(error: Exception) -> str:
 
 
 def part_class(module: str, name: str) -> type:
-    """Return the class `name` that the loaded module `module` defines as a part of a robot.
+    """Return the class `name` of the module `module` if it may be a part of a robot.
 
-    Raises `ValueError` for every other name, such as a function, a class that the module imports,
-    or an attribute of an attribute. This function imports nothing.
+    Raises `ValueError` if the module is not loaded, or if `name` is anything else: for example a
+    function, a class that the module imports, or an attribute of an attribute. This function
+    imports nothing.
     """
     if (module, name) in OTHER_PARTS:
         return OTHER_PARTS[module, name]
@@ -148,20 +153,21 @@ PLAIN = (bool, int, float, str, bytes, type(None))
 def adopt(robot: Robot, begun: Robot, other: Robot) -> None:
     """Apply another configuration to the recorded robot `robot`, in place.
 
-    The three robots are compared attribute by attribute. An attribute of `robot` that equals the
-    attribute of `begun` gets the value from `other`. An attribute that the recorded run has changed
-    keeps its value.
+    The three robots are compared attribute by attribute. If an attribute of `robot` still equals
+    that of `begun`, it gets the value from `other`. If the recorded run has changed the attribute,
+    it keeps its value.
 
     Args:
         robot: the recorded robot.
         begun: a new robot with the recorded configuration.
-        other: a new robot with the other configuration. `robot` may share parts with it afterwards.
+        other: a new robot with the other configuration. Afterwards `robot` may share parts with
+            `other`.
     """
     _Walk().into(robot, begun, other)
 
 
 class _Walk:
-    """Walks through the objects of the three robots of `adopt()`, and visits each object once."""
+    """Walks through the three robots of `adopt()`, and visits each of their objects once."""
 
     def __init__(self) -> None:
         self._visited: dict[int, Any] = {}
@@ -169,7 +175,10 @@ class _Walk:
         `id()` stays unique."""
 
     def into(self, now: Any, begun: Any, other: Any) -> None:
-        """Merge the attributes of the object `now` of the recorded robot in place."""
+        """Merge the attributes of three corresponding objects into `now`, in place.
+
+        `now` is a part of the recorded robot, and `begun` and `other` of the two new robots.
+        """
         if id(now) in self._visited:
             return
         self._visited[id(now)] = now
@@ -186,7 +195,10 @@ class _Walk:
                 setattr(now, name, merged)
 
     def merged(self, now: Any, begun: Any, other: Any) -> Any:
-        """Return the merged value: `now`, perhaps with changed parts, or `other`."""
+        """Return the merged value of an attribute, given its value in each of the three robots.
+
+        The result is `now`, perhaps with changed parts, or `other`.
+        """
         if type(now) is not type(other):
             return other if _same(now, begun) else now
         match now:
@@ -214,7 +226,7 @@ def _same(now: Any, begun: Any) -> bool:
 
 
 def _names(item: object) -> list[str]:
-    """Return the names of the attributes that are stored in the object, not in its class."""
+    """Return the names of the attributes that the object itself stores, without its class's."""
     slots = [name for kind in type(item).__mro__ for name in getattr(kind, "__slots__", ())]
     names = [*getattr(item, "__dict__", ()), *slots]
     return [name for name in names if hasattr(item, name)]

@@ -34,14 +34,15 @@ RETRY_ROUNDS = 5
 There is about one call each second."""
 
 BATCH = 256
-"""Largest number of steps in one message. A second has fewer steps, unless many commands arrive."""
+"""Largest number of steps in one message. There are fewer steps in a second, unless many commands
+arrive."""
 
 CHECKPOINT_NS = 18 * NS_PER_S + NS_PER_S // 2
 """Time from one checkpoint (the robot's state in a file) to the request for the next one, ns.
 
-After damage to a chunk, a replay lacks at most 20 s. A checkpoint takes 0.6 ms of the control
-loop's step, after the loop has written its line. A checkpoint has 6 kB at rest and 13 kB while the
-robot drives.
+After damage to a chunk, a replay lacks at most 20 s. The control loop needs 0.6 ms for a
+checkpoint, after it has written its line. A checkpoint has 6 kB while the robot stands and 13 kB
+while it drives.
 """
 
 MAX_FILE_NS = 3600 * NS_PER_S
@@ -50,7 +51,7 @@ INCIDENTS = frozenset({
     "fault", "stop", "emergency_stop", "bumper_pressed", "battery_stop", "link_down", "link_stale",
     "port_lost",
 })  # fmt: skip
-"""Names of the events that count as an incident, so that all files within a minute are retained."""
+"""Names of the events that count as incidents. All files within a minute of one are retained."""
 
 
 class Bug(NamedTuple):
@@ -74,7 +75,7 @@ class StepWriter:
         request_state: Callable[[], None],
         started_ns: int,
     ) -> None:
-        """Prepare the first file; nothing is opened before the first call of `write`.
+        """Start without an open file: the first call of `write` opens one.
 
         Args:
             config: the configuration at the daemon's start.
@@ -85,7 +86,7 @@ class StepWriter:
         self._started_ns = started_ns
         self.where = config.record.directory
         self.trouble = ""
-        """The error of the disk, in words for the user; "" if the disk accepts data."""
+        """The present error of the disk, in words for the user; "" if the disk accepts data."""
         self.lost = 0
         """Number of steps that were not written because of errors of the disk."""
         self.syncs = 0
@@ -93,7 +94,7 @@ class StepWriter:
         self._lost_before = 0
         """Value of `lost` before the present trouble began."""
         self._safe_ns: int | None = None
-        """Monotonic time of the last step that a sync has brought to the disk, ns; None before a
+        """Monotonic time of the last step that is synced to the disk, ns; None before the first
         sync."""
         self._config, self._report, self._request_state = config, report, request_state
         self._ring: Ring | None = None
@@ -104,7 +105,7 @@ class StepWriter:
         self._number = self._began_ns = self._state_ns = 0
         self._last = Instant(0, 0)
         self._reported = False
-        """True once the log says that the recording works."""
+        """True once the log has an event that says that the daemon records."""
         self._refused = False
         """True if the last write failed because the disk was full."""
         self._looked_back = False
@@ -112,20 +113,23 @@ class StepWriter:
         self._cut_ns: int | None = None
         """Time at which a crash cut off the previous run's file, ns since 1970.
 
-        None if there was no crash, and as soon as this run has begun a file.
+        It is None if there was no crash, and it becomes None when this run begins a file.
         """
         self.bug: Bug | None = None
         """The failure that ends the daemon; only the last call of `write` reads it."""
         self._pause = 0
         self._handed = self._safe = 0
-        """`_handed` counts the steps of this call of `write` that were written or are lost.
+        """`_handed` is the number of steps that this call of `write` has written or lost so far.
 
-        `_safe` counts those of them that are synced or lost. If the disk refuses to write, the
-        steps that are not safe are lost.
+        `_safe` is the number of these steps that are already synced or lost. If the disk refuses to
+        write, all other steps of this call are lost.
         """
 
     def write(self, items: list[Taken | Start], over: bool) -> None:
-        """Write the items, or count their steps as lost. `over` is true for the last call."""
+        """Write the items, or count their steps as lost if the disk refuses to write.
+
+        `over` is true for the last call, which also finishes the file.
+        """
         self._handed = self._safe = 0
         try:
             if self._pause == 0 or over:
@@ -181,7 +185,10 @@ class StepWriter:
             self._add(ring, self._writing, steps[at : at + BATCH])
 
     def _goes_on(self, ring: Ring, start: Start) -> bool:
-        """Return whether the current file can go on with the first step after `start`."""
+        """Return whether the steps after `start` may follow in the current file.
+
+        They may not if steps are missing before `start`, or if the file is long enough.
+        """
         return start.number == self._number and not self._is_long_enough(ring)
 
     def _is_long_enough(self, ring: Ring) -> bool:
@@ -244,7 +251,7 @@ class StepWriter:
             ring.retain(path)
 
     def _write_bug(self, ring: Ring, bug: Bug) -> None:
-        """Write the inputs of the step that failed, and retain the file as after a crash."""
+        """Write the inputs of the step that failed, and register an incident to retain the file."""
         if bug.at is not None and self._writing is None and self._start is not None:
             self._begin(ring, self._start, bug.at)
         if self._writing is None:
@@ -276,7 +283,7 @@ class StepWriter:
                 at_most = f", at most {(self._began_ns - self._safe_ns) / NS_PER_S:.1f} s"
             else:
                 at_most = ""
-            # The disk also refused the event with the reason, so repeat the reason here.
+            # The disk also refused the event that gave the reason, so repeat the reason here.
             since = (
                 f" again; {missing} missing{at_most} (the error was: {self.trouble})"
                 if self.trouble

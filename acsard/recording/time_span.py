@@ -1,7 +1,7 @@
-"""Reads times that a person types, and finds the part of a recording between two such times.
+"""Parses times that a person types, and finds the part of a recording between two such times.
 
-A recording may cross midnight, and the wall clock may be set during the recording. A time is
-therefore looked up in every `Stretch` (a part of the recording in which the clock was not set).
+A recording may cross midnight, and the wall clock may be set during the recording. Therefore a time
+is searched in every `Stretch`, a part of the recording during which the clock was not set.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from acsard.recording.timeline import SET_NS
 
 
 class Span(NamedTuple):
-    """A part of a recording, limited by monotonic times in s after the recording began."""
+    """A part of a recording. Its limits are monotonic times, s after the recording began."""
 
     begin: float = -math.inf
     end: float = math.inf
@@ -30,7 +30,7 @@ WHOLE = Span()
 
 
 class Offset(NamedTuple):
-    """A time in seconds after the beginning of a recording."""
+    """A time that a person typed as a number of seconds after the beginning of a recording."""
 
     seconds: float
 
@@ -47,7 +47,7 @@ MIDNIGHT = TimeOfDay(0, 0, 0.0)
 
 
 class Moment(NamedTuple):
-    """A moment (`begin` equals `end`) or a whole day. Times are s since 1970."""
+    """A moment or a whole day, in s since 1970. For a moment, `begin` equals `end`."""
 
     begin: float
     end: float
@@ -57,7 +57,7 @@ When = Offset | TimeOfDay | Moment
 """A time that a person typed."""
 
 TIMES = '14:05, 14:05:30, today, "yesterday 14:05", "2026-11-21 14:05", 2026-11-21 or "2 h ago"'
-"""Examples of a time that may be in any recording."""
+"""Examples of times that do not refer to one particular recording."""
 
 EXAMPLES = f"{TIMES}; for one recording also a number of seconds after its beginning"
 
@@ -107,7 +107,7 @@ def _time_of_day(words: str, text: str) -> TimeOfDay:
 
 
 def _date(words: str, text: str, now_s: float) -> tuple[int, int, int]:
-    """Return the year, month and day that `words` mean. For "yesterday" the day may be 0."""
+    """Return the triple (year, month, day) that `words` mean. For "yesterday" the day may be 0."""
     if words in _DAYS_AGO:
         today = time.localtime(now_s)
         return today.tm_year, today.tm_mon, today.tm_mday - _DAYS_AGO[words]
@@ -123,9 +123,9 @@ def _date(words: str, text: str, now_s: float) -> tuple[int, int, int]:
 
 
 def _moment(date: tuple[int, int, int], when: TimeOfDay = MIDNIGHT, days: int = 0) -> float:
-    """Return the local time `when`, `days` days after a date, in s since 1970.
+    """Return a local time in s since 1970: the time of day `when`, `days` days after `date`.
 
-    The day of the month may be out of range.
+    The day of the month in `date` may be out of range, for example 0.
     """
     year, month, day = date
     whole = (year, month, day + days, when.hours, when.minutes, 0, 0, 0, -1)
@@ -137,13 +137,13 @@ def _unknown(text: str) -> TimeError:
 
 
 def resolve(begin: When | None, end: When | None, now_s: float) -> tuple[float, float]:
-    """Return the range of time that `begin` and `end` mean, s since 1970. A limit may be infinite.
+    """Return the pair of limits, s since 1970, that `begin` and `end` mean.
 
-    - None, or an `Offset`, does not limit the range on its side.
-    - A time of day in `begin` means its last occurrence before `end` if `end` is a `Moment`.
-      Otherwise it means the last occurrence before the present time `now_s`, s since 1970.
-    - A time of day in `end` means its first occurrence after `begin` if `begin` limits the range.
-      Otherwise it means the last occurrence before `now_s`.
+    - If `begin` or `end` is None or an `Offset`, the range is unlimited (infinite) on that side.
+    - If `begin` is a time of day, it means the last occurrence of this time before `end` if `end`
+      is a `Moment`, and otherwise before the present time `now_s`, s since 1970.
+    - If `end` is a time of day, it means the first occurrence of this time after `begin` if `begin`
+      limits the range, and otherwise the last occurrence before `now_s`.
 
     Raises `TimeError` if the range ends before it begins.
     """
@@ -171,7 +171,10 @@ def _last_occurrence(when: TimeOfDay, before_s: float) -> float:
 
 
 def clock(seconds: float, day: bool = False) -> str:
-    """Format `seconds`, s since 1970, as local time: with the date if `day`, otherwise with ms."""
+    """Format a time in s since 1970 as local time.
+
+    The text contains the date if `day` is true. Otherwise it contains milliseconds.
+    """
     local = time.localtime(seconds)
     if day:
         return time.strftime("%Y-%m-%d %H:%M:%S", local)
@@ -184,7 +187,7 @@ def date(seconds: float) -> str:
 
 
 class Stretch(NamedTuple):
-    """A part of the recording in which the wall clock was not set."""
+    """A part of a recording during which the wall clock was not set."""
 
     at: float
     """Start of the stretch, s after the beginning of the recording."""
@@ -195,7 +198,10 @@ class Stretch(NamedTuple):
 
 
 def span(recording: Recording, begin: When | None, end: When | None) -> Span:
-    """Return the part of a recording from `begin` to `end`. None means no limit on that side."""
+    """Return the part of a recording from `begin` to `end`.
+
+    If `begin` or `end` is None, the part is not limited on that side.
+    """
     by_clock = any(isinstance(when, TimeOfDay | Moment) for when in (begin, end))
     found = stretches(recording) if by_clock else []
     first = None if begin is None else _seconds(begin, found, end=False)
@@ -224,7 +230,7 @@ def _seconds(when: When, found: list[Stretch], end: bool) -> float:
 def part_between(found: list[Stretch], first: float, last: float) -> Span | None:
     """Return the part of a recording between the times `first` and `last`, s since 1970.
 
-    Returns None if no stretch of the recording overlaps that range.
+    `found` are the stretches of the recording. Returns None if none of them overlaps that range.
     """
     inside = [one for one in found if one.begin <= last and first <= one.end]
     if not inside:
@@ -238,13 +244,13 @@ def part_between(found: list[Stretch], first: float, last: float) -> Span | None
 
 
 def _on(near: float, day: int, when: TimeOfDay) -> float:
-    """Return a time of day, s since 1970, `day` days after the date of `near`."""
+    """Return the time of day `when`, `day` days after the date of `near`. Both are s since 1970."""
     date = time.localtime(near)
     return _moment((date.tm_year, date.tm_mon, date.tm_mday), when, day)
 
 
 class Contents(NamedTuple):
-    """The times of a recording, and its first and last step."""
+    """The stretches of a recording, and its first and last readable step."""
 
     stretches: list[Stretch]
     first: Step
@@ -258,7 +264,7 @@ def stretches(recording: Recording) -> list[Stretch]:
 
 
 def read_contents(recording: Recording) -> Contents | None:
-    """Read the times of a recording; return None if no step can be read."""
+    """Read the contents of a recording. Returns None if no step can be read."""
     found: list[Stretch] = []
     first: Step | None = None
     last_ns, before = 0, b""

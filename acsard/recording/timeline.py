@@ -1,8 +1,8 @@
 """Describes a recording as a timeline of short texts.
 
-The timeline has an entry for each event of the log. It has further entries, for example an entry
-for each drive (a period in the mode `driving`). `acsard recording show` and `acsard recording
-report` show the same entries, and an export has them in the channel `log`.
+The timeline has an entry for each event of the log, and further entries. For example, each drive (a
+period in the mode `driving`) has an entry. `acsard recording show` and `acsard recording report`
+show the same entries, and an export writes them to the channel `log`.
 """
 
 from __future__ import annotations
@@ -26,37 +26,39 @@ from acsard.core.values import NS_PER_S, Command, Event, Instant
 from acsard.recording.recorded_steps import MICRO, Step
 
 FURTHEST_S = 2**63 / 1e9
-"""Largest distance of an entry's time from 1970, s. It is 292 years, because a time in ns must fit
-in 64 bits."""
+"""Largest distance between an entry's time and 1970, s. It is 292 years, because a time in ns must
+fit in 64 bits."""
 
 
 REASON_NS = NS_PER_S
 """Shortest time between two entries with the same name `reason`, `waits` or `board`, ns.
 
-Otherwise two sources that alternate in every step would fill the timeline.
+Without this limit, two sources that alternate in every step would fill the timeline.
 """
 
 POSE_NS = NS_PER_S
-"""Longest time for which the entry `continues` is delayed until a pose is known, ns. Without a link
-there is no pose."""
+"""Longest time for which the entry `continues` waits for the first pose, ns. Without a link to the
+board there is no pose."""
 
 SET_NS = 5 * NS_PER_S
-"""Smallest change of the wall clock against the monotonic clock that gives an entry `clock`, ns."""
+"""Smallest change of the wall clock that gives an entry `clock`, ns. The change is measured against
+the monotonic clock."""
 
 WAITS_NS = NS_PER_S
-"""Time for which a sender sends speeds without effect before the timeline mentions it, ns.
+"""Time for which a sender must send speeds without effect before it gets an entry `waits`, ns.
 
-When an operator changes from one sender to another, both senders may send, but for less time.
+When an operator changes from one sender to another, both may send for a shorter time.
 """
 
 SILENT_NS = NS_PER_S
-"""Pause of a waiting sender, ns, after which its waiting time restarts at 0."""
+"""If a waiting sender sends nothing for longer than this, ns, its waiting time restarts at 0."""
 
 MAX_IDENTITY_BYTES = 256
-"""Largest line with which a microcontroller names itself, bytes. The firmware's line has 150."""
+"""Largest length, bytes, of the line with which a microcontroller names itself. The reference
+firmware's line has 150 bytes."""
 
 MAX_WAITING = 16
-"""Largest number of waiting senders that are watched. A stranger may send under many names."""
+"""Largest number of waiting senders that are watched. A hostile client may use many names."""
 
 NUMBER = re.compile(r"\b\d+(\.\d+)?\b")
 """Matches a number, but not a digit in a name. Reasons that differ only in numbers count as
@@ -74,7 +76,7 @@ class TimelineEntry(Struct, frozen=True, omit_defaults=True):
     - `start`: the daemon starts.
     - `continues`: the recording continues an earlier one.
     - `drive`: a drive has ended, or is under way as the recording ends.
-    - `link_late`: an event `link_stale` that this computer caused.
+    - `link_late`: an event `link_stale` that a delay of the daemon's computer caused.
     - `link_heard`: a further event about a link that is already lost.
     - `reason`: the reason of the robot's mode has changed, but the mode has not.
     - `waits`: a sender must wait while another one drives.
@@ -99,7 +101,7 @@ class TimelineEntry(Struct, frozen=True, omit_defaults=True):
 
 
 def entry_of(event: Event, wall_ns: int) -> TimelineEntry:
-    """Return the entry of an event that happened at `wall_ns`, wall-clock ns since 1970."""
+    """Return the entry of an event. `wall_ns` is its wall-clock time, ns since 1970."""
     late = event.name == "link_stale" and is_ours(event.text)
     name = "link_late" if late else event.name
     return TimelineEntry(wall_ns / 1e9, name, event.text, event.level, event.by, event.count)
@@ -110,7 +112,7 @@ class LinkLosses:
 
     def __init__(self) -> None:
         self._names: set[str] = set()
-        """Names of the events about a lost link since the link was last up."""
+        """Names of the events that have reported a lost link since the link was last up."""
 
     def repeated(self, name: str) -> bool:
         """Register an event. Return whether it repeats an event about the same loss of the link."""
@@ -124,21 +126,26 @@ class LinkLosses:
 
 
 class ReasonChanges:
-    """Detects a new reason for an unchanged mode, unless an event reports this reason."""
+    """Detects when the reason of the robot's mode changes, although the mode does not.
+
+    A reason that an event reports is ignored.
+    """
 
     def __init__(self) -> None:
         self._mode = self._reason = ""
         """The last mode and reason that the timeline shows. The reason has `#` for each number."""
         self._reported_ns = -REASON_NS
-        """Monotonic time of the last entry or of the last report of the mode `waiting`, ns."""
+        """Monotonic time of the last entry, or of the last event that reported the mode `waiting`,
+        whichever is later, ns."""
         self._sender = ("", "")
-        """Source and sender of the last command that came from the source that the robot
-        followed."""
+        """Pair: the source that the robot followed when its last command arrived, and the sender of
+        that command."""
 
     def step(self, step: Step) -> Iterator[TimelineEntry]:
-        """Yield an entry if the reason has changed, the mode has not, and no event has the reason.
+        """Yield an entry if the reason has changed, but the mode has not.
 
-        There is no entry while the robot drives, and at most one entry each second.
+        There is no entry if an event reports the reason, and none while the robot drives. There is
+        at most one entry each second.
         """
         mode, text, _, source = step.recorded.status
         now, reason = step.inputs.now, NUMBER.sub("#", text)
@@ -166,9 +173,9 @@ _IDENTITY = re.compile(re.escape(IDENTITY) + rb"([^\r\n]*)[\r\n]")
 class BoardIdentity:
     """Detects the line with which a microcontroller names itself.
 
-    The board sends this line after its start, and when asked. The robot reports the line as an
-    event only if the link was up. After a slow restart only this line explains why the board was
-    silent.
+    The board sends this line after its start, and when the daemon asks for it. The robot reports
+    the line as an event only if the link was up. If a restart takes so long that the link is lost,
+    only this line shows that a restart was the reason.
     """
 
     def __init__(self) -> None:
@@ -177,7 +184,7 @@ class BoardIdentity:
         self._reported_ns = -REASON_NS
 
     def step(self, step: Step) -> Iterator[TimelineEntry]:
-        """Yield an entry if the board's line has arrived, at most one each second."""
+        """Yield an entry if the board has named itself, but at most one entry each second."""
         now = step.inputs.now
         for read in step.inputs.received:
             data = self._data + read.data
@@ -219,12 +226,12 @@ class WaitingSenders:
     def __init__(self, priorities: Mapping[str, int]) -> None:
         self._priorities = priorities
         self._commander = ""
-        """Source and sender that the robot follows, as in the event `commander`."""
+        """The sender that the robot follows: text "source (sender)" from the event `commander`."""
         self._waiting: dict[tuple[str, str], _Waiting] = {}
         self._reported_ns = -REASON_NS
 
     def step(self, step: Step) -> Iterator[TimelineEntry]:
-        """Yield one entry for each wait of a sender, once the wait has lasted for `WAITS_NS`."""
+        """Yield an entry for each sender that has just waited for `WAITS_NS`."""
         for event in step.recorded.events:
             if event.name == "commander":
                 # If the log combined several changes, `by` contains several names.
@@ -259,7 +266,7 @@ class WaitingSenders:
         yield TimelineEntry(now.wall_ns / 1e9, "waits", text, by=_named(*key))
 
     def _has_room(self, now: Instant) -> bool:
-        """Forget the senders that are silent, and return whether one more can be watched."""
+        """Return whether one more sender can be watched. If not, first forget silent senders."""
         if len(self._waiting) >= MAX_WAITING:
             oldest_ns = now.mono_ns - SILENT_NS
             kept = {key: one for key, one in self._waiting.items() if one.last_ns >= oldest_ns}
@@ -267,14 +274,14 @@ class WaitingSenders:
         return len(self._waiting) < MAX_WAITING
 
     def _known(self, source: str) -> bool:
-        """Return whether the sender that the robot follows on this source is known."""
+        """Return whether it is known which sender of this source the robot follows."""
         return self._commander.startswith(f"{source} (") and ", " not in self._commander
 
     def _why(self, waiting: str, followed: str) -> str:
-        """Return why the robot follows the source `followed` and not `waiting`, or "" if unknown.
+        """Return why the robot follows the source `followed` and not `waiting`; "" if unknown.
 
-        Also return "" if `waiting` has the higher priority: the robot then refuses its commands, so
-        that the source does not wait.
+        The result is also "" if `waiting` has the higher priority. Such a source does not wait: the
+        robot follows another one because it refuses the commands of `waiting`.
         """
         one, other = self._priorities.get(waiting), self._priorities.get(followed)
         if one is None or other is None or one > other:
@@ -290,7 +297,7 @@ class TimelineWriter:
     """Makes the timeline of a recording from its steps."""
 
     def __init__(self, config: Config | None = None) -> None:
-        """Prepare for the first step. Without `config` there are no `waits` entries."""
+        """Prepare for the first step. If `config` is None, there are no entries `waits`."""
         sources = config.commands.sources if config is not None else ()
         self._number: int | None = None
         self._pose: tuple[int, int, int] | None = None
@@ -300,8 +307,8 @@ class TimelineWriter:
         self._sources: list[str] = []
         """The sources that commanded the present drive, in the order in which they began."""
         self._since = ""
-        """Words that are added to the entry of a drive that began before this recording; "" for
-        others."""
+        """The end of the text of the present drive's entry: a note if the drive began before this
+        recording, otherwise ""."""
         self._now: Instant | None = None
         self._shutting_down = False
         self._continued: Step | None = None
@@ -323,7 +330,7 @@ class TimelineWriter:
         yield from entries
 
     def _continues(self) -> Iterator[TimelineEntry]:
-        """Yield the entry that says what the robot does as the recording begins."""
+        """Yield the entry `continues`, which says what the robot does as the recording begins."""
         first, self._continued = self._continued, None
         if first is None:
             return
@@ -334,7 +341,7 @@ class TimelineWriter:
             x, y, yaw = [value / MICRO for value in self._pose]
             at = f"at x {x:.2f} m, y {y:.2f} m, yaw {math.degrees(yaw):.1f} deg"
         text = (
-            "this recording continues an earlier one; at its beginning the robot is: "
+            "this recording continues an earlier one; when this one begins, the robot is: "
             f"{does}, link {link}, {at}"
         )
         yield TimelineEntry(first.inputs.now.wall_ns / 1e9, "continues", text, by=source)
@@ -347,7 +354,8 @@ class TimelineWriter:
             missing = step.number - self._number - 1
             seconds = (step.inputs.now.mono_ns - self._now.mono_ns) / 1e9
             gap = (
-                f"{many(missing, 'step is', 'steps are')} missing before this step: {seconds:.1f} s"
+                f"{many(missing, 'step is', 'steps are')} missing before this step "
+                f"({seconds:.1f} s)"
             )
             yield TimelineEntry(wall_s, "gap", gap, "warning")
         yield from self._clock(step.inputs.now)
@@ -365,7 +373,7 @@ class TimelineWriter:
         self._shutting_down = step.inputs.shutting_down
 
     def _clock(self, now: Instant) -> Iterator[TimelineEntry]:
-        """Yield an entry if the wall clock was set since the last step."""
+        """Yield an entry `clock` if the wall clock was set since the last step."""
         last = self._now
         if last is None:
             return
@@ -403,10 +411,10 @@ class TimelineWriter:
             self._began_ns = None
 
     def end(self, ending: str = "") -> Iterator[TimelineEntry]:
-        """Yield the entries after the last step.
+        """Yield the entries that follow the last step.
 
-        These are the entry of an unfinished drive, and an entry `cut` with the text `ending` unless
-        `ending` is "".
+        There is an entry `drive` if the robot still drives, and an entry `cut` unless `ending` is
+        "". `ending` says how the recording was cut off.
         """
         yield from self._continues()
         if self._now is None:
@@ -438,8 +446,8 @@ INCIDENT_WORDS = {
     "wheel_fault": "wheel fault",
     "link_up": "",
 }
-"""Words for the events in a summary. `link_up` has no word, because it only separates losses of the
-link."""
+"""Words for the events that a summary counts, by the event's name. The event `link_up` is not
+counted: it only shows where one loss of the link ends."""
 
 
 SERIOUS = re.compile(r"(^|, )\d+ (emergency stop|bumper hit|battery stop|stop|fault)s?\b")
@@ -453,9 +461,10 @@ def is_serious(text: str) -> bool:
 
 
 def summary(events: Iterable[TimelineEntry], starts: bool = False) -> str:
-    """Count the incidents of a recording in words, and name the clients that stopped the robot.
+    """Return a text that counts the incidents of a recording.
 
-    If `starts` is true, the recording includes the daemon's start.
+    The text also names the clients that stopped the robot. `starts` is true if the recording
+    includes the daemon's start; the text then begins with "start".
     """
     counts: Counter[str] = Counter()
     stopped: list[str] = []

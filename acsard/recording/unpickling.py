@@ -1,8 +1,8 @@
-"""Rebuilds a pickled `Robot`, and nothing else, even if a stranger wrote the bytes.
+"""Rebuilds a pickled `Robot` safely, even if an attacker forged the bytes.
 
-Python's own unpickler obeys its bytes: it calls functions, imports modules, changes classes, and
-nests objects without limit. This reader knows only the opcodes that a pickled robot consists of. It
-calls only constructors of plain data, and checks each part when it makes the part:
+Python's own unpickler does whatever the bytes say: it calls functions, imports modules, changes
+classes, and nests objects without limit. This reader knows only the opcodes that a pickled robot
+consists of. It calls only constructors of plain data, and checks each part when it makes the part:
 
     a number, text, bytes    a number has at most 128 bits
     a list, a tuple ...      depth and size are limited; a part that occurs twice counts twice
@@ -10,10 +10,10 @@ calls only constructors of plain data, and checks each part when it makes the pa
     any other object         made without its constructor, then given attributes; no attribute
                              hides an attribute of the class
 
-A list of allowed classes in `Unpickler.find_class` is not enough. With only the classes that
-`state.py` allows, forged bytes took more than 3 s of processor time (nested tuples as keys, keys
-with equal hashes, copies of one dict), allocated more than 2 GB, or changed the class of the robot
-for the whole process.
+A list of allowed classes in `Unpickler.find_class` is not enough. Even when only the classes of
+`state.py` were allowed, forged bytes took more than 3 s of processor time (nested tuples as keys,
+keys with equal hashes, copies of one dict), allocated more than 2 GB, or changed the class of the
+robot for the whole process.
 
 Once the bytes refer to an earlier part, that part cannot grow any more. Therefore no part contains
 itself, and the depth and the size of every part are exact.
@@ -31,7 +31,8 @@ import msgspec
 from msgspec import Struct
 
 MAX_BYTES = 1 << 20
-"""Largest size of a pickled robot, bytes. A robot has 12 000 to 40 000, more with many senders."""
+"""Largest size of a pickled robot, bytes. A robot usually has 12 000 to 40 000 bytes. With many
+senders it has more."""
 
 MAX_OPCODES = 1 << 17
 
@@ -39,13 +40,13 @@ MAX_PARTS = 1 << 19
 """Largest number of values in a robot. A value that occurs several times counts each time."""
 
 MAX_COPIED = 4 * MAX_PARTS
-"""Largest number of values that constructors and attributes copy. Otherwise a few bytes could copy
-a part again and again."""
+"""Largest number of values that constructors and settings of attributes may copy in total. Without
+this limit, a few bytes could copy a large part again and again."""
 
 MAX_KEY = 2**61 - 1
-"""Bound on the absolute value of an integer that is used as a key.
+"""The absolute value of an integer that is used as a key must be below this bound.
 
-Below this bound every integer except -1 is its own hash, so that forged keys cannot collide.
+Below it, every integer except -1 is its own hash, so that forged keys cannot collide.
 """
 
 MAX_DEPTH = 50
@@ -80,12 +81,12 @@ TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 values."""
 
 SIMPLE = (str, int, float, bool, bytes, type(None))
-"""Types of dict keys and set elements. A tuple of such values is allowed too, and so is a member of
-an Enum."""
+"""Allowed types of dict keys and set elements. Members of an Enum, and short tuples of all these
+values, are allowed too."""
 
 
 def unpickle(data: bytes, find: FindClass) -> object:
-    """Return the object that the bytes describe; `find` looks up the classes.
+    """Return the object that the bytes describe. `find` returns the class with a given name.
 
     Raises `ValueError` if the bytes are damaged or contain anything that a robot never contains.
     """
@@ -122,10 +123,10 @@ class _Entry:
         self.depth = 0
         self.size = 1
         self.closed = False
-        """True once an opcode has referred to the value. Then it cannot grow any more."""
+        """True once an opcode has fetched the value from the memo. It then cannot grow any more."""
 
     def holds(self, parts: Sequence[_Entry]) -> None:
-        """Add the depth and the size of new parts to this value.
+        """Update the depth and the size of this value for `parts`, which it is about to contain.
 
         Raises `ValueError` if a limit is exceeded, or if the value is closed.
         """
@@ -174,7 +175,7 @@ class _Machine:
     def do(self, name: str, argument: Any) -> None:
         """Execute the opcode `name`.
 
-        Raises `ValueError` for a forbidden opcode, or the exception that damaged operands cause.
+        Raises `ValueError` for a forbidden opcode. Damaged operands raise other exceptions too.
         """
         if name in ARGUMENTS:
             if type(argument) is int and argument.bit_length() > MAX_INT_BITS:
@@ -207,7 +208,7 @@ class _Machine:
         return entry
 
     def _push_of(self, kind: type, parts: list[_Entry]) -> None:
-        """Push a tuple or a frozenset, which cannot be made empty and filled later."""
+        """Push a new tuple or frozenset with these parts. It cannot grow later, unlike a list."""
         entry = _Entry(None)
         entry.holds(parts)
         entry.value = kind([part.value for part in parts])
@@ -228,7 +229,10 @@ class _Machine:
         return taken
 
     def _copies(self, entry: _Entry) -> None:
-        """Count the values of `entry` as copied. Raises `ValueError` above `MAX_COPIED`."""
+        """Count the values of `entry` as copied.
+
+        Raises `ValueError` if the number of all copied values exceeds `MAX_COPIED`.
+        """
         self._copied += entry.size
         if self._copied > MAX_COPIED:
             raise ValueError(
@@ -363,7 +367,10 @@ OPCODES: dict[str, Callable[[_Machine], None]] = {
 
 
 def _keys(entries: Sequence[_Entry]) -> None:
-    """Raise `ValueError` for dict keys and set elements that are slow or impossible to hash."""
+    """Raise `ValueError` unless every entry is allowed as a dict key or set element.
+
+    Other values may be impossible to hash, slow to hash, or forged so that their hashes collide.
+    """
     for entry in entries:
         value = entry.value
         parts = value if type(value) is tuple and len(value) <= MAX_KEY_PARTS else (value,)
@@ -382,7 +389,7 @@ def _keys(entries: Sequence[_Entry]) -> None:
 def _is_part(kind: Any) -> bool:
     """Return whether objects of the class `kind` can be rebuilt from their attributes alone.
 
-    The class must not define `__new__`, `__reduce_ex__` or `__setstate__`.
+    They cannot if the class is a builtin or defines `__new__`, `__reduce_ex__` or `__setstate__`.
     """
     plain = kind.__new__ is object.__new__ and kind.__reduce_ex__ is object.__reduce_ex__
     return plain and kind.__module__ != "builtins" and not hasattr(kind, "__setstate__")

@@ -342,7 +342,7 @@ def first_run(host: Host) -> None:
         "the disk has room again",
         r"^recording: the daemon records to .* again; \d+ steps are missing, at most \d\.0 s "
         r"\(.*No space left on device\)",
-        r"^continues: this recording continues an earlier one; at its beginning the robot is: "
+        r"^continues: this recording continues an earlier one; when this one begins, the robot is: "
         r"driving, link up, .* \(by nav\)",
     )
     host.hold(NAV, "nav", 0.5, 4.0)

@@ -113,7 +113,7 @@ def found(board: Board, motors: list[int], lost: float = 0.2) -> Finding | None:
     ("command", "reply", "figure", "mend"),
     [
         (5, 0, "0 on the way back", "the computer's TX to the board's RX"),
-        (0, 5, "0 lost on the way there", "the board's TX to the computer's RX"),
+        (0, 5, "0 lost on the way out", "the board's TX to the computer's RX"),
         (4, 3, "", "first the ground of board and computer"),
     ],
 )

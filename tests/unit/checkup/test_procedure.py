@@ -142,7 +142,7 @@ TEN: list[tuple[str, str, str, str, str, dict[str, object]]] = [
     ("stuck_encoder=b", "motor b", "FAIL", "the encoder is dead", "watch the wheel", {}),
     ("wrong_baud=57600", "baud rate", "FAIL", "at 57600", "baud_rate = 57600",
      {"mcu.baud_rate": 57600}),
-    ("sparse_replies", "reply rate", "FAIL", "one reply in", "reply_period = 0.1",
+    ("sparse_replies", "reply rate", "FAIL", "one reply every", "reply_period = 0.1",
      {"mcu.reply_period": 0.1}),
     ("spaces", "reply form", "WARN", "ap00.00, bp", "nothing to do", {}),
     ("unpadded", "reply form", "WARN", "ap0.00,bp", "nothing to do", {}),

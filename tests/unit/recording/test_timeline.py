@@ -63,8 +63,8 @@ def test_a_recording_that_continues_another_begins_with_what_the_robot_does() ->
     assert entry.seconds == steps[0].inputs.now.wall_ns / 1e9
     assert entry.by == "app"
     assert entry.text == (
-        "this recording continues an earlier one; at its beginning the robot is: driving, link up, "
-        f"at x {x / 1e6:.2f} m, y {y / 1e6:.2f} m, yaw {math.degrees(yaw / 1e6):.1f} deg"
+        "this recording continues an earlier one; when this one begins, the robot is: driving, "
+        f"link up, at x {x / 1e6:.2f} m, y {y / 1e6:.2f} m, yaw {math.degrees(yaw / 1e6):.1f} deg"
     )
     assert "continues" not in [other.name for other in others]
     assert "continues" not in [entry.name for entry in story(tape)]
@@ -79,7 +79,7 @@ def test_without_a_link_a_recording_that_continues_another_begins_without_a_pose
     ]
     (entry,) = [entry for entry in [*entries, *writer.end()] if entry.name == "continues"]
     assert entry is entries[0]
-    assert "continues an earlier one; at its beginning the robot is: waiting (" in entry.text
+    assert "continues an earlier one; when this one begins, the robot is: waiting (" in entry.text
     assert entry.text.endswith(", the pose of the robot is not known")
 
 
@@ -330,7 +330,7 @@ def test_lines_during_a_silence_do_not_count_as_another_silence() -> None:
 
 def test_missing_steps_are_reported() -> None:
     gaps = [one.text for one in story(driven(), range(100, 160)) if one.name == "gap"]
-    assert gaps == ["60 steps are missing before this step: 0.3 s"]
+    assert gaps == ["60 steps are missing before this step (0.3 s)"]
 
 
 def test_a_pressed_emergency_stop_is_a_serious_incident_and_its_release_is_none() -> None:
