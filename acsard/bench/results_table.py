@@ -10,9 +10,9 @@ from pathlib import Path
 from msgspec import Struct
 from rich.console import RenderableType
 
-from acsard import __version__
 from acsard.bench.matching import Summary
 from acsard.host import real_time
+from acsard.host.version import version
 from acsard.terminal.output import table
 
 POINTS = {
@@ -85,7 +85,7 @@ def this_machine() -> Machine:
         cores=len(os.sched_getaffinity(0)),
         kernel=platform.release(),
         python=platform.python_version(),
-        acsard=__version__,
+        acsard=version(),
         realtime_permitted=real_time.allowed(),
     )
 
