@@ -1,5 +1,5 @@
-"""Install the systemd unit, the stop script, the udev rules and a first configuration, then enable
-and start the service; or remove all of that.
+"""Install the systemd units, the stop script, the udev rules and a first configuration, then enable
+and start the service; or remove the service; or show its status.
 """
 
 from __future__ import annotations
