@@ -31,7 +31,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         type=seconds,
         default=5.0,
         metavar="S",
-        help="how long to measure (default: 5)",
+        help="duration of the measurement in seconds (default: 5)",
     )
     parser.add_argument(
         "--follow",
@@ -53,7 +53,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _config(robot: Client, path: str | None) -> Config:
-    """Return the daemon's configuration, or the local one if the daemon does not give its own."""
+    """Return the daemon's configuration. If the daemon does not send it, load the local one."""
     try:
         return msgspec.convert(robot.get("config"), Config)
     except (NoAnswerError, NotPermittedError, msgspec.ValidationError):

@@ -29,7 +29,10 @@ MANY = "; several ids separated by commas, or '*' for all robots"
 
 
 def add_bus(parser: argparse.ArgumentParser, more: str = "") -> None:
-    """Add the options of tools that talk to a running daemon. `more` ends the help of `--id`."""
+    """Add the options of tools that talk to a running daemon.
+
+    `more` is appended to the help text of `--id`.
+    """
     add_config(parser)
     parser.add_argument(
         "--connect", metavar="ENDPOINT", help="address of the daemon, e.g. tcp/127.0.0.1:7448"

@@ -221,7 +221,7 @@ def _expected(robot: Client, ids: tuple[str, ...]) -> Collection[str]:
         there = present(robot.session, ids, robot.where.endpoint)
         missing = [one for one in ids if one not in there and one != ALL]
         words = f"following {', '.join(there) or 'no robot yet'}"
-        words += f"; not there: {', '.join(missing)}" if missing else ""
+        words += f"; not present: {', '.join(missing)}" if missing else ""
     except NoAnswerError as error:
         words = f"{error} Waiting."
     print(f"acsard: {words}", file=sys.stderr)

@@ -49,7 +49,7 @@ def main(args: argparse.Namespace) -> int:
     if not likely:
         print(
             "no port has the USB id of a common board: unplug the board and run this again; the "
-            "port that is then missing is the board's",
+            "port that has disappeared is the board's port",
             file=sys.stderr,
         )
     if len(likely) == 1:

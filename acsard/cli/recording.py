@@ -61,7 +61,7 @@ from acsard.report.page import drawn
 from acsard.terminal.output import show, table
 
 MAX_NAMES = 10
-"""Largest number of names of recordings that a search prints, and of gaps between recordings."""
+"""Largest number of recordings that a search names. It also lists at most this many gaps."""
 
 SERVICE = Path("/var/lib/acsard/record")
 """The directory in which the systemd service stores its recordings."""

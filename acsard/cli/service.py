@@ -32,7 +32,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
             action.add_argument(
                 "--force",
                 action="store_true",
-                help="also replace or remove files that differ from what this version installs",
+                help="also replace or remove files that differ from those of this version",
             )
         if name == "uninstall":
             action.add_argument(

@@ -72,9 +72,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     renew = actions.add_parser(
         "renew",
         help="replace a certificate that expires soon with a new one from the same authority",
-        description="Replace the robot's certificate before it expires. With --name, replace a "
-        "certificate that `tls add` made instead of the robot's. The new certificate has the "
-        "names and addresses of the old certificate. All other certificates stay valid.",
+        description="Replace the robot's certificate before it expires. With --name, replace "
+        "another certificate, which `tls add` made. The new certificate has the names and "
+        "addresses of the old certificate. All other certificates stay valid.",
     )
     renew.add_argument(
         "--name",

@@ -217,6 +217,6 @@ def _clock(seconds: int) -> str:
 def _name(text: str) -> str:
     if not NAME.match(text):
         raise argparse.ArgumentTypeError(
-            f"{text!r} is not a name: use 1 to 32 of A-Z a-z 0-9 _ . -"
+            f"{text!r} is not a name: use 1 to 32 characters of A-Z a-z 0-9 _ . -"
         )
     return text

@@ -264,7 +264,7 @@ def objection(state: RobotState, source: str, sender: str) -> str:
 
 
 def no_command(source: str) -> str:
-    """Return the sentence that the daemon receives no command of the source `source`."""
+    """Return the reason for the operator if the daemon receives no command of `source`."""
     return (
         f"the daemon receives no command of source {source}; `acsard top` shows whether the daemon "
         "refuses commands"

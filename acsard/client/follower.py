@@ -118,7 +118,7 @@ class Follower:
 
 
 def restarted(before: RobotState | None, state: RobotState) -> bool:
-    """Return whether the daemon restarted between the states `before` and `state`.
+    """Return whether the daemon restarted between the two states `before` and `state`.
 
     The sign of a restart is that a counter in `STEADY` is lower in `state` than in `before`.
     Returns False if `before` is None.

@@ -37,7 +37,7 @@ class Outbox:
         self._thread.start()
 
     def take(self, commander: Commander, put: Put, wish: Wish) -> int | None:
-        """Queue a command of the sender `commander`, to be sent by `put` on the thread.
+        """Queue a command of the sender `commander`. The thread sends the command with `put`.
 
         Returns the time since the sender's previous command, ns, or None (see `Commander.take`).
         """
@@ -81,7 +81,7 @@ class Outbox:
             self.dead.set_exception(error)
 
     def _round(self) -> bool:
-        """Wait for commands that are due and send them; return False when the thread must end."""
+        """Wait until commands are due, and send them. Return False if the thread must end."""
         with self._news:
             self._busy = False
             self._news.notify_all()
