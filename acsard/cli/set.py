@@ -4,8 +4,8 @@ logs them and publishes them on the key `config`. They last until the daemon's n
 limits of speed, acceleration and jerk are an exception: they also survive the next start, but not
 on the simulator. With --keep the robot also writes the settings into its own configuration file,
 and the answer names that file. With --write this tool writes them into the configuration file of
-this machine. Neither option can write the timeout of a command source: edit [[commands.sources]]
-yourself. If a speed limit is lowered during a drive, the robot decelerates to the new limit.
+this machine. Neither --keep nor --write changes the file for a source's timeout: edit
+[[commands.sources]] yourself. If a speed limit is lowered, a faster robot decelerates to it.
 Without a setting, list the settings that can be changed. If --id names several robots, all of them
 get the settings at the same time, and each line has the answer of one robot. The exit code is 1 if
 a robot refuses, and 69 if a robot does not answer.
