@@ -88,7 +88,7 @@ class Follower:
             self.published(state, now)
             return True
         if held is None:
-            # A storage may have sent this first answer. Query again at once to find out.
+            # A storage may have sent this first answer. Query again immediately to find out.
             self.state, self.due = state, now
         return False
 
