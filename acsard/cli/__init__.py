@@ -1,9 +1,9 @@
 """The command line of acsard: one module for each subcommand.
 
 The docstring of such a module is the text of its `--help`. Its function `add_options` declares the
-options, and `main` runs it. Each action of a subcommand, such as `init` of `acsard tls`, has a main
-function of its own. Only the module of the typed subcommand is imported. It imports everything it
-needs at its top, except libraries that may be missing.
+options, and its function `main` runs the subcommand. Each action of a subcommand, such as `init` of
+`acsard tls`, has its own main function. Only the module of the typed subcommand is imported. That
+module imports everything it needs at its top, except libraries that may be missing.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ VERBS = {
     "completion": "print the script that lets a shell complete acsard commands with Tab",
     "man": "print the text of every --help as a man page",
 }
-"""Maps each subcommand to its help text, in the order of `--help`. The name of a subcommand is also
-the name of its module in this package."""
+"""Maps each subcommand to its line in `acsard --help`, in the order of that list. The name of a
+subcommand is also the name of its module in this package."""
 
 _EPILOG = """\
 exit codes: 0 done, 1 failure, 2 wrong usage, 65 part of the recording is damaged, 66 no such
@@ -73,16 +73,18 @@ try:  acsard run                (start the robot on the built-in simulator)
 
 class _Parser(argparse.ArgumentParser):
     _intermixed = False
-    """True while argparse parses the options first, and the arguments without a name after them."""
+    """True during `parse_known_intermixed_args`, which parses the options first and the positional
+    arguments after them."""
 
     def parse_known_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> tuple[argparse.Namespace, list[str]]:
-        """Parse the words, and report unknown ones with the help of the innermost subcommand.
+        """Parse the words. For an unknown word, end with an error that names the `--help` to read.
 
-        Argparse leaves over the arguments that follow an option between two arguments, such as
-        `cal.csv` in `export 1 --csv cal.csv`. If words are left over, they are parsed once more
-        with `parse_known_intermixed_args`, which some Pythons build on this method.
+        Argparse does not recognize positional arguments on both sides of an option: it calls
+        `cal.csv` in `export 1 --csv cal.csv` unknown. If a word is unknown, this method therefore
+        parses all words again with `parse_known_intermixed_args`. Some versions of Python call this
+        method from there.
         """
         if self._intermixed:
             return super().parse_known_args(args, namespace)
@@ -159,16 +161,19 @@ _EXPONENT = re.compile(r"-(\d+\.?\d*|\.\d+)[eE][+-]?\d{1,3}")
 
 
 def _decimal(word: str) -> str:
-    """Return `-0.001` for `-1e-3`, which argparse would take for an option; keep other words."""
+    """Write a negative number such as `-1e-3` without its exponent, as `-0.001`.
+
+    Argparse would take `-1e-3` for an option. Other words are returned unchanged.
+    """
     return f"{Decimal(word):f}" if _EXPONENT.fullmatch(word) else word
 
 
 def entry() -> NoReturn:
-    """Run `main` and end the process at once: the entry point of the `acsard` script.
+    """Run `main`, then end the process. This is the entry point of the `acsard` script.
 
     The process ends with `os._exit`, because Zenoh's threads may still call into Python. During
     a normal shutdown of the interpreter, such a call would abort the process. Standard output and
-    standard error are flushed first.
+    standard error are flushed before the process ends.
     """
     _fill_closed_streams()
     try:
@@ -196,6 +201,7 @@ def _fill_closed_streams() -> None:
         try:
             os.fstat(number)
         except OSError:
-            # The kernel gives the lowest free descriptor, which is this one.
+            # The kernel opens a file with the lowest free descriptor. That descriptor is `number`,
+            # because the loop has already filled all lower ones.
             os.open(os.devnull, os.O_RDWR)
             setattr(sys, name, os.fdopen(number, "r" if number == 0 else "w", closefd=False))

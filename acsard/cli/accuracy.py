@@ -1,8 +1,9 @@
-"""Follow the robot while it is driven, and print how much each cause alone makes its odometry wrong
-if the drive goes on like that: in mm after 100 m, and in degrees after a turn of 360 degrees. The
-causes are the times of the feedback lines, their rounding, gaps, slip, wheel radii and track width,
-and the gyro if there is one. The tool also says how to reduce the largest error. It sends nothing.
-While the robot stands still, it prints only the errors that follow from the settings.
+"""Observe the robot while someone drives it, and print the odometry error that each cause alone
+would produce if the drive continued in the same way: in mm after 100 m, and in degrees after a turn
+of 360 degrees. The causes are the timing and the rounding of the feedback lines, gaps between them,
+slip, wheel radii, track width, and the gyro if there is one. The tool also says how to reduce the
+largest error. It sends no commands. While the robot stands still, the tool prints only the errors
+that follow from the settings.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         type=seconds,
         default=5.0,
         metavar="S",
-        help="how long to measure (default: 5)",
+        help="duration of the measurement in seconds (default: 5)",
     )
     parser.add_argument(
         "--follow",
@@ -52,7 +53,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _config(robot: Client, path: str | None) -> Config:
-    """Return the daemon's configuration, or the local one if the daemon does not give its own."""
+    """Return the daemon's configuration. If the daemon does not send it, load the local one."""
     try:
         return msgspec.convert(robot.get("config"), Config)
     except (NoAnswerError, NotPermittedError, msgspec.ValidationError):

@@ -1,12 +1,12 @@
-"""Measure how fast the daemon is on this machine. The tool starts a daemon of its own on a
-simulated microcontroller; a daemon that already runs is not disturbed. It commands and follows the
-new daemon from another process and prints the times. It does not judge them. A busy machine gives
-worse times.
+"""Measure how fast the daemon is on this machine. The tool starts its own daemon with a simulated
+microcontroller; a daemon that already runs is not disturbed. From another process, the tool sends
+commands to the new daemon, receives its messages, and prints the times. It does not judge the
+times. A busy machine gives worse times.
 
 what is measured, and between which points (all on the same clock):
   command -> wire       from the call of put() in this process, at random times, until the first
                         byte of the line with that command can be read at the far end of the
-                        port. The time on a real wire (2.9 ms a line at 115200 baud) comes on top.
+                        port. Add the time on a real wire (2.9 ms a line at 115200 baud).
   feedback -> odometry  from the write of the last byte of a feedback line at the far end of the
                         port until a callback in this process receives the odometry of that line.
   processor, memory     of the daemon's process alone, read from /proc.
@@ -14,8 +14,9 @@ what is measured, and between which points (all on the same clock):
 Successive commands and feedback lines have different speeds, by which the tool recognizes them.
 A real wire adds its own time, and an FTDI adapter adds its latency timer.
 
-With --port the tool uses the real microcontroller. It sends only zero speeds, so nothing moves.
-It cannot see the wire then, so it omits the times on the wire. Stop the robot's daemon first.
+With --port the tool uses the real microcontroller. It sends only zero speeds, so nothing moves. The
+tool cannot observe the far end of a real wire, so it omits all times that begin or end there. Stop
+the robot's daemon first.
 """
 
 from __future__ import annotations

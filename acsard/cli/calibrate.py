@@ -1,19 +1,20 @@
 """Measure the wheel radii and the effective track width, each with its standard deviation, and say
-how much they improve the odometry. The tool also fits the noise of [odometry] if a gyro or
-positions show it. Without --log the tool drives the robot and guides a person at this terminal
-through the drive. The person stands near the robot on a free floor of 3 m x 3 m, starts each leg
-with Enter, stops it with any key, and types the tape measurements that the tool asks for. The robot
-drives for at most 90 s. With --log the tool uses a recorded drive: a black-box recording of a robot
-with a gyro, a ROS 2 bag in MCAP (its file or directory), or a CSV file with a header. A bag must
-contain the wheels as JointState, and an Imu, a PoseStamped or an Odometry to compare them with. Its
-topics are chosen by their types, or with --topic. The CSV file has the column t (s) and the wheel
-speeds in rad/s, "fr,fl,rl,rr" or "left,right". It also has yaw_rate (rad/s, from a gyro), or x and
-y (m, from any source of positions) with or without yaw (rad), or both. The column run (any name)
-separates several drives. The columns applied_linear (m/s) and applied_angular (rad/s) contain the
-commands, and show how soon the wheels follow. The columns may be in any order, and a cell is empty
-if its sensor has no value at that time. A good log begins with 3 s of standing still. It contains
-straight drives, turns to both sides, slow and fast, and curves, for 60 s or more. The exit code is
-0 if the tool found the values. Otherwise it is 1, and a message says what to do instead.
+how much they improve the odometry. The tool also estimates the noise settings of [odometry] if a
+gyro or positions show the noise. Without --log the tool drives the robot and guides a person at
+this terminal through the drive. The person stands near the robot on a free floor of 3 m x 3 m,
+starts each leg with Enter, stops it with any key, and types the tape measurements that the tool
+asks for. The robot drives for at most 90 s. With --log the tool uses a recorded drive: a black-box
+recording of a robot with a gyro, a ROS 2 bag in MCAP (its file or directory), or a CSV file with a
+header. A bag must contain the wheels as JointState, and an Imu, a PoseStamped or an Odometry to
+compare them with. The tool reads the topics that have these types, or those that --topic names. The
+CSV file has the column t (s) and the wheel speeds in rad/s, "fr,fl,rl,rr" or "left,right". It also
+has yaw_rate (rad/s, from a gyro), or x and y (m, from any source of positions) with or without yaw
+(rad), or both. If the file contains several drives, the column run names the drive of each row. The
+columns applied_linear (m/s) and applied_angular (rad/s) contain the commands, and show how fast the
+wheels respond. The columns may be in any order, and a cell is empty if its sensor has no value at
+that time. A good log begins with 3 s of standing still. It contains straight drives, turns to both
+sides, slow and fast, and curves, for 60 s or more. The exit code is 0 if the tool found the values.
+Otherwise it is 1, and a message says what to do instead.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ TRUE_POSE = "sim/pose"
 """Key of the true pose, which only a daemon with the built-in simulator publishes."""
 
 DRIVE_OPTIONS = ("method", "positions", "positions_at", "imu", "yes", "json_lines")
-"""Options that fit only a drive that this tool guides, and not a recorded one (`--log`)."""
+"""Options that are only for a drive that this tool guides, not for a recorded drive (`--log`)."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -107,7 +108,7 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
     where, mine = load(args.config)
     if args.write:
         writable(args.config)
-    # Messages and reports name a log by the name of its file.
+    # Messages and reports name a recorded drive by the path of its file.
     source = str(args.log) if args.log else "the drive"
     try:
         if args.log:
@@ -149,7 +150,10 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
 
 
 def _require_fitting(args: argparse.Namespace) -> None:
-    """Raise `UsageError` if options of a recorded drive (`--log`) and of a guided one are mixed."""
+    """Raise `UsageError` if options of a recorded drive (`--log`) and of a guided drive are mixed.
+
+    Also raise it if an option needs `--log` and `--log` is missing.
+    """
     if not args.log and args.distance:
         raise UsageError(
             "--distance needs --log: without --log, acsard asks for the distances that it needs"
@@ -217,10 +221,10 @@ def _add_drive_options(parser: argparse.ArgumentParser) -> None:
 def _guided(
     args: argparse.Namespace, config: Config, where: str, lines: JsonPrompt | None
 ) -> tuple[Calibration, Config]:
-    """Drive the robot, and return the calibration and the configuration of the robot's daemon.
+    """Drive the robot. Return a pair: the calibration, and the configuration of its daemon.
 
     A key press or Ctrl-C stops the robot with zero commands. `config` is the configuration in the
-    file `where`. `lines` is the prompt for --json-lines.
+    file `where`. `lines` is the prompt for --json-lines, or None without that option.
     """
     require_one(args)
     endpoint, robot_id, tls = address_of(config, args.connect, args.id, args.tls)
@@ -265,7 +269,7 @@ def _usable(args: argparse.Namespace, odometry: str) -> None:
             "--method positions needs the Zenoh key of the positions: add --positions KEY"
         )
     if args.positions and args.method not in (None, "positions"):
-        raise UsageError(f"--positions does not go with --method {args.method}: leave one out")
+        raise UsageError(f"--positions is not for --method {args.method}: leave one out")
     if args.positions in ("odom", odometry):
         raise UsageError(
             "the daemon computes odom from the wheels themselves: give --positions the Zenoh key "
@@ -288,7 +292,11 @@ def _usable(args: argparse.Namespace, odometry: str) -> None:
 
 
 def _differing(config: Config, mine: Config, where: str) -> str:
-    """Return an error if the file `where` and the daemon differ in radius or track, else ""."""
+    """Return an error text if the daemon's wheel radius or separation is not that of the file.
+
+    `config` is the daemon's configuration, and `mine` is the one in the file `where`. Returns "" if
+    both have the same values.
+    """
     same = config.drive.wheel_radius, config.drive.wheel_separation
     if same == (mine.drive.wheel_radius, mine.drive.wheel_separation):
         return ""

@@ -48,7 +48,7 @@ def main(args: argparse.Namespace) -> int:
     wanted = _fields(args.service)
     if len(args.values) != len(wanted):
         form = " ".join(["acsard call", args.service, *(name.upper() for name in wanted)])
-        raise UsageError(f"write: {form}")
+        raise UsageError(f"wrong number of arguments; write: {form}")
     for name, value in zip(wanted, args.values, strict=True):
         if not math.isfinite(value):
             raise UsageError(f"{name.upper()} = {value}: the number must be finite; correct it")
@@ -84,7 +84,8 @@ def for_one(service: str, values: Sequence[float], ids: tuple[str, ...]) -> str:
 
 
 def _stop_all(robot: Client, ids: tuple[str, ...], *, as_json: bool) -> int:
-    # Send the stop to every named robot first. Finding out which robots are present would delay it.
+    # First send the stop to every named robot. `of_each` may look up which robots are present, and
+    # this would delay the stop.
     robot_discovery.stop(robot.session, ids, robot.caller)
     replies = of_each(robot, ids, lambda one: one.call("stop"))
     silence = "NO ANSWER: go to the robot, or use its emergency switch ({error})"

@@ -31,7 +31,7 @@ def add_config(parser: argparse.ArgumentParser) -> None:
 def add_outcome(parser: argparse.ArgumentParser, result: str) -> None:
     """Add --json, --json-lines and --write to a subcommand that asks a person questions.
 
-    `result` is the name of the result that --write stores, for the help text.
+    `result` is a noun for the result that --write stores. It becomes a part of the help text.
     """
     form = parser.add_mutually_exclusive_group()
     form.add_argument("--json", action="store_true", help="print one JSON object")
@@ -62,7 +62,7 @@ def count(text: str) -> int:
     """Parse a whole number of at least 1, as an argparse type."""
     number = int(text)
     if number < 1:
-        raise argparse.ArgumentTypeError(f"{text} is less than 1, the smallest number")
+        raise argparse.ArgumentTypeError(f"{text} is less than 1; give a number of at least 1")
     return number
 
 
@@ -87,13 +87,13 @@ def between(least: float, most: float, units: str) -> Callable[[str], float]:
 
 seconds = between(1.0, 600.0, "seconds")
 """Argparse type for the duration of a measurement. The limit is 600 s because all measured values
-stay in memory: 60 MB after 600 s at 100 Hz."""
+stay in memory, which takes 60 MB after 600 s at 100 Hz."""
 
 
 def whole(units: str, most: int, hint: str = "") -> Callable[[str], int]:
     """Return an argparse type for a whole number from 1 to `most`.
 
-    `units` is the noun in the error message, such as "days". `hint` is the end of that message.
+    `units` is the noun in the error message, such as "days". `hint` is appended to that message.
     """
 
     def number(text: str) -> int:
@@ -108,7 +108,8 @@ def whole(units: str, most: int, hint: str = "") -> Callable[[str], int]:
 def by_environment() -> dict[str, dict[str, object]]:
     """Return the configuration values that environment variables set, by table and key.
 
-    `ACSARD_TLS` sets `bus.tls`. A systemd unit uses it to name the directory of its credentials.
+    Only `ACSARD_TLS` is read, which sets `bus.tls`. A systemd unit sets this variable to the
+    directory of its credentials.
     """
     return {"bus": {"tls": os.environ["ACSARD_TLS"]}} if "ACSARD_TLS" in os.environ else {}
 
@@ -143,11 +144,11 @@ OPTIONS = {
 
 
 def load(path: str | None, options: Mapping[str, object] | None = None) -> tuple[str, Config]:
-    """Return the path of the configuration and the configuration itself.
+    """Return a pair: the path of the configuration file, and the configuration.
 
     `path` is the value of --config, or None. `options` maps dotted keys of `OPTIONS` to values that
-    override the file; None leaves a key as it is. If the configuration has problems, this prints
-    each of them with the file or the option that it is in, and raises `MendableError`.
+    override the file; None leaves a key as it is. If the configuration has problems, this function
+    prints each problem with the file or the option that causes it, and raises `ExitError`.
     """
     where, text = find(path)
     given = tables(options or {}, by_environment())
@@ -167,11 +168,11 @@ def load(path: str | None, options: Mapping[str, object] | None = None) -> tuple
 
 
 def recorded(config: Config) -> Config:
-    """Return `config` with an absolute path of the recording directory.
+    """Return a copy of `config` in which the path of the recording directory is absolute.
 
-    Without a configured directory, the path comes from ACSARD_RECORD, which the systemd units set,
-    or stays "". It is absolute because a client that reads it on the bus may run in another
-    directory.
+    If no directory is configured, the path comes from the environment variable ACSARD_RECORD, which
+    the systemd units set. Without this variable, the path stays "". The path is absolute because a
+    client that receives it over the bus may run in another working directory.
     """
     told = config.record.directory or os.environ.get(RECORD, "")
     directory = os.path.abspath(told) if told else ""

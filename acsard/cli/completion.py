@@ -23,7 +23,7 @@ SHELLS = {
     "zsh": "the file _acsard in a directory of your $fpath",
     "fish": "~/.config/fish/completions/acsard.fish",
 }
-"""Where each shell looks for its completion script."""
+"""Maps each shell to the place where it looks for its completion script."""
 
 _NUMBERS = "acsard recording 2>/dev/null | sed -n 's/^0*\\([0-9][0-9]*\\)-.*/\\1/p'"
 """Shell command that prints the numbers of the recordings."""
@@ -45,7 +45,8 @@ _acsard_recordings() {{
 }}""",
     },
 }
-"""Completion of a recording's number or file name for each shell, in the form of shtab."""
+"""Completion of a recording's number or file name, for each shell. shtab defines the format of this
+table."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -69,8 +70,8 @@ def main(args: argparse.Namespace) -> int:
         if kind:
             action.complete = kind  # type: ignore[attr-defined]
         elif (verb, action.dest) in known:
-            # The choices serve only the completion. This parser parses no arguments, so it refuses
-            # no other word.
+            # The choices serve only the completion. They refuse no other word, because this parser
+            # parses no arguments.
             action.choices = known[verb, action.dest]
     script = shtab.complete(whole, args.shell)
     if args.shell == "zsh":
@@ -105,7 +106,10 @@ def _words() -> Mapping[tuple[str, str], list[str]]:
 def _actions(
     parser: argparse.ArgumentParser, verb: str = ""
 ) -> Iterator[tuple[str, argparse.Action]]:
-    """Yield (subcommand, option) for each option. `recording show` counts as `recording`."""
+    """Yield a pair for each option: the subcommand and the option.
+
+    The options of an action such as `recording show` count as options of `recording`.
+    """
     for action in parser._actions:
         yield verb, action
         if isinstance(action, argparse._SubParsersAction):

@@ -1,5 +1,5 @@
-"""Shared code of the subcommands that use the bus: options, connection, and checks of keys. It also
-explains why no message arrives.
+"""Shared code of the subcommands that use the bus: their options, their connection, checks of keys,
+and the explanation why no message arrives.
 """
 
 from __future__ import annotations
@@ -29,7 +29,10 @@ MANY = "; several ids separated by commas, or '*' for all robots"
 
 
 def add_bus(parser: argparse.ArgumentParser, more: str = "") -> None:
-    """Add the options of tools that talk to a running daemon. `more` ends the help of `--id`."""
+    """Add the options of tools that talk to a running daemon.
+
+    `more` is appended to the help text of `--id`.
+    """
     add_config(parser)
     parser.add_argument(
         "--connect", metavar="ENDPOINT", help="address of the daemon, e.g. tcp/127.0.0.1:7448"
@@ -72,10 +75,11 @@ def require_one(args: argparse.Namespace) -> None:
 
 @contextmanager
 def connected_to_many(args: argparse.Namespace) -> Iterator[tuple[Client, tuple[str, ...]]]:
-    """Connect to the bus. Yield a client and, if `--id` names several robots, their ids.
+    """Connect to the bus. Yield a pair: a client, and the ids if `--id` names several robots.
 
-    The ids are ("*",) if `--id` is "*". If it names one robot or is missing, the ids are (), and
-    the client belongs to that robot or to the configured one.
+    If `--id` is "*", the ids are ("*",). If `--id` names one robot, the ids are () and the client
+    is for that robot. If `--id` is missing, the ids are () and the client is for the configured
+    robot.
     """
     many = named(args.id or "")
     _, config = load(args.config)
@@ -87,11 +91,11 @@ def connected_to_many(args: argparse.Namespace) -> Iterator[tuple[Client, tuple[
 def require_followed(key: str) -> None:
     """Raise `UsageError`, with the command to type instead, if a key never has messages.
 
-    Print a warning if the key is not in the table of keys. Without the warning, waiting for
-    messages on a misspelt key would look like a dead robot.
+    Print a warning if the key is not in the table of keys. Without the warning, a misspelt key
+    would look like a robot that sends nothing.
     """
     if unknown(key):
-        words = f"{key} is not in the topic table ({key_hint(key)}); waiting for it all the same"
+        words = f"{key} is not in the topic table ({key_hint(key)}); waiting for it nevertheless"
         print(f"acsard: {printable(words)}", file=sys.stderr)
     row = row_of(key)
     if row is None:
@@ -112,8 +116,8 @@ def require_followed(key: str) -> None:
 def require_asked(key: str) -> None:
     """Raise `UsageError` if `acsard get` cannot query this key.
 
-    Some keys do not answer queries. A query to a service's key would call the service. A key with a
-    wildcard has several answers, but `get` prints one.
+    Some keys do not answer queries. A query to the key of a service would call the service. A key
+    with a wildcard has several answers, but `get` prints only one answer.
     """
     if set(key.partition("?")[0]) & set("*$"):
         raise UsageError(
@@ -126,7 +130,7 @@ def require_asked(key: str) -> None:
         raise UsageError(f"{key} is a service: type acsard call {key.removeprefix('srv/')}")
     if row.direction == "in":
         raise UsageError(
-            f"{key} is an input and does not answer queries: acsard echo {key} follows it"
+            f"{key} is an input and does not answer queries: acsard echo {key} prints its messages"
         )
     if row.key == "alive":
         raise UsageError(
@@ -144,17 +148,17 @@ def explained(
 ) -> Iterator[Callable[[], None]]:
     """Print why no messages arrive, and yield a function that the caller calls for each message.
 
-    A separate thread prints on standard error, so the caller does not wait while it receives.
+    A separate thread finds the reason and prints it on standard error, so that the caller can go on
+    receiving. A reason that is "" is not printed.
 
     Args:
-        look: is called if no message arrives in the first `after_s` s, and returns the reason.
-        ceased: is called if no further message arrives for `after_s` s, and returns the reason. If
-            it is None, only the silence before the first message is explained.
-        after_s: shortest silence that is explained, s.
-        timeout_s: silence after which the caller ends the context, s. If no message has arrived by
+        look: Function that returns the reason. It is called if no message arrives in the first
+            `after_s` s.
+        ceased: Function that returns the reason. It is called if no further message arrives for
+            `after_s` s. If it is None, only the silence before the first message is explained.
+        after_s: Shortest silence that is explained, s.
+        timeout_s: Silence after which the caller ends the context, s. If no message has arrived by
             then, the reason is printed before the context ends.
-
-    A reason that is "" is not printed.
     """
     come, end, looked = Event(), Event(), Event()
     began_s = time.monotonic()
@@ -189,11 +193,11 @@ def explained(
 def silence_explained(
     robot: Client, key: str = "", timeout_s: float | None = None
 ) -> AbstractContextManager[Callable[[], None]]:
-    """Print why no message arrives on a key, and later whether the connection was lost.
+    """Print why no message arrives on a key, and later report if the connection is lost.
 
     The context yields a function that the caller calls for each message. If `key` is "", only a
     lost connection is reported. The texts go to standard error. If the caller ends the context
-    after a silence of `timeout_s` s, the text is printed before.
+    after a silence of `timeout_s` s, the reason is printed before the context ends.
     """
     return explained(
         lambda: _none_yet(robot, key) if key else "",

@@ -1,6 +1,6 @@
 """Check the configuration, the serial port and the process that uses it, permissions, the clock,
 real-time limits, causes that make this computer late, certificates, and the daemon if it runs. The
-daemon is looked for at the address in the configuration, or at the address in the options. Each
+address of the daemon is the one in the options, otherwise the one in the configuration. Each
 problem is printed with its fix. The exit code is 1 if a check fails, else 0.
 """
 

@@ -1,8 +1,8 @@
 """Print each message on a key as one line of JSON, until Ctrl-C. Every key below the robot's id
-works, for example `cmd/teleop`. --csv prints wheel speeds, gyro and position as one file for
+works, for example `cmd/teleop`. --csv prints wheel speeds, gyro and position as one table for
 `acsard calibrate --log`: acsard echo wheel_states imu --csv > drive.csv. --short prints pose,
 speeds and warnings as text: acsard echo odom -n 1 --short. If --id names several robots, each line
-names its robot, and -n N prints N messages of each.
+names its robot, and -n N prints N messages of each robot.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 class Quota:
-    """Limit of the number of printed messages of each robot."""
+    """Counts the printed messages of each robot, and limits their number."""
 
     def __init__(self, most: int | None, robots: Collection[str]) -> None:
         """Allow `most` messages of each robot, or any number if `most` is None.
@@ -132,10 +132,11 @@ def _print(
     timeout: float | None,
     heard: Callable[[], None],
 ) -> int:
-    """Print a line per message until Ctrl-C, the end of `quota`, or the end of `samples`.
+    """Print one line per message, and return the exit code.
 
-    A `decoder` gives the short form; None prints JSON. The function also returns if it has printed
-    no message for `timeout` s. It calls `heard` for each message.
+    The function returns 0 after Ctrl-C or when `quota` is used up. It returns 1 when `samples` ends
+    or when no message was printed for `timeout` s. It prints the short form if there is a
+    `decoder`, else JSON, and calls `heard` for each message.
     """
     printed_s = time.monotonic()
     try:
@@ -164,7 +165,11 @@ def _shortened(key: str) -> Decoder[Any]:
 
 
 def _shown(decoder: Decoder[Any] | None, encoding: str, payload: bytes, whose: str) -> str:
-    """Return a message as a line. It is JSON without a `decoder`, or if decoding fails."""
+    """Return a message as one line: the short form, or JSON.
+
+    The line is JSON if `decoder` is None or cannot decode the message. `whose` is the robot id that
+    the line must name, or "".
+    """
     if decoder is not None:
         try:
             told = short(decoder.decode(encoding, payload))
@@ -183,7 +188,10 @@ def _record(
     timeout: float | None,
     heard: Callable[[], None],
 ) -> int:
-    """Print rows of all keys until Ctrl-C, until `most` rows, or after `timeout` s of silence."""
+    """Print the messages on `keys` as rows of one CSV log, and return the exit code.
+
+    The function returns 0 after Ctrl-C or after `most` rows, and 1 after `timeout` s of silence.
+    """
     queues = [(robot.subscribe(key), decoder(key)) for key in keys]
     print(HEADER, flush=True)
     count, heard_s = 0, time.monotonic()
@@ -205,14 +213,15 @@ def _record(
 def _expected(robot: Client, ids: tuple[str, ...]) -> Collection[str]:
     """Return `ids`, or for "*" the ids of the robots that are present now.
 
-    Also print which robots are present, because a silent robot looks like an absent one.
+    Also print which robots are present. Otherwise the operator could not tell a silent robot from
+    an absent robot.
     """
     there: list[str] = []
     try:
         there = present(robot.session, ids, robot.where.endpoint)
         missing = [one for one in ids if one not in there and one != ALL]
         words = f"following {', '.join(there) or 'no robot yet'}"
-        words += f"; not there: {', '.join(missing)}" if missing else ""
+        words += f"; not present: {', '.join(missing)}" if missing else ""
     except NoAnswerError as error:
         words = f"{error} Waiting."
     print(f"acsard: {words}", file=sys.stderr)

@@ -1,7 +1,7 @@
 """Query a key and print the answer as JSON, indented on a terminal and as one line into a pipe. The
-key is info, config, interfaces, topics, schema/Twist, or any published key, which answers with its
-last value. If --id names several robots, each line has the answer of one robot. The exit code is 69
-if one does not answer.
+key is info, config, interfaces, topics, schema/Twist or any published key. The answer of a
+published key is its last message. If --id names several robots, each line has the answer of one
+robot. The exit code is 69 if a robot does not answer.
 """
 
 from __future__ import annotations

@@ -34,11 +34,12 @@ and the emergency stop and the bumpers that the board reports. It opens the port
 daemon first (exit code 75 if the daemon has the port). It asks you to type that the wheels are
 lifted. Then it turns the motors one by one, and then all together. It commands at most 3 rad/s, but
 a wheel whose encoder is dead or reversed can reach full speed. If the board restarts during a test,
-the tool reports that and repeats the test. If the tool itself stands still for more than 0.5 s, or
-for more than 5 s before the tests of the motors, the check ends, for example because the computer
-is suspended. Its last lines to the board are always zeros, then it is silent. The exit code is 0 if
-every test was judged and none failed. It is 1 if a test failed, if the tool ended early, or if this
-computer was too slow to judge a test; in that case try again when the computer is idle.
+the tool reports that and repeats the test. The check ends if the tool itself could not run for more
+than 0.5 s (5 s before the first motor test), for example because the computer was suspended. The
+tool always ends by sending zero speeds to the board, and sends nothing more after them. The exit
+code is 0 if every test was judged and none failed. It is 1 if a test failed, if the tool ended
+early, or if this computer was too slow to judge a test; in that case try again when the computer is
+idle.
 """
 
 
@@ -84,7 +85,11 @@ def main(args: argparse.Namespace) -> int:
 def _checked(
     args: argparse.Namespace, config: Config, configured: Config, where: str, prompt: Prompt
 ) -> int:
-    """Check the board. Suggest changes to `configured`, the configuration in the file `where`."""
+    """Check the board, print the report, and return the exit code.
+
+    Changes are suggested to `configured`, the configuration in the file `where`. `config` is the
+    same configuration with the values of the options.
+    """
     port, simulated = config.mcu.port, config.mcu.simulated
     findings: list[Finding] = []
 
@@ -145,7 +150,7 @@ def _prompt(args: argparse.Namespace, port: str) -> TerminalPrompt | NoPrompt | 
         return NoPrompt(args.json)
     master = master_of(port)
     if master is None or master.name != "acsard":
-        what = f"a pty of {master.name}" if master else "no simulator of acsard's"
+        what = f"a pty of {master.name}" if master else "not a simulator of acsard"
         raise UsageError(
             f"{port} is {what}: a robot may be behind it, and --yes would turn its wheels without "
             "a question. Either leave --yes out, or lift the wheels, stay with the robot and add "

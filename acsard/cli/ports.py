@@ -1,6 +1,6 @@
-"""List the serial ports: device, stable names, driver, USB id, the process that has it open, and
-the common microcontroller board that it resembles. If no port resembles a board, the tool says so.
-It opens no port. The exit code is 1 if there is no port.
+"""List the serial ports: device, stable names, driver, USB id, the process that has the port open,
+and the common microcontroller board that the port looks like. If no port looks like a board, the
+tool says so. It opens no port. The exit code is 1 if there is no port.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def main(args: argparse.Namespace) -> int:
     if not likely:
         print(
             "no port has the USB id of a common board: unplug the board and run this again; the "
-            "port that is then missing is the board's",
+            "port that has disappeared is the board's port",
             file=sys.stderr,
         )
     if len(likely) == 1:

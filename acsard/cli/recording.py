@@ -1,8 +1,8 @@
 """Work with the recordings that the daemon has made. Without a subcommand, list them, oldest
 first, with the main events of each. `!` marks those with a stop, a fault or a crash. --from and
---to list only the recordings of that time. FILE is a recording, its number in that list, or `all`
-of them. Without FILE, --from and --to search all recordings; without any of the three, the newest
-recording is used.
+--to limit the list to the recordings of that time. The argument FILE of a subcommand is the file of
+a recording, its number in the list, or `all`. Without FILE, a subcommand uses the newest recording,
+or all recordings between --from and --to if these are dates or times.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ from acsard.report.page import drawn
 from acsard.terminal.output import show, table
 
 MAX_NAMES = 10
-"""Largest number of recordings, and of gaps between recordings, that a search prints."""
+"""Largest number of recordings that a search names. It also lists at most this many gaps."""
 
 SERVICE = Path("/var/lib/acsard/record")
 """The directory in which the systemd service stores its recordings."""
@@ -94,7 +94,8 @@ _MISNAMED = {
     ("html", ".mcap"): "let the name end in .html; `acsard recording export` writes MCAP",
     ("html", ".txt"): "let the name end in .html; `acsard recording show` prints text",
 }
-"""Maps a format and the suffix of another one to the advice for the operator who typed it."""
+"""Maps a pair of an output format and a wrong suffix to the advice for the operator. The suffix is
+that of the file name which the operator typed."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -177,8 +178,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         _times(action, argparse.SUPPRESS, f"{EXAMPLES} (not with FILE `all`)")
     for action in (shown, replay, recover, exported, report):
         _directory(action, argparse.SUPPRESS)
-    # `replay` and `export` are left out, because their own option --config has another meaning: the
-    # configuration that they try.
+    # Not for `replay` and `export`: their own option --config names a configuration to try, not the
+    # one that names the directory of the recordings.
     for action in (shown, recover, report):
         _own_config(action, argparse.SUPPRESS)
 
@@ -291,7 +292,10 @@ def main_show(args: argparse.Namespace) -> int:
 
 
 def _is_being_recorded(recording: Recording) -> bool:
-    """Return whether a daemon still writes to a recording that has been read to its end."""
+    """Return whether a daemon is still writing to this recording.
+
+    Call this only after all steps of the recording have been read.
+    """
     if recording.ending != UNFINISHED:
         return False
     with suppress(OSError):  # the daemon has just renamed or removed the file
@@ -300,12 +304,12 @@ def _is_being_recorded(recording: Recording) -> bool:
 
 
 def _show(recording: Recording, part: Span, as_json: bool) -> bool:
-    """Print the events in the time span `part`, and return whether it contains any steps."""
+    """Print the events in the time span `part`. Return whether the recording has steps in it."""
     story = TimelineWriter(_config_of(recording))
     found, over = False, False
     for step in steps(recording):
         if over:
-            # Read the rest too, so that `recording.missing` counts every damaged place.
+            # Read the remaining steps too, so that `recording.missing` counts every damaged place.
             continue
         seconds = (step.inputs.now.mono_ns - recording.about.mono_ns) / NS_PER_S
         over = seconds > part.end
@@ -444,11 +448,11 @@ def _refuse_times(args: argparse.Namespace, subcommand: str) -> None:
 
 
 def _require_suffix(new: str | None, kind: Kind | Literal["html"]) -> None:
-    """Raise `UsageError` if the name of the file to write has the suffix of another format."""
+    """Raise `UsageError` if the file to write, `new`, has the suffix of another format."""
     suffix = Path(new or "").suffix.lower()
     if mend := _MISNAMED.get((kind, suffix)):
         form = "a directory" if kind == "rosbag2" else f"{kind.upper()}, not {suffix}"
-        raise UsageError(f"nothing is written to {new}, because it would become {form}: {mend}")
+        raise UsageError(f"nothing is written to {new}, because the output is {form}: {mend}")
 
 
 def _files_to_write(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
@@ -463,7 +467,7 @@ def _files_to_write(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
 
 
 def _parts(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
-    """Return the recordings that the arguments name, each with the part from --from to --to."""
+    """Return the recordings that the arguments name, each with its span from --from to --to."""
     times = [when for when in (args.begin, args.end) if when is not None]
     by_clock = bool(times) and not any(isinstance(when, Offset) for when in times)
     if args.file == "all" or (args.file is None and by_clock):
@@ -477,7 +481,11 @@ def _parts(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
 
 
 def _range(args: argparse.Namespace) -> tuple[float, float]:
-    """Return the times of --from and --to, s since 1970; infinite for an option that is missing."""
+    """Return a pair: the times of --from and --to, s since 1970.
+
+    The time of a missing option is minus or plus infinity. Raises `UsageError` for options that
+    count seconds from the beginning of a recording.
+    """
     if any(isinstance(when, Offset) for when in (args.begin, args.end)):
         raise UsageError(
             "--from and --to in seconds count from the beginning of one recording, but "
@@ -491,9 +499,9 @@ def _range(args: argparse.Namespace) -> tuple[float, float]:
 
 
 def _search(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
-    """Return each recording with steps between --from and --to, and the span of these steps.
+    """Return the recordings with steps between --from and --to, each with the span of these steps.
 
-    Also print the names of these recordings.
+    Also print the names of these recordings, and the times that no recording covers.
     """
     first, last = _range(args)
     where, files = _files(args)
@@ -501,7 +509,7 @@ def _search(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
         result = search(files, first, last)
     except NothingRecordedError as error:
         raise RecordingError(
-            f"{error} (looked at {many(len(files), 'recording')} in {where})"
+            f"{error} (searched {many(len(files), 'recording')} in {where})"
         ) from None
     names = [path.name for found in result.found for path in found.recording.paths]
     looked = f"{len(names)} of {many(len(files), 'recording')} in {where}"
@@ -560,10 +568,10 @@ def _when(text: str) -> When:
 
 @contextmanager
 def _progress(recording: Recording) -> Iterator[Callable[[int], None]]:
-    """Show the progress of the work on a recording, if standard error is a terminal.
+    """Show the progress of reading a recording, if standard error is a terminal.
 
     Yield a function that the caller calls to report progress. Its argument is the recorded
-    wall-clock time, ns, up to which the recording has been processed.
+    wall-clock time, ns, up to which the recording has been read.
     """
     if not sys.stderr.isatty():
         yield lambda wall_ns: None
@@ -592,9 +600,10 @@ def _written(new: Path) -> Iterator[None]:
 
 
 def _percent(recording: Recording) -> Callable[[int], None]:
-    """Return a function that prints the progress in percent, for the web server to read.
+    """Return a function that prints the progress in percent on standard error.
 
-    Its argument is the recorded wall-clock time, ns, up to which the recording has been processed.
+    The web server reads it there. The argument of the function is the recorded wall-clock time, ns,
+    up to which the recording has been read.
     """
     last, began = read_end(recording.path), recording.about.wall_ns / 1e9
     end = last.last_ns / 1e9 if last else recording.path.stat().st_mtime

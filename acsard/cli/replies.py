@@ -37,16 +37,16 @@ def json_line(encoding: str, payload: bytes) -> str:
 
 
 Replies = Mapping[str, ServiceReply | AcsardError]
-"""Maps a robot's id to the robot's reply, or to the error that says why it did not reply."""
+"""Maps the id of each robot to its reply, or to the error that says why the robot did not reply."""
 
 
 def of_each(
     robot: Client, ids: Sequence[str], call: Callable[[Client], ServiceReply]
 ) -> dict[str, ServiceReply | AcsardError]:
-    """Call a service of each robot in `ids` at the same time, and return the replies by robot id.
+    """Call a service of several robots at the same time, and return the replies by robot id.
 
-    If `ids` contains "*", all robots that are present are called. Raises `NoAnswerError` if no
-    robot is present.
+    `ids` names the robots; "*" in it means all robots that are present. `call` calls the service
+    with a client of one robot. Raises `NoAnswerError` if "*" is given and no robot is present.
     """
     wanted = present(robot.session, ids, robot.where.endpoint) if ALL in ids else list(ids)
 
@@ -65,9 +65,9 @@ def print_each(
 ) -> int:
     """Print one line for the reply of each robot, and return the exit code.
 
-    The exit code is `UNREACHABLE` if a robot did not answer, else `FAILURE` if one refused. `ids`
-    are the ids that the operator named. `silence` is the line of a robot without an answer, in
-    which `{error}` stands for the reason.
+    The exit code is `UNREACHABLE` if a robot did not answer. Otherwise it is `FAILURE` if a robot
+    refused, else `OK`. `ids` are the ids that the operator named. `silence` is the template of the
+    line to print for a robot that did not answer; `{error}` in it is replaced by the reason.
     """
     for one, reply in replies.items():
         if isinstance(reply, AcsardError):

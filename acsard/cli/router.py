@@ -25,8 +25,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "file", type=Path, metavar="FILE", help="Zenoh's configuration file (JSON5)"
     )
-    # The subcommand starts a child of itself with this option. The child is the router, and ends
-    # when its standard input is closed.
+    # The subcommand starts itself as a child process with this option. The child is the router, and
+    # ends when its standard input is closed.
     parser.add_argument("--supervised", action="store_true", help=argparse.SUPPRESS)
 
 
@@ -43,7 +43,10 @@ def main(args: argparse.Namespace) -> int:
 
 
 async def _kept(file: str, log: Log) -> int:
-    """Keep a router process running until a signal arrives, or until its files cannot be used."""
+    """Keep a router process running, and return the exit code.
+
+    It ends when a signal arrives, or when its configuration or certificates cannot be used.
+    """
     keeper = asyncio.ensure_future(keep_running(["router", file], log.event, ROUTER))
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         asyncio.get_running_loop().add_signal_handler(number, keeper.cancel)

@@ -72,7 +72,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def options(args: argparse.Namespace) -> dict[str, object]:
-    """Return the options by dotted key; None for an option that is not given."""
+    """Return the value of each option by its dotted configuration key; None if it is not given."""
     return {
         "mcu.port": args.port,
         "mcu.baud_rate": args.baud_rate,
@@ -115,8 +115,8 @@ def main(args: argparse.Namespace) -> int:
         config.robot.id,
     ]
     gateway += ["--namespace", config.ros.namespace]
-    # The systemd watchdog ends a hanging daemon with SIGABRT. The traceback of the hang then goes
-    # to standard error.
+    # The systemd watchdog ends a hanging daemon with SIGABRT. With this handler, the daemon then
+    # writes a traceback of the hang to standard error.
     if sys.stderr is not None:  # it is None if standard error was closed before the start
         faulthandler.enable()
     try:
@@ -137,10 +137,10 @@ def main(args: argparse.Namespace) -> int:
 
 
 def settings_file(where: str, config: Config, given: dict[str, object]) -> SettingsFile:
-    """Return the `SettingsFile` at `where`, which reads the file as a restart would.
+    """Return the `SettingsFile` of the configuration file at `where`.
 
-    `config` is the present configuration. `given` maps dotted keys to the values from the command
-    line, which override the file.
+    It parses the file as the daemon would after a restart. `config` is the present configuration.
+    `given` maps dotted keys to the values from the command line, which override the file.
     """
     overrides = tables(given, by_environment())
     file = Path(where).absolute() if Path(where).is_file() else None
@@ -177,7 +177,7 @@ def _bus(config: Config) -> str:
 
 
 def reach(args: argparse.Namespace) -> str:
-    """Return the options with which other tools find this daemon, as text for the banner."""
+    """Return the options that another tool needs to reach this daemon, as text for the banner."""
     listens = args.listen and reachable(args.listen)
     given = (("--config", args.config), ("--connect", listens), ("--id", args.id))
     return "".join([f" {option} {shlex.quote(value)}" for option, value in given if value])
@@ -196,7 +196,7 @@ def banner(
 
     Args:
         trouble: why the serial device `device` cannot be opened yet, or "".
-        reach: the options with which other tools find this daemon.
+        reach: the options that another tool needs to reach this daemon.
         served: whether the robot's web page is served.
     """
     port = f"{device} at {config.mcu.baud_rate} baud"

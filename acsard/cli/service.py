@@ -1,5 +1,5 @@
-"""Install the systemd unit, the stop script, the udev rules and a first configuration, then enable
-and start the service; or remove all of that.
+"""Install the systemd units, the stop script, the udev rules and a first configuration, then enable
+and start the service; or remove the service; or show its status.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
             action.add_argument(
                 "--force",
                 action="store_true",
-                help="also replace or remove files that differ from what this version installs",
+                help="also replace or remove files that differ from those of this version",
             )
         if name == "uninstall":
             action.add_argument(

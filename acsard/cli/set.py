@@ -1,13 +1,14 @@
 """Change settings of the running robot: limits, timeouts, covariances, publishing rates, the log
 level. Either all given settings change or none. The daemon checks them like the configuration file,
-logs them and publishes them on the key `config`. They last until the daemon's next start; only a
-lowered speed, acceleration or jerk survives it, except on the simulator. With --keep the robot also
-writes them into its own configuration file, and the answer names that file. With --write this tool
-writes them into the configuration file of this machine. Neither --keep nor --write changes a file
-for a source's timeout: edit [[commands.sources]] yourself. The robot decelerates to a lowered speed
-limit. Without a setting, list the settings that can be changed. If --id names several robots, all
-of them get the settings at the same time, and each line has the answer of one robot. The exit code
-is 1 if a robot refuses, and 69 if one does not answer.
+logs them and publishes them on the key `config`. They last until the daemon's next start. Lowered
+limits of speed, acceleration and jerk are an exception: they also survive the next start, but not
+on the simulator. With --keep the robot also writes the settings into its own configuration file,
+and the answer names that file. With --write this tool writes them into the configuration file of
+this machine. Neither --keep nor --write changes the file for a source's timeout: edit
+[[commands.sources]] yourself. If a speed limit is lowered, a faster robot decelerates to it.
+Without a setting, list the settings that can be changed. If --id names several robots, all of them
+get the settings at the same time, and each line has the answer of one robot. The exit code is 1 if
+a robot refuses, and 69 if a robot does not answer.
 """
 
 from __future__ import annotations
@@ -131,15 +132,16 @@ def _require_for_many(args: argparse.Namespace, settings: dict[str, Plain]) -> N
 
 
 def _lasting(message: str) -> str:
-    """Return the daemon's answer, and until when the changed settings stay in force."""
+    """Return the daemon's answer, extended by how long the changed settings stay in force."""
     until = _until(message)
     return f"{message}; {until}" if until else message
 
 
 def _until(message: str) -> str:
-    """Return a text which says until when the settings stay in force, "" if none has changed.
+    """Return a text that says how long the changed settings stay in force.
 
-    `message` is the daemon's answer: "KEY = NEW (was OLD), KEY = NEW (was OLD)".
+    `message` is the daemon's answer: "KEY = NEW (was OLD), KEY = NEW (was OLD)". Returns "" if the
+    daemon has changed nothing.
     """
     changes = {key: (new, old) for key, new, old in _CHANGE.findall(message)}
     if not changes:
@@ -154,13 +156,17 @@ def _until(message: str) -> str:
     if len(kept) == len(changes):
         return "a lowered limit survives a restart of the daemon, except on the simulator"
     return (
-        f"until the daemon's next start; only {', '.join(kept)} is lowered and survives a restart, "
-        "except on the simulator"
+        f"until the daemon's next start, except {', '.join(kept)}: a lowered limit survives a "
+        "restart. On the simulator, no setting survives a restart"
     )
 
 
 def _limits(pairs: Mapping[str, Sequence[str]], at: int) -> LimitsConfig:
-    """Return limits with the new (`at` = 0) or the old values (`at` = 1) of these changes."""
+    """Return the limits with one value of each change.
+
+    `pairs` maps each changed key to the pair (new value, old value). `at` is 0 for the new values
+    and 1 for the old values. Other limits have their defaults.
+    """
     return LimitsConfig(**{key.removeprefix(TABLE): float(pair[at]) for key, pair in pairs.items()})
 
 

@@ -1,5 +1,5 @@
 """Simulate the microcontroller's side of the serial protocol on a pty, until Ctrl-C. The tool
-prints the device for `acsard run --port`.
+prints the `acsard run` command with the device of the pty.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _make_link(link: Path, device: str) -> None:
-    """Make a symbolic link to the device. It may replace an older link but no other file."""
+    """Make a symbolic link to the device. An older link is replaced, but another file is not."""
     try:
         if link.is_symlink():
             if link.exists():
@@ -87,7 +87,7 @@ def _make_link(link: Path, device: str) -> None:
 
 
 def _remove_link(link: Path, device: str) -> None:
-    """Remove the symbolic link, unless another program has replaced it since."""
+    """Remove the symbolic link, unless another program has replaced it in the meantime."""
     if link.is_symlink() and os.readlink(link) == device:
         link.unlink()
 

@@ -1,5 +1,6 @@
-"""Make certificates for a bus that other machines can reach. Needs the library cryptography; if it
-is missing, a message gives the command that installs it.
+"""Make certificates for a bus that other machines can reach, and the configuration of a fleet's
+router. Needs the library cryptography; if it is missing, a message gives the command that installs
+it.
 """
 
 from __future__ import annotations
@@ -72,8 +73,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "renew",
         help="replace a certificate that expires soon with a new one from the same authority",
         description="Replace the robot's certificate before it expires. With --name, replace "
-        "not the robot's certificate but one that `tls add` made. The new certificate has the "
-        "names and addresses of the old one. All other certificates stay valid.",
+        "another certificate, which `tls add` made. The new certificate has the names and "
+        "addresses of the old certificate. All other certificates stay valid.",
     )
     renew.add_argument(
         "--name",
@@ -145,7 +146,8 @@ def main_init(args: argparse.Namespace) -> int:
         require_tomlkit()
         require_changeable(args.write, keys, new=True)
     else:
-        # The file may already have https:// or tls/ addresses, which need these certificates.
+        # Set bus.tls in this call, because the file may already have https:// or tls/ addresses,
+        # which are not valid without certificates.
         wanted: Mapping[str, object] = keys(load(None, {"bus.tls": str(directory)})[1])
     names = certificates.init(args.directory, args.address, args.days, force=args.force)
     if args.write:
@@ -223,21 +225,21 @@ def _certified(names: list[str]) -> str:
 
 
 def _admit_service(directory: Path) -> None:
-    """Let the installed TLS gateway use the certificates in `directory`, with a systemd drop-in.
+    """Write a systemd drop-in that lets the TLS gateway use the certificates in `directory`.
 
-    Does nothing if the service is not installed or this user is not root.
+    Does nothing if the service is not installed or if this user is not root.
     """
     step = service.admitting(directory)
     if step is None:
         return
     step.do()
-    print(f"{step}\nThis file is for the service's TLS gateway. Check its networks, then run:")
+    print(f"{step}\nThis file sets which networks reach the TLS gateway. Check them, then run:")
     print("systemctl daemon-reload && systemctl restart acsard\n")
 
 
 def _name(text: str) -> str:
-    # The names in `[access]` follow the same rule. The name becomes a part of keys on the bus, and
-    # here also the name of a directory.
+    # The names in `[access]` follow the same rule, because the name becomes a part of keys on the
+    # bus. Here it also becomes the name of a directory.
     if not NAME.fullmatch(text) or text in (".", ".."):
         raise argparse.ArgumentTypeError(
             f"{text!r} is not a name for a certificate: 1 to 64 letters, digits, spaces and "
@@ -263,9 +265,9 @@ TAKEN = """\
 `acsard router`, `acsard web` and the gateway of `acsard run` use the new certificate within 5 s by
 themselves. For this, the gateway and the router disconnect their clients for about a second, and a
 robot that one of those clients drives ramps to zero. If you started `acsard gateway` by hand, it
-ends with code 1: start it again. A robot that connects to a router uses the new certificate for its
-next connection. Until then, `acsard doctor` warns of the old certificate; a restart of `acsard run`
-ends the warning at once.
+ends with code 1: start it again. A robot that connects to a router uses the new certificate from
+its next connection on. Until then, `acsard doctor` warns of the old certificate; a restart of
+`acsard run` ends the warning immediately.
 
 A systemd service has copies of the files. To renew the copies, run these commands on the machine
 of the service. The robot keeps driving meanwhile:
@@ -275,7 +277,7 @@ of the service. The robot keeps driving meanwhile:
 """
 
 _LINES = """\
-On the robot, in acsard.toml (--write FILE does it):
+Write into acsard.toml on the robot (--write FILE does this for you):
 
 [bus]
 listen = {listen}
@@ -285,7 +287,7 @@ tls = "{directory}"
 
 _NEXT = """\
 Wrote {directory}:
-  {ca}, {certificate}, {key}   the robot's
+  {ca}, {certificate}, {key}   the robot's files
   ca-key.pem                       the authority's key: a person who has it can admit anyone.
                                    Move it off the robot; `tls add` and `tls renew` need it
   clients/<role>/                  one directory each for viewer, operator, maintainer

@@ -1,4 +1,4 @@
-"""List every key of the daemon. No daemon has to run."""
+"""List every key of the daemon. The daemon does not need to run."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def ros_table(config: Config) -> Topics:
-    """Return the ROS topics and services that are switched on, each with its bus key."""
+    """Return the ROS topics and services that the configuration enables, each with its bus key."""
     ros = config.ros
     known = source_keys(source.name for source in config.commands.sources)
     rows = []

@@ -48,8 +48,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--record",
         metavar="DIRECTORY",
-        help="directory whose recordings the page offers, until the robot reports where it "
-        "records (default: record.directory)",
+        help="directory of the recordings that the page lists. If the robot reports its own "
+        "directory, the page uses that one (default: record.directory)",
     )
     doing = parser.add_mutually_exclusive_group()
     doing.add_argument(
@@ -61,7 +61,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     doing.add_argument(
         "--revoke",
         metavar="NAME",
-        help="revoke a token; `acsard web` disconnects the pages that use the token at once",
+        help="revoke a token; `acsard web` immediately disconnects the pages that use it",
     )
     parser.add_argument(
         "--name",
@@ -184,7 +184,8 @@ def _vault(args: argparse.Namespace, config: Config) -> Vault:
 
 
 def _list(vault: Vault) -> int:
-    # Import this late: the server runs for months without tables, which would take 5 MB.
+    # Import this here and not at the top: the page's server never prints a table, and would lose
+    # 5 MB of memory for months.
     from acsard.terminal.output import show, table
 
     tokens, now_s = vault.all(), time.time()
@@ -216,6 +217,6 @@ def _clock(seconds: int) -> str:
 def _name(text: str) -> str:
     if not NAME.match(text):
         raise argparse.ArgumentTypeError(
-            f"{text!r} is not a name: use 1 to 32 of A-Z a-z 0-9 _ . -"
+            f"{text!r} is not a name: use 1 to 32 characters of A-Z a-z 0-9 _ . -"
         )
     return text

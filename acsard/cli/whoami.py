@@ -1,6 +1,6 @@
 """Ask the robot for the role of this client: viewer, operator or maintainer. Over TLS the
 certificate decides; on the robot's own machine every client is maintainer. The exit code is 69 if
-no daemon answers, and 77 if none answers this client's certificate, which then may have no role.
+no daemon answers. Over TLS it is 77 instead, because this client's certificate may have no role.
 """
 
 from __future__ import annotations

@@ -11,24 +11,25 @@ typed messages (`acsard.core.messages.schema`). The daemon refuses late commands
 zero before a sender may move the robot. The client does what these rules require: it signs, numbers
 and stamps its commands, and sends zeros before each drive. When the block ends, also by an
 exception, the client sends a zero if its last command was not zero. `drive` raises an error if the
-robot does not follow. When `drive` returns, the robot stands, unless something else moves it.
+robot does not follow the commands. When `drive` returns, the robot stands, unless something else
+moves it.
 
-Arguments that you leave out come from the configuration file that the environment variable
-ACSARD_CONFIG names (`bus.listen`, `robot.id`, `bus.tls`), as on the command line. Without that
-variable, the client connects to the robot `acsar` on this machine. It ignores a file in the current
-directory, so that a program reaches the same robot wherever it is started.
+If you leave out an argument, its value comes from the configuration file that the environment
+variable ACSARD_CONFIG names (`bus.listen`, `robot.id`, `bus.tls`). Without that variable, the
+client connects to the robot `acsar` on this machine. Unlike the command line, the client ignores an
+`acsard.toml` in the current directory, so a program reaches the same robot wherever it is started.
 
-Errors are `AcsardError`s, and most are also the matching built-in exception. Their text says what
-to do:
+All errors are `AcsardError`s, and most are also the built-in exception in the second column. The
+text of an error says what to do:
 
     UnreachableError   ConnectionError  no daemon listens at the endpoint
     NoAnswerError      TimeoutError     the robot or the key does not exist, or you may not query it
     ReplyError         RuntimeError     the daemon reports a failure; a service that refuses says so
                                         in its reply instead
-    NotDrivenError     RuntimeError     the robot does not follow your drive: it is stopped or in
-                                        fault, another client drives, or you may not; or your
-                                        program sent no command for 0.5 s, because it stood still or
-                                        the network failed; the text names the possible causes
+    NotDrivenError     RuntimeError     the robot does not follow your commands: it is stopped or in
+                                        fault, another client drives it, or your role may not drive;
+                                        or your program sent no command for 0.5 s, because it was
+                                        suspended or the network failed; the text names the causes
     NotPermittedError  PermissionError  your certificate does not allow this, or you may not read
                                         its files
     CertificateError   ValueError       the certificates do not exist or cannot be used

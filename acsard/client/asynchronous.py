@@ -1,4 +1,4 @@
-"""The client for asyncio programs. Calls that block run in threads."""
+"""The client for asyncio programs. Calls that would block the event loop run in threads."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class AsyncClient:
         self._client.send(linear, angular)
 
     async def drive(self, linear: float, angular: float = 0.0, *, seconds: float) -> None:
-        """Drive as `Client.drive` does. If the drive is cancelled, send zeros at once."""
+        """Drive as `Client.drive` does. If the task is cancelled, send zeros immediately."""
         try:
             with closing(drive(self._client, linear, angular, seconds)) as steps:
                 for pause in steps:
@@ -74,7 +74,7 @@ class AsyncClient:
         return await in_thread(lambda: self._client.set(settings, keep=keep), 2 * REPLY_TIMEOUT_S)
 
     async def get(self, name: str) -> Any:
-        """Return the last value of a key, as `Client.get` does."""
+        """Return the last message on a key, as `Client.get` does."""
         return await in_thread(lambda: self._client.get(name), 2 * REPLY_TIMEOUT_S)
 
     async def whoami(self) -> Identity:

@@ -1,9 +1,10 @@
 """The rules for a sender of commands: what it sends and when, and why a command has no effect.
 
 This module is pure. Every program that commands the robot uses these time limits. A program that
-forwards the commands of a person (`Wish`) uses a `Commander`, which repeats no command. So the
-robot stops when the person, the panel or the network falls silent. A new command replaces one that
-has not been sent yet. A zero is sent however old it is. A drive ends with a zero.
+forwards the commands of a person (`Wish`), for example from a panel in a browser, uses a
+`Commander`. A `Commander` never repeats a command, so the robot stops when the person, the panel or
+the network falls silent. A new command replaces a command that still waits to be sent. A zero is
+sent even if it is old. A drive ends with a zero.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ SPACING_S = 0.003
 faster than 1000 per second."""
 
 AGAIN_S = 0.02
-"""Pause before a zero is sent a second time, s. The first zero may be lost: a busy daemon that
-receives several commands at once drops some, because they seem to come too fast."""
+"""Pause before a zero is sent a second time, s. The first zero may be lost: a busy daemon may
+receive several commands in a burst, and drops some because they seem to come too fast."""
 
 OPENING_S, OPENING_PERIOD_S = 0.4, 0.01
 """Duration and period of the zeros at the beginning of a drive, s. The daemon checks for 0.25 s
@@ -41,9 +42,9 @@ ZEROS = 3
 
 GRACE_S = 0.5
 """Longest time for which commands may have no effect, s, before the program informs the operator or
-ends the drive. If the program itself sends no command for longer, the drive ends too. The time
-exceeds the first 0.25 s of a new sender, whose commands have no effect yet, and a short delay of a
-known sender."""
+ends the drive. If the program itself sends no command for longer, the drive ends too. The time is
+longer than the first 0.25 s of a new sender, in which its commands have no effect yet, and longer
+than a short delay of a known sender."""
 
 SILENCE_NS = 3 * NS_PER_S // 10
 """Time without a command, ns, after which the robot is assumed to brake. It is a little longer than
@@ -52,14 +53,15 @@ a source's default timeout of 0.25 s."""
 GATHER_NS = NS_PER_S // 25
 """Time for which the first command after a silence is held, ns, to see whether a burst follows. A
 panel that sends at 20 Hz sends at most one command in this time. After a burst of more than `CROWD`
-commands, the next command waits again."""
+commands, the next command is held in the same way."""
 
 CROWD = 5
 """Largest number of commands that a panel is assumed to send within `GATHER_NS` (125 Hz). If more
 commands arrive, they have waited in a queue, which may contain further commands."""
 
 STALE_NS = NS_PER_S // 10
-"""Age above which a nonzero command is dropped, ns, because the operator may no longer want it."""
+"""Age of a nonzero command, ns, above which it is dropped, because the operator may no longer want
+it."""
 
 DRIVES_NS = NS_PER_S // 2
 """Time for which a sender counts as driving after its last nonzero command, ns."""
@@ -74,7 +76,8 @@ NEVER = ("inactive", "stopped", "fault", "shutdown")
 class Wish(Struct, frozen=True):
     """A command to forward: the twist that a person requests.
 
-    `stamp_ns` is its time on the sender's clock, ns, or None for a sender without a clock.
+    `stamp_ns` is the time of the command on the sender's clock, ns, or None for a sender without a
+    clock.
     """
 
     twist: Twist
@@ -87,17 +90,17 @@ class Commander:
     """Decides which commands of one sender are sent, and when. Only the newest command can wait.
 
     Args:
-        leads: whether to send a zero before the first command after each silence. It is for a
+        leads: whether to send a zero before the first command after each silence. Set this for a
             sender that sends no zeros of its own.
-        gathers: whether to drop a burst of commands after a silence, because a congested link or a
-            stalled process has delayed it. It is for a sender without stamps, because the daemon
-            cannot measure the delay of such a sender.
+        gathers: whether to drop a burst of commands that arrives after a silence, because a
+            congested link or a stalled process must have delayed it. Set this for a sender without
+            stamps, because the daemon cannot measure the delay of such a sender.
     """
 
     def __init__(self, *, leads: bool = False, gathers: bool = False) -> None:
         self.replaced = self.stale = 0
-        """Numbers of commands that were not sent. `replaced`: a newer command came. `stale`: they
-        were too old or came in a burst."""
+        """Two counters of commands that were not sent. `replaced` counts those that a newer command
+        replaced, and `stale` counts those that were too old or came in a burst."""
         self._leads, self._gather_ns = leads, GATHER_NS if gathers else 0
         self._wish: Wish | None = None
         self._last = Wish(REST)
@@ -117,7 +120,7 @@ class Commander:
         """Monotonic time at which a nonzero command last arrived, ns; None after a zero."""
 
     def take(self, wish: Wish, now_ns: int) -> int | None:
-        """Store a command that has arrived, in place of one that still waits to be sent.
+        """Store a command that has arrived. It replaces a command that still waits to be sent.
 
         `now_ns` is the monotonic time, as in the other methods. Returns the time since the previous
         command, ns, if it is longer than `SILENCE_NS`. Returns None otherwise, and for the first
@@ -140,7 +143,10 @@ class Commander:
         return silence if begins else None
 
     def due_ns(self) -> int | None:
-        """Return the monotonic time from which `send` returns a command, ns; None if none waits."""
+        """Return the monotonic time from which `send` returns a command, ns.
+
+        Returns None if no command waits to be sent.
+        """
         if self._lead:
             return self._came_ns
         return None if self._wish is None else self._hold_until_ns
@@ -166,11 +172,11 @@ class Commander:
         return wish
 
     def end(self, now_ns: int, timeout_s: float = LONGEST_S) -> Wish | None:
-        """Discard the command that waits, and end the drive of this sender.
+        """Discard the command that waits to be sent, and end the drive of this sender.
 
         Returns a zero to send if the robot may still follow a nonzero command of this sender, else
-        None. `timeout_s` is the timeout of this sender's source, s. When it has passed
-        since the last nonzero command, a zero would only stop the next sender.
+        None. `timeout_s` is the timeout of this sender's source, s. When this time has passed since
+        the last nonzero command, a zero would only stop the next sender.
         """
         moved_ns, self._moved_ns = self._moved_ns, None
         self._wish = self._asked_ns = None
@@ -192,11 +198,14 @@ class Commander:
 
     @property
     def moves(self) -> bool:
-        """Whether the last command that arrived has requested a speed, however long ago."""
+        """Whether the last command that arrived was not zero, even if it arrived long ago."""
         return self._asked_ns is not None
 
     def drives(self, now_ns: int) -> bool:
-        """Return whether the sender has requested a speed within the last `DRIVES_NS`."""
+        """Return whether the last command was not zero and arrived within the last `DRIVES_NS`.
+
+        `now_ns` is the monotonic time, ns.
+        """
         return self._asked_ns is not None and now_ns - self._asked_ns <= DRIVES_NS
 
 
@@ -210,8 +219,8 @@ class Sender:
         """Return the signature of the next command.
 
         The daemon refuses a command whose stamp is older than that of an earlier command. If a
-        sender uses two sources, its commands may be signed in another order than their stamps. So
-        that a zero is never refused, it gets at least the newest stamp of this sender.
+        sender uses two sources, its commands may be signed in another order than their stamps. A
+        zero must never be refused, so its stamp is at least the newest stamp of this sender.
 
         Args:
             stamp_ns: the time of the command on the sender's clock, ns, or None without a clock.
@@ -226,10 +235,10 @@ class Sender:
 
 
 def objection(state: RobotState, source: str, sender: str) -> str:
-    """Return why the robot does not follow the commands of `sender` as `source`; "" if it does.
+    """Return why the robot does not follow the commands of a sender, or "" if it follows.
 
-    `state` is the newest state of the robot, `source` is the name of a command source, and `sender`
-    is the public name of the sender.
+    `state` is the newest state of the robot. `sender` is the public name of the sender, and
+    `source` is the command source of its commands.
     """
     if state.mode in NEVER:
         return state.reason
@@ -255,7 +264,7 @@ def objection(state: RobotState, source: str, sender: str) -> str:
 
 
 def no_command(source: str) -> str:
-    """Return the text which says that the daemon receives no command of the source `source`."""
+    """Return the reason for the operator if the daemon receives no command of `source`."""
     return (
         f"the daemon receives no command of source {source}; `acsard top` shows whether the daemon "
         "refuses commands"
@@ -263,7 +272,7 @@ def no_command(source: str) -> str:
 
 
 def heard(state: RobotState, source: str) -> bool:
-    """Return whether commands of this source arrive at the daemon, even if they are late."""
+    """Return whether commands of this source arrive at the daemon. Late commands count too."""
     return any(one.name == source and one.waits_for != "a command" for one in state.sources)
 
 

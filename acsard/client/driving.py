@@ -1,4 +1,4 @@
-"""One drive of `acsard.client`: sends the commands, and checks that the robot follows them.
+"""Sends the commands of one drive of `acsard.client`, and checks that the robot follows them.
 
 The daemon does not answer commands. It reports in `state` why the robot does not follow a command.
 A drive therefore subscribes to `state`. If the robot does not follow, the drive ends with an error
@@ -35,7 +35,7 @@ SETTLED_S = 0.2
 after an action, the daemon sent it after the action."""
 
 STANDS = 0.01, 0.02
-"""Linear speed, m/s, and turn rate, rad/s, below which the robot counts as standing."""
+"""The robot counts as standing below this linear speed, m/s, and below this turn rate, rad/s."""
 
 SLOWER, SLOWS_S = 0.97, 1.0
 """The robot is still slowing down if, within `SLOWS_S` s, its speed falls below the fraction
@@ -46,7 +46,7 @@ CLOSED = "the connection to the daemon was closed while the robot was driving"
 
 
 class UnheardError(NotDrivenError):
-    """The robot does not follow, and the daemon receives no command of this client's source."""
+    """The error of a drive if the daemon receives no commands from the source of this client."""
 
 
 class Driven(Followed, Protocol):
@@ -54,7 +54,7 @@ class Driven(Followed, Protocol):
 
     source: str
     sender: str
-    """Public name of this client, by which the daemon identifies its commands."""
+    """Public name by which the daemon identifies the commands of this client."""
 
     def send(self, linear: float, angular: float = 0.0) -> None:
         """Send one command: `linear` m/s, `angular` rad/s (left is +)."""
@@ -69,8 +69,9 @@ def drive(
     generator. `linear` is in m/s and `angular` in rad/s (left is +).
 
     Raises:
-        NotDrivenError: The robot does not follow, and the text is the daemon's reason; or this
-            program sent no command for more than `GRACE_S` before it began to stop the robot.
+        NotDrivenError: The robot does not follow the commands, and the text is the daemon's reason.
+            Or, before it began to stop the robot, this program sent no command for more than
+            `GRACE_S` s.
         NoAnswerError: The daemon is silent.
         UsageError: An argument is not a finite number, or `seconds` is not above 0.
     """
@@ -82,8 +83,8 @@ def drive(
         )
     checks = _Drive(robot)
     try:
-        # Send zeros before each drive, not only before the first one. Since the last drive, the
-        # robot may have been stopped and cleared, or its daemon restarted.
+        # Send zeros before each drive, not only before the first one. Since the previous drive, the
+        # robot may have been stopped and cleared, or the daemon may have restarted.
         yield from _opening(checks)
         end, grace = clock.steady_s() + seconds, min(GRACE_S, seconds / 2)
         while (left := end - clock.steady_s()) > 0:
@@ -122,7 +123,10 @@ def _opening(checks: _Drive) -> Iterator[float]:
 
 
 def _stopping(checks: _Drive) -> Iterator[float]:
-    """Send zeros until the robot stands, or something else moves it. Yield the pauses, s."""
+    """Send zeros, and yield the pauses between them, s.
+
+    End when the robot stands, or when it no longer slows down, because something else moves it.
+    """
     begun = since = clock.steady_s()
     watch, slowest = checks.watch, math.inf
     while since + SLOWS_S > (now := clock.steady_s()) or watch.age(now) > QUIET_S:
@@ -150,10 +154,11 @@ class _Drive:
     def __init__(self, robot: Driven) -> None:
         self._robot = robot
         self.watch = Watch(robot, clock.steady_s())
-        # To subscribe may take long, and no command is due before the subscription.
+        # Read the clock again here, because the subscription above may take long.
         self._fine = self._stepped = clock.steady_s()
         self.objection: str | None = None
-        """Why the robot does not follow; "" if it follows, None before the first state."""
+        """Why the robot does not follow the commands; "" if it follows, None before the first
+        state."""
 
     @property
     def hopeless(self) -> bool:
@@ -172,8 +177,8 @@ class _Drive:
         """Raise `NotDrivenError` if more than `GRACE_S` has passed since the last call.
 
         The process may have been stopped, its computer may have been suspended, or the bus may not
-        have accepted the command. The states that arrived before the pause seem to arrive now, so
-        they cannot show that time has passed.
+        have accepted the command. The received states cannot reveal such a pause, because old
+        states that waited in the queue seem to arrive now.
         """
         now = clock.steady_s()
         paused, self._stepped = now - self._stepped, now
@@ -185,7 +190,7 @@ class _Drive:
             )
 
     def look(self) -> None:
-        """Process the states that have arrived. Raises `NoAnswerError` after a long silence."""
+        """Process the received states. Raises `NoAnswerError` if the daemon has been silent."""
         now, watch = clock.steady_s(), self.watch
         try:
             news = watch.look(now)
@@ -206,9 +211,10 @@ class _Drive:
             )
 
     def require(self, grace: float) -> None:
-        """Raise `NotDrivenError` if the robot has not followed for `grace` s, or never will.
+        """Process the received states, and raise `NotDrivenError` if the robot does not follow.
 
-        First process the states that have arrived.
+        It is raised if the robot has not followed the commands for `grace` s, or if the state shows
+        that the daemon will keep refusing the commands.
         """
         self.look()
         if not self.objection:

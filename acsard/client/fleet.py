@@ -1,8 +1,8 @@
 """Follows many robots: whether each daemon is present, its newest state and its version.
 
 A daemon is present while Zenoh shows its liveliness token. Zenoh's threads store the newest states
-undecoded, and the thread that reads the rows decodes them. Of the methods that this thread calls
-repeatedly, only `Fleet.ask()` may wait for the bus.
+undecoded, and the thread that calls `Fleet.rows()` decodes them. Of the methods that this thread
+calls repeatedly, only `Fleet.ask()` may wait for the bus.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from acsard.host import clock
 from acsard.host.mailbox import Mailbox
 
 MOST = 1000
-"""Maximum number of robots, because any client of the bus can invent robot names."""
+"""Maximum number of robots. It is limited because any client of the bus can invent robot ids."""
 
 
 class Row(Struct, frozen=True):
@@ -34,7 +34,8 @@ class Row(Struct, frozen=True):
 
     robot_id: str
     here: bool | None
-    """Whether the liveliness token of the robot's daemon is present; None if it was never seen."""
+    """Whether the liveliness token of the robot's daemon is present; None if no token was ever
+    seen."""
     state: RobotState | None
     age: float
     """Age of `state`, s; inf before a state has proved that the daemon runs."""
@@ -52,7 +53,10 @@ class _Known:
         self.begin()
 
     def begin(self) -> None:
-        """Begin to follow the robot, or begin again when it reappears. Its queries are then due."""
+        """Begin to follow the robot, or begin again when it reappears.
+
+        The queries of its keys `state` and `info` are due immediately.
+        """
         self.since = self.info_due = clock.steady_s()
         self.follower = Follower(self.since, FLEET_ASK_S)
         self.follower.due = self.since
@@ -72,8 +76,8 @@ class Fleet:
             robot: A client of any robot on the same bus.
             ids: The ids of the robots, or "*" for all. A robot that is named here is never dropped.
             most: Maximum number of robots.
-            forget_s: Time without a state, s, after which any other robot is dropped unless its
-                liveliness token is present.
+            forget_s: Time without a state, s, after which a robot that `ids` does not name is
+                dropped, unless its liveliness token is present.
         """
         self._robot, self._ids, self._most, self._forget_s = robot, ids, most, forget_s
         self._lock = Lock()
@@ -109,7 +113,10 @@ class Fleet:
             return [self._row(name, one, now) for name, one in self._known.items()]
 
     def due(self) -> list[tuple[str, str]]:
-        """Return the due queries for `ask()`: pairs of robot id and key. Plan the next queries."""
+        """Return the queries that are due, as pairs of robot id and key, for the method `ask()`.
+
+        Also set the times of the next queries.
+        """
         now, due = clock.steady_s(), []
         with self._lock:
             for name, one in self._known.items():
@@ -140,7 +147,7 @@ class Fleet:
         follower, state = one.follower, one.follower.state
         silent = follower.silent(now)
         if one.here and not follower.heard and not silent:
-            state = None  # wait for the robot's own answer
+            state = None  # it may be an old one from a storage: wait for the daemon's own answer
         age = follower.age(now) if follower.heard else math.inf
         return Row(name, one.here, state, age, one.version, silent)
 
@@ -166,7 +173,7 @@ class Fleet:
             return self._known.get(name)
 
     def _forget_one(self) -> None:
-        """Drop the robot that has been absent for longest. Robots that `ids` names always stay."""
+        """Drop the robot that has been absent longest. Never drop a robot that `ids` names."""
         gone = [(one.since, name) for name, one in self._known.items() if not one.here]
         for _, name in sorted(one for one in gone if one[1] not in self._ids)[:1]:
             del self._known[name]

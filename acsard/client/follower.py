@@ -1,11 +1,11 @@
 """Follows the `state` of one robot: its newest value, its age, and whether the daemon is silent.
 
 `Follower` is pure, and `Watch` connects it to the bus. All programs use the time limits of this
-module, so they all report a silent robot equally soon.
+module, so all of them report a silent robot after the same time.
 
-A storage of a router answers queries too: for a robot that is off, with the last state. A published
-state never comes from a storage, so it always proves that the daemon runs. An answer to a query
-proves this only if it is newer than an earlier state.
+A storage on a router answers queries too. For a robot that is off, it sends the last state of that
+robot. A published state never comes from a storage, so it always proves that the daemon runs. An
+answer to a query proves this only if it is newer than an earlier state.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from acsard.daemon.bus.subscription import QUEUED, Subscription, encoded
 from acsard.host.mailbox import Mailbox
 
 ASK_S = 0.3
-"""Time without a new state, s, after which the client queries `state`. A robot may be configured to
-publish its state seldom."""
+"""Time without a new state, s, after which the client queries `state`. The query is for a robot
+that is configured to publish its state seldom."""
 
 QUIET_S = 0.5
 """Age of a state, s, above which a program must not base an action on the state."""
@@ -35,8 +35,8 @@ FIRST_S = 2.0
 """Time, s, within which the first message on a key arrives if the robot works normally."""
 
 FLEET_ASK_S = 2.0
-"""Time without a new state, s, after which a program that follows many robots queries a `state`.
-The time is longer than `ASK_S`, because such a program sends many queries."""
+"""Time without a new state of a robot, s, after which a program that follows many robots queries
+the robot's `state`. It is longer than `ASK_S`, because such a program sends many queries."""
 
 STATE = "state"
 
@@ -50,7 +50,7 @@ STEADY = ("lines", "lines_sent", "commands")
 class Follower:
     """The newest state of one robot. All times are in s on the same monotonic clock.
 
-    This clock must also advance during a suspend, as `clock.steady_s` does.
+    This clock must also advance while the computer is suspended, as `clock.steady_s` does.
     """
 
     def __init__(self, now: float, ask_s: float = ASK_S) -> None:
@@ -88,12 +88,12 @@ class Follower:
             self.published(state, now)
             return True
         if held is None:
-            # A storage may have sent this first answer. Query again at once to find out.
+            # A storage may have sent this first answer. Query again immediately to find out.
             self.state, self.due = state, now
         return False
 
     def asks(self, now: float) -> bool:
-        """Return whether the caller must query `state` now. If so, plan the next query."""
+        """Return whether the caller must query `state` now. If so, set the next query's time."""
         if now < self.due:
             return False
         self.due = now + self._ask_s
@@ -118,9 +118,10 @@ class Follower:
 
 
 def restarted(before: RobotState | None, state: RobotState) -> bool:
-    """Return whether the daemon has restarted between two states.
+    """Return whether the daemon restarted between the two states `before` and `state`.
 
     The sign of a restart is that a counter in `STEADY` is lower in `state` than in `before`.
+    Returns False if `before` is None.
     """
     return before is not None and any(
         state.counters.get(name, 0) < before.counters.get(name, 0) for name in STEADY
@@ -156,10 +157,10 @@ class Watch(Follower):
         """Replies to queries, which a thread of Zenoh puts here."""
 
     def look(self, now: float) -> list[RobotState]:
-        """Process the states that have arrived, and return the new ones.
+        """Process the received states, and return the new ones.
 
-        If no state has arrived for some time, send a query, whose reply a later call processes.
-        `now` is the present time, s. Raises `ZError` if the session was closed.
+        If no state has arrived for some time, send a query. A later call processes its reply. `now`
+        is the present time, s. Raises `ZError` if the session was closed.
         """
         news = []
         for _ in range(QUEUED):  # bounded, so that a flood cannot block the caller
@@ -188,10 +189,10 @@ class Watch(Follower):
             return None
 
     def objection(self, source: str, sender: str, now: float) -> str:
-        """Return why the commands of `sender` as `source` have no effect at the time `now`, s.
+        """Return why the robot does not follow a sender's commands at the time `now`, s.
 
-        Returns "" if the robot follows them, and before the first state. `source` is the name of a
-        command source, and `sender` is the public name of the sender.
+        Returns "" if the robot follows, or if no state has arrived yet. `sender` is the public name
+        of the sender, and `source` is the command source of its commands.
         """
         if self.silent(now):
             return (

@@ -1,8 +1,8 @@
 """Sends the commands of several senders from one thread, so that no caller waits for the bus.
 
-Each sender has a `Commander`, which keeps only its newest command. When a sender ends, the program
-must call `Outbox.release()`. The last zero of this sender is then sent, however long the bus was
-blocked.
+Each sender has a `Commander`, which keeps only the newest command of that sender. When a sender
+ends, the program must call `Outbox.release()`. The last zero of this sender is then sent, even if
+the bus was blocked for a long time.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ class Outbox:
         self._news = Condition()
         self._busy = self._ended = False
         self.dead: Future[Never] = Future()
-        """Future that receives the exception if one ends the thread. From then on, nothing is
-        sent."""
+        """Future that receives the exception if an exception ends the thread. After that, no
+        command is sent."""
         self._thread = Thread(target=self._live, name="outbox", daemon=True)
         self._thread.start()
 
     def take(self, commander: Commander, put: Put, wish: Wish) -> int | None:
-        """Queue a command of the sender `commander`, to be sent by `put` on the thread.
+        """Queue a command of the sender `commander`. The thread sends the command with `put`.
 
         Returns the time since the sender's previous command, ns, or None (see `Commander.take`).
         """
@@ -60,7 +60,7 @@ class Outbox:
             self._news.notify_all()
 
     def flush(self, seconds: float) -> None:
-        """Wait until all commands are sent, but at most for `seconds`."""
+        """Wait until all queued commands are sent, but at most `seconds`."""
         with self._news:
             self._news.wait_for(
                 lambda: not (self._busy or self._zeros or self._times()), timeout=seconds
@@ -81,7 +81,7 @@ class Outbox:
             self.dead.set_exception(error)
 
     def _round(self) -> bool:
-        """Wait for commands that are due and send them; return False when the thread must end."""
+        """Wait until commands are due, and send them. Return False if the thread must end."""
         with self._news:
             self._busy = False
             self._news.notify_all()

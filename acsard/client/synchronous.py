@@ -51,7 +51,7 @@ from acsard.host.own_identity import new_secret, own_name, sender_id
 REPLY_TIMEOUT_S = 3.0
 
 TIMED_OUT = "Timeout"
-"""Text of Zenoh's error reply if the other side has received a query but did not answer in time."""
+"""Text of Zenoh's error reply if the other side received a query but did not answer it in time."""
 
 
 @contextmanager
@@ -67,10 +67,10 @@ def connect(
     The client sends its commands as the command source `source`, a name in `[[commands.sources]]`.
     `tls` is the directory with your certificate, for an endpoint like "tls/robot.local:7449".
 
-    An argument that is None comes from the file that the environment variable ACSARD_CONFIG names.
-    The variable ACSARD_TLS replaces the certificate directory of that file. Without these
-    variables, `endpoint` is "tcp/127.0.0.1:7448", `robot_id` is "acsar", and there is no
-    certificate.
+    If an argument is None, its value comes from the configuration file that the environment
+    variable ACSARD_CONFIG names. The variable ACSARD_TLS overrides the certificate directory in
+    that file. Without these variables, `endpoint` is "tcp/127.0.0.1:7448", `robot_id` is "acsar",
+    and the client uses no certificate.
     """
     where = address_by_environment(endpoint, robot_id, tls)
     session = client_session(where.endpoint, where.tls)
@@ -82,7 +82,7 @@ def connect(
 
 
 def close(session: zenoh.Session) -> None:
-    """Close a session. Ignore the error of Zenoh if the other side is stuck."""
+    """Close a session. Ignore the error that Zenoh raises if the other side does not respond."""
     try:
         session.close()
     except zenoh.ZError:
@@ -92,9 +92,9 @@ def close(session: zenoh.Session) -> None:
 class _Puts:
     """Keeps a minimum pause between the commands on one connection.
 
-    The daemon accepts 1000 commands a second per connection and key, so it would drop a zero that
-    directly follows another command. All clients of a connection share one instance, because the
-    other command may come from any of them.
+    The daemon accepts at most 1000 commands a second per connection and key. Without the pause, it
+    would drop a zero that is sent directly after another command. All clients of a connection share
+    one instance, because the other command may come from any of these clients.
     """
 
     def __init__(self) -> None:
@@ -127,7 +127,7 @@ class Client:
         self.session, self.source = session, source
         self.where = Address(endpoint, robot_id, tls)
         self.name = own_name()
-        """Name under which the daemon's log shows service calls; you may change it."""
+        """Name that the daemon's log shows for this client's service calls. You may change it."""
         self._opened = False
         self._puts = _Puts()
         self.certificate = shown_at(endpoint, tls)
@@ -144,7 +144,7 @@ class Client:
         whole = sender_id(name)
         self._sender = Sender(whole)
         self.sender = public_name(whole, self.certificate)
-        """Public name of this client. It is the value of `state.sender` while the client drives."""
+        """Public name of this client. While the client drives, `state.sender` has this value."""
 
     @property
     def caller(self) -> str:
@@ -155,10 +155,10 @@ class Client:
         return sender_id(self.name, self._secret)
 
     def like(self, robot_id: str, name: str = "") -> Client:
-        """Return another client on the same connection. It is a separate sender of commands.
+        """Return a new client on the same connection, which is a separate sender of commands.
 
-        `robot_id` is the robot of the new client, which may be the robot of this client. `name` is
-        the name of the new sender; "" means the host name and the process id.
+        `robot_id` is the id of the new client's robot, which may be the robot of this client.
+        `name` is the new client's name as a sender; "" means the host name and the process id.
         """
         other = Client(self.session, robot_id, self.source, self.where.tls, self.where.endpoint)
         other.name, other._secret, other._puts = self.name, self._secret, self._puts
@@ -173,7 +173,7 @@ class Client:
     def command_key(self, source: str) -> str:
         """Return the key, below the robot's id, on which this client puts commands as `source`.
 
-        Over TLS it differs for each certificate.
+        Over TLS, the key ends with the common name of this client's certificate.
         """
         return command_key("cmd", source, self.certificate)
 
@@ -181,8 +181,8 @@ class Client:
         """Send one command: `linear` m/s, `angular` rad/s (left is +).
 
         Repeat the call to keep the robot moving. The first call sends a zero instead, because the
-        daemon requires a zero before it follows a sender. A program that forwards commands sets
-        `stamp_ns` to the time of the command by the clock of its origin, ns.
+        daemon requires a zero before it follows a sender. A program that forwards commands passes
+        `stamp_ns`, the time of the command on the clock of the original sender, ns.
         """
         if self._opened:
             self._put(linear, angular, stamp_ns)
@@ -193,11 +193,11 @@ class Client:
     def end(self) -> None:
         """Close the connection, as `connect` does at the end of its block.
 
-        First send a zero to each robot that may still follow a client of this connection. Otherwise
-        the robot would drive on until the timeout of the source, which may be 10 s.
+        First send a zero to each robot that may still follow a client of this connection. Without
+        the zero, the robot would drive on until the timeout of the source, which may be 10 s.
         """
         begun_s = clock.steady_s()
-        # After the longest timeout a zero would only stop the next sender that drives.
+        # When the longest timeout has passed, a zero would only stop the next sender that drives.
         moving = [one for one, at_s in self._puts.moving.items() if begun_s - at_s < LONGEST_S]
         try:
             for pause_s in (AGAIN_S, 0.0) if moving else ():
@@ -213,9 +213,14 @@ class Client:
 
         `linear` is in m/s and `angular` in rad/s (left is +). Speeds above the robot's `[limits]`
         are not an error: the robot drives at its limits. `get("config")` returns the limits, and
-        `get("cmd_vel_out")` the applied speed. Raises `NotDrivenError` with the daemon's reason as
-        soon as the robot does not follow, and also if this program sent no command for more than
-        0.5 s during the drive, because it stood still or the network failed.
+        `get("cmd_vel_out")` returns the applied speed.
+
+        Raises:
+            NotDrivenError: The robot does not follow the commands, and the text is the daemon's
+                reason. Or this program sent no command for more than 0.5 s during the drive,
+                because the program was suspended or the network failed.
+            NoAnswerError: The daemon is silent.
+            UsageError: An argument is not valid.
         """
         try:
             with closing(drive(self, linear, angular, seconds)) as steps:
@@ -237,9 +242,9 @@ class Client:
         """Call a service, such as "stop", with the fields of its payload.
 
         `clear` releases the stop or fault that `state` shows at the time of the call, and
-        `activate` switches on a robot that is off at that time. If a person decided by an earlier
-        state, pass `latch=state.latch` of that state. The daemon then refuses the call if the robot
-        has been stopped or switched off again since then.
+        `activate` switches on a robot that is inactive at that time. If a person saw an earlier
+        state and decided to make the call, pass `latch=state.latch` of that earlier state. The
+        daemon then refuses the call if the robot was stopped or switched off again in between.
         """
         if service in ("clear", "activate") and "latch" not in fields:
             fields["latch"] = self.get("state").latch
@@ -266,7 +271,7 @@ class Client:
         return decoder(name).decode(*self.reply(name))
 
     def reply(self, name: str) -> tuple[str, bytes]:
-        """Return the last value of a key without decoding it: its encoding and its payload."""
+        """Return a pair: the encoding and the undecoded payload of the last message on a key."""
         return self._ask(name)
 
     def whoami(self) -> Identity:
@@ -313,7 +318,7 @@ class Client:
         return Subscription(self._queue(name), self.key(name))
 
     def ask(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
-        """Query a key without waiting. `take` is called with a reply on a thread of Zenoh."""
+        """Send a query and return immediately. A thread of Zenoh calls `take` with each reply."""
         self.session.get(
             self.key(name),
             lambda reply: take(reply.ok) if reply.ok is not None else None,
@@ -367,9 +372,9 @@ class Client:
             self._puts.moving.pop(self, None)
 
     def _ask(self, name: str, payload: bytes | None = None) -> tuple[str, bytes]:
-        """Return the encoding and the payload of the first reply to a query.
+        """Return a pair: the encoding and the payload of the first reply to a query.
 
-        Other replies are ignored, because any client on the bus may send any number of them.
+        Later replies are ignored, because any client on the bus may send any number of replies.
         """
         end_s = time.monotonic() + REPLY_TIMEOUT_S
         while True:
@@ -412,7 +417,7 @@ class Client:
         return UsageError(f"{name!r} is not a key; `acsard topics` lists them")
 
     def _unanswered(self, name: str) -> MendableError:
-        """Return the error for a query of the key `name` without a reply; the text says why."""
+        """Return the error for a query of the key `name` that got no reply. Its text says why."""
         key, no_answer = name.partition("?")[0], f"no answer on the Zenoh key {self.key(name)}"
         if unknown(key):
             return NoAnswerError(f"{no_answer}: {key} is not in the topic table ({key_hint(key)})")
@@ -438,8 +443,8 @@ class Client:
     def unheard(self, error: UnheardError | NoAnswerError) -> MendableError:
         """Return the error to raise in place of `error`, which ended a drive or a query.
 
-        The returned error is one of those that `acsard.client` documents. Its text names the role
-        of this client if the role may be the reason.
+        The returned error has one of the types that `acsard.client` documents. If the role of this
+        client may be the reason, the text of the returned error names the role.
         """
         if isinstance(error, UnheardError) and not self.where.tls:
             return NotDrivenError(str(error))
@@ -452,7 +457,7 @@ class Client:
             return error
         if us.role and not has(us.role, COMMAND_ROLE):
             return NotPermittedError(us.words())
-        # The role may explain why no command arrives, but it does not explain a fault or a stop.
+        # The role may explain why no command arrives, but not a fault or a stop.
         unexplained = str(error) == no_command(self.source)
         return NotDrivenError(f"{error}; {us.words()}" if unexplained else str(error))
 

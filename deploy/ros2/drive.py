@@ -18,7 +18,11 @@ from rclpy.utilities import remove_ros_args
 
 PERIOD_S = 0.05
 PATIENCE_S = 10.0
+<<<<<<< HEAD
 """Longest wait for a subscriber, s. A bridge creates its route only when a publisher appears."""
+=======
+"""Longest time to wait for a subscriber, s. A bridge makes its route when a publisher appears."""
+>>>>>>> 9b69eeb6e11311bfdc56374143bfaac6130581cf
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 ZEROS_S = 1.5
 """Duration of the zeros before the drive, s. Behind a bridge all publishers look like one sender,
@@ -38,7 +42,7 @@ def end(number: int, frame: object) -> NoReturn:
 def main(argv: list[str]) -> None:
     given = [float(word) for word in remove_ros_args(argv)[1:]]
     linear, angular, seconds = given + [0.2, 0.0, 3.0][len(given) :]
-    # rclpy's own handlers would end the context first, and no zero could be sent any more.
+    # rclpy's own signal handlers would end the context first, so that no zero could be sent.
     rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
     for number in SIGNALS:
         # With nohup, SIGHUP is ignored already: the program goes on when its terminal closes.

@@ -376,7 +376,7 @@ def test_echo_for_many_waits_for_each_and_says_which_is_missing(shared: Daemon) 
     assert (ended.code, len(ended.out.splitlines())) == (0, 2)
     ended = tool(shared, "echo", "odom", "-n", "1", "--timeout", "0.5", "--id", "acsar,other")
     assert (ended.code, len(ended.out.splitlines())) == (1, 1)
-    assert "following acsar; not there: other" in ended.err
+    assert "following acsar; not present: other" in ended.err
 
 
 @each("verb", ["top", "hz", "whoami", "drive", "accuracy", "calibrate"])

@@ -102,8 +102,8 @@ ENDS = "; until the daemon's next start"
         ("odometry.pose_covariance_diagonal = [1.0, 2.0] (was [0.0, 2.0])", ENDS),
         (
             "rates.state = 5.0 (was 10.0), limits.linear_speed = 0.6 (was 1.0)",
-            f"{ENDS}; only limits.linear_speed is lowered and survives a restart, except on the "
-            "simulator",
+            f"{ENDS}, except limits.linear_speed: a lowered limit survives a restart. On the "
+            "simulator, no setting survives a restart",
         ),
         ("nothing changes: all settings have these values already", ""),
     ],
