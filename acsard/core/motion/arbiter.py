@@ -1,8 +1,9 @@
 """Chooses the one command that the robot follows: first the source, then the sender of that source.
 
-A sender is live while its last command is not older than the timeout of its source, and a source is
-live while one of its senders is live. If the stamps of a live sender come into doubt, the sender
-still keeps its place for a short time (`Sender.present`), but the robot stands still meanwhile.
+A sender is live while its last accepted command is not older than the timeout of its source. A
+source is live while one of its senders is live. If the stamps of a sender come into doubt, its
+commands are not accepted, so it is soon not live any more. It then still takes part in the choice
+for a short time (`Sender.present`). If the arbiter chooses such a sender, the robot stands still.
 
 - The robot follows the live source of the highest priority. Among sources of equal priority, the
   robot follows the one that began to send first, until that source falls silent. The same rule
@@ -29,8 +30,9 @@ from acsard.core.motion.neutral import Sender, is_zero
 from acsard.core.values import NS_PER_S, REST, Command, SourceStatus, Twist, Wait
 
 MAX_SENDERS = 16
-"""Largest number of senders that one source remembers. A new sender never replaces one that may
-keep the robot (`Sender.holds`), such as a live, armed sender."""
+"""Largest number of senders that one source remembers. Beyond this number, a new sender replaces
+another one, but never a sender that may keep control of the robot (`Sender.holds`), such as a live,
+armed sender."""
 
 Objection = Literal["", "unknown_source", "not_finite", "too_many_senders", "unproven", "stale"]
 """The reason to refuse a command, or "" if the arbiter accepts it."""
@@ -98,19 +100,22 @@ class _Source:
         return holds, holds or sender.armed(now_ns), sender.noticed_ns
 
     def cancel_zeros(self, at_ns: int) -> None:
-        """Cancel the zeros of shared identities, because any of them may have sent a speed.
+        """Record that any sender with a shared identity may have sent a speed.
 
-        `at_ns` is the monotonic time at which the message that may be a speed arrived.
+        A zero from such a sender does not arm the sender any more, unless its
+        `commands.neutral_pause` was already over. `at_ns` is the monotonic time at which the
+        message that may be a speed arrived.
         """
         for sender in self.senders.values():
             sender.cancel_zero(at_ns)
 
     def doubt(self, command: Command, was_set: bool) -> None:
-        """Undo the effect of zeros on this source whose stamps come from a doubtful clock.
+        """Undo the effect that zeros of a sender had on this source, because its clock is in doubt.
 
-        The doubtful clock is that of `command`, which may have come to another source. If the clock
-        was set (`was_set`), the sender must send a zero again. Otherwise the clock is unproven, and
-        the zeros that it has stamped so far do not count. Later zeros arm the sender as usual.
+        The sender and its clock are those of `command`, which may have come to another source. If
+        the clock was set (`was_set`), the sender must send a zero again. Otherwise the clock is
+        unproven, and a zero arms the sender only if it was accepted before the doubt or arrives
+        later.
 
         Behind a bridge, several programs with clocks of their own share one identity. Therefore a
         command to another source has an effect here only if the same clock stamped the last command
@@ -125,10 +130,11 @@ class _Source:
             sender.unlearn()
 
     def present(self, now_ns: int) -> list[Sender]:
-        """Return the senders that keep their place, in the order in which they get the robot.
+        """Return the senders that take part in the choice, the preferred sender first.
 
-        Armed senders come before unarmed senders. In each of these two groups, live senders come
-        first, and senders of equal rank are in the order in which they began to send.
+        These are the senders for which `Sender.present` is true. Armed senders come before unarmed
+        senders. In each of these two groups, live senders come before senders that are not live,
+        and otherwise the sender that began to send earlier comes first.
         """
         present = [sender for sender in self.senders.values() if sender.present(now_ns)]
         if len(present) < 2:
@@ -139,7 +145,11 @@ class _Source:
         )
 
     def latest_ns(self) -> int | None:
-        """Return the monotonic time of the last accepted command, ns, or None if there is none."""
+        """Return the monotonic time at which the last accepted command arrived, ns.
+
+        Commands from before the last `require_neutral` do not count. Return None if there is no
+        command.
+        """
         times = [s.arrived_ns for s in self.senders.values() if s.arrived_ns is not None]
         return max(times, default=None)
 
@@ -156,8 +166,9 @@ class _Source:
         return Wait("neutral", self.name, pause, lasts=lasts, ros=sender.ros, shared=sender.shared)
 
     def doubted(self, now_ns: int) -> Wait | None:
-        """Return why the robot does not follow a recent command because of its stamp.
+        """Return why the stamp of a recent command kept the command from being accepted.
 
+        If several senders sent such commands, the result is for the sender of the newest message.
         Return None if there is no such command.
         """
         doubtful = [sender for sender in self.senders.values() if sender.doubtful(now_ns)]
@@ -174,7 +185,7 @@ class _Source:
         return self.proof if sender.armed(now_ns) else self.neutral(sender)
 
     def obstacle(self, sender: Sender, now_ns: int, lasting: bool = True) -> Wait:
-        """Return why this sender, which keeps its place, cannot drive the robot.
+        """Return why this sender cannot drive the robot, although it takes part in the choice.
 
         If the reason is that the sender must send a zero, and `lasting` is true, the result
         contains the time for which it has sent speeds instead.
@@ -209,7 +220,7 @@ class Arbiter:
             self._sources[settings.name].use(settings, commands.neutral_pause)
 
     def require_neutral(self, since_ns: int = 0) -> None:
-        """Forget all commands, and require a zero from each sender before it drives again.
+        """Forget all commands. Each sender must then send a zero before it drives again.
 
         Only a zero that arrives at the monotonic time `since_ns` or later arms a sender. An older
         zero, for example from before a stop was cleared, does not show that the sender wants the
@@ -224,8 +235,8 @@ class Arbiter:
         """Begin a step at the monotonic time `now_ns`. Call this before `accept` in each step.
 
         If the daemon stood still since the last step, the bus may not have delivered the commands
-        of that time yet. Therefore each sender keeps its place for a short time more, and a running
-        `commands.neutral_pause` takes longer (see `Sender.resume`).
+        of that time yet. Therefore each sender takes part in the choice for a short time more, and
+        a running `commands.neutral_pause` takes longer (see `Sender.resume`).
         """
         before_ns, self._begun_ns = self._begun_ns, now_ns
         if now_ns - before_ns > LATE_NS:
@@ -261,12 +272,13 @@ class Arbiter:
         return "" if verdict in ("fresh", "set") else "unproven"
 
     def notice(self, source: str, sender: str, arrived_ns: int, shared: bool = False) -> None:
-        """Record a lost or unusable message, which may have commanded motion.
+        """Record a lost or unusable message to `source`, which may have commanded motion.
 
-        If the sender is unknown ("") or has a `shared` identity, the message cancels zeros of all
-        shared identities of `source`: those zeros whose `commands.neutral_pause` was not over when
-        the message arrived. For a lost message, whose time is unknown, `sender` is "" and
-        `arrived_ns` is 0. It cancels every zero that has not armed its sender yet.
+        If `sender` is unknown ("") or has a `shared` identity, any sender with a shared identity
+        may have sent the message. If `commands.neutral_pause` after a zero of such a sender was not
+        over at the monotonic time `arrived_ns`, the zero does not arm its sender any more. The time
+        of a lost message is unknown: `sender` is "" and `arrived_ns` is 0, and no zero arms its
+        sender any more unless it has already done so.
         """
         known = self._sources.get(source)
         if known is None:
@@ -316,7 +328,11 @@ class Arbiter:
         return Choice(source.name, sender.twist, wait, sender.arrived_ns, sender.name)
 
     def _kept(self, holder: _Source, now_ns: int) -> str:
-        """Return words for the source or sender that must wait because `holder` sends zeros."""
+        """Return the name of a source whose speeds have no effect, because `holder` sends zeros.
+
+        If the speeds come from another sender of `holder` itself, the result is "another sender of
+        NAME". It is "" if nobody sends speeds.
+        """
         for source in self._ranking:
             senders = (each for each in source.present(now_ns) if each is not self._followed)
             if any(sender.twist != REST for sender in senders):
@@ -325,11 +341,11 @@ class Arbiter:
 
     @property
     def forgiven_ns(self) -> int:
-        """Sum of all rises of the commands' delay that were trusted without an explanation, ns.
+        """Sum of the rises of command delays that were trusted without a visible cause, ns.
 
         A rise is trusted within a budget, or after a pause of the sender (`freshness.py`). If the
-        stamps show that the sender's clock was adjusted, this explains the rise, so it does not
-        count here.
+        stamps of a sender show that its clock was adjusted, the rise has a visible cause and does
+        not count here.
         """
         return self._freshness.forgiven_ns
 

@@ -22,8 +22,9 @@ REFUSED = {
 }
 
 MAX_SENDER = 124
-"""Largest number of characters of a sender's name in an event. A public name has up to 57, and a
-certificate adds up to 67. A name that is made from a Zenoh key can be longer and is cut."""
+"""Largest number of characters of a sender's name in an event. The public name of a program has at
+most 57 characters, and the name from its certificate adds at most 67. A name that is made from a
+Zenoh key can be longer. It is cut to this length."""
 
 ROS_NEVER = (
     ' (`ros2 topic pub` with a speed never sends a zero; the section "After a clear" of '

@@ -1,8 +1,8 @@
 """Limits the log lines about events of the same name to one per second on average.
 
-A few lines of one name may follow each other without a delay, and after that one line per second.
-Each line reports the number of events since the previous line. So neither a client that floods the
-bus nor a serial line with a loose contact can flood the log.
+At first, a few lines of one name may be written without a delay. After that, one line per second
+may be written. Each line reports the number of events since the previous line. So neither a client
+that floods the bus nor a serial line with a loose contact can flood the log.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from typing import get_args
 from acsard.core.values import NS_PER_S, Event, EventName, Level
 
 BURST = 5
-"""Number of log lines of one name that may follow each other without a delay. A person who presses
-buttons does not need more."""
+"""Number of log lines of one name that may be written without a delay between them. A person who
+presses buttons does not need more."""
 
 MOST = 8
 """Largest number of event kinds that one log line lists, and also the largest number of client
@@ -30,7 +30,7 @@ class _Held:
     def __init__(self) -> None:
         self.count, self.news, self._level = 0, False, 0
         self.number = 0
-        """The number of the last event, counted over all names."""
+        """Position of the newest of these events in the sequence of the events of all names."""
         self._kinds: Counter[str] = Counter()
         self._by: Counter[str] = Counter()
 
@@ -85,8 +85,9 @@ class EventThrottle:
     def _may(self, name: EventName, news: bool, now_ns: int) -> bool:
         """Return whether a line of this name may be written now; if so, count it as written.
 
-        Only lines with news may be ahead of the schedule: up to `BURST` of them may be written at
-        once. The line of a stop may be ahead even if the robot is already stopped, because the time
+        The schedule has one line of each name per second. If `news` is true (the line does more
+        than repeat earlier events), up to `BURST` lines may be written at once, ahead of the
+        schedule. So may the lines of a stop even if the robot is already stopped, because the time
         of each stop matters.
         """
         free_ns, at_once = self._free_ns.get(name, now_ns), news or name == "stop"

@@ -1,10 +1,11 @@
 """Decides whether a stamped command is fresh, although the sender's clock is not synchronized.
 
-The stamp is the time of sending by the sender's clock. The time of arrival by our clock minus the
-stamp is the true delay plus the unknown offset of the two clocks. This module calls that sum the
-delay. The offset cancels out in a comparison with the minimum of all delays. A command is stale if
-its delay exceeds the minimum by more than the timeout of its source, or if its stamp is earlier
-than that of an accepted command. The clock of a sender is in one of two states:
+The stamp is the time of sending by the sender's clock. This module subtracts the stamp from the
+time of arrival by our clock, and calls the difference the delay. It is the true delay plus the
+unknown offset of the two clocks. The offset cancels out in a comparison with the minimum of all
+delays. A command is stale if its delay exceeds the minimum by more than the timeout of its source,
+or if its stamp is earlier than that of an accepted command. The clock of a sender is in one of two
+states:
 
     new      The minimum is not known. Delays fall while a backlog arrives. Therefore a test of
              several commands (the proof) must first show that the delays no longer fall.
@@ -121,14 +122,13 @@ class _Proof:
     """A test whether the delays have become constant, starting with one command.
 
     The test compares the minimum delays of successive intervals. An interval is called a half,
-    because it lasts half of the nominal duration of the test. A test may take more than two halves.
+    because it lasts half of the nominal duration of the test. The delays are constant if the minima
+    of the first two halves differ by little enough (`EVEN`, `CREPT`). Otherwise the test goes on:
 
-    - For a known clock (`again`), the test restarts with the second half if the minima of the first
-      two halves differ too much.
-    - For a new clock in this case, the test compares the last eight halves in four pairs. The
-      minima of the pairs must agree within the same limit (`EVEN`), or differ by at most `EARLY_NS`
-      without a trend. A trend means that the minima only fall, as while a backlog arrives, or only
-      rise, as while a queue grows.
+    - For a known clock (`again`), it restarts, and the second half becomes the first one.
+    - For a new clock, it compares the last eight halves in four pairs. The minima of the pairs must
+      agree within the same limit, or differ by at most `EARLY_NS` without a trend. A trend means
+      that the minima only fall, as while a backlog arrives, or only rise, as while a queue grows.
     """
 
     def __init__(
@@ -193,7 +193,8 @@ class _Clock:
         """Longest silence that is not a pause, ns: `GAP_NS`, or the longest timeout of the sources
         to which the sender has sent commands, if that is longer."""
         self.forgiven_ns = 0
-        """Part of the last trusted rise of the delay that no visible adjustment explains, ns."""
+        """Part of the last trusted rise of the delay for which no adjustment of the clock was
+        visible, ns."""
         self._stamp_ns = 0
         self._delay = 0
         self._number = -1
@@ -201,10 +202,12 @@ class _Clock:
         self._least = 0
         """Minimum of the trusted delays, ns. It rises with time by the largest possible drift."""
         self._early = 0
-        """Recent fall of `_least`, ns. It decreases by a tenth of the time that passes."""
+        """Sum of the recent falls of `_least`, ns. It decreases by 1 ns for each 10 ns that
+        pass."""
         self._floor: int | None = None
-        """Lowest delay of a clock that is never adjusted, ns, plus the possible drift; None without
-        such a delay."""
+        """Lowest delay of a steady clock (one that is never adjusted), ns. It rises with time by
+        the largest possible drift. It is None before the first command, and for a clock that may be
+        adjusted."""
         self._before: int | None = None
         """Delay before the first visible adjustment since the last command that was on time, ns;
         None if there was no visible adjustment."""
@@ -255,16 +258,20 @@ class _Clock:
         return verdict
 
     def _superseded(self, mark: tuple[int, int]) -> bool:
-        """Return whether a newer command was accepted. `mark` is a stamp, ns, and a number."""
+        """Return whether a newer command than this one was already accepted.
+
+        `mark` is the pair of this command's stamp, ns, and its sequence number, -1 without one.
+        """
         last = self._accepted
         return last is not None and (mark < last or (mark == last and mark[1] >= 0))
 
     def _repeats(self, stamp_ns: int, number: int, silence: int) -> bool:
         """Return whether the network repeated this command, or delivered a later one before it.
 
-        Such a command changes nothing. A low number may also show that the program has restarted
-        and counts from the beginning. That is assumed if the stamp is later than all stamps before,
-        or after a pause.
+        Such a command changes nothing. `number` is its sequence number, -1 without one, and
+        `silence` is the time since the command before it, ns. A low number may also show that the
+        program has restarted and counts from the beginning. That is assumed if the stamp is later
+        than all stamps before, or after a pause.
         """
         if not 0 <= number <= self._number or silence > self.gap_ns:
             return False
@@ -272,13 +279,20 @@ class _Clock:
         return stamp_ns <= self._stamp_ns or (accepted is not None and stamp_ns <= accepted[0])
 
     def _later_than_lowest(self, delay: int, silence: int) -> int:
-        """Return by how much this delay of a steady clock exceeds its lowest delay, ns."""
+        """Return by how much this delay of a steady clock exceeds its lowest delay so far, ns.
+
+        `silence` is the time since the previous command, ns. The lowest delay rises by the drift
+        that is possible in this time.
+        """
         floor = delay if self._floor is None else self._floor + silence // DRIFT
         self._floor = min(floor, delay)
         return delay - self._floor
 
     def _look_for_adjustment(self, stamp_ns: int, silence: int, number: int) -> None:
         """Record a pause of the sender, or an adjustment of its clock.
+
+        `silence` is the time since the previous command, ns. `number` is the sequence number, -1
+        without one.
 
         A stamp that goes back or stands still shows an adjustment. The next command must confirm
         the adjustment: the stamp of that command must also go back or stand still, or must not be
@@ -351,10 +365,11 @@ class _Clock:
         return "stale"
 
     def _forgive(self, proof: _Proof, at_ns: int) -> bool:
-        """Trust the proven delay if that is allowed, and return whether it is.
+        """Trust the delay that `proof` found constant, if that is allowed; return whether it is.
 
-        A fall of the delay is always allowed. A rise is allowed after a pause of the sender, within
-        the budget, or as far as a visible adjustment of the clock explains it.
+        A fall of the delay is always allowed. A rise is allowed if the sender has paused, if the
+        budget covers the rise, or if a visible adjustment of the clock accounts for it. A visible
+        adjustment and the budget may each account for a part of the rise.
         """
         self._accrue(at_ns, FORGET_NS)
         hidden = proof.least - self._least
@@ -368,7 +383,7 @@ class _Clock:
         return True
 
     def _accrue(self, at_ns: int, most_ns: int) -> None:
-        """Refill the budget for the time since the last call, to at most `most_ns`."""
+        """Add to the budget for the time since the last call, up to a budget of `most_ns`."""
         grown = (at_ns - self._budget_at_ns) // FORGIVE_RATE
         self._budget, self._budget_at_ns = min(self._budget + grown, most_ns), at_ns
 

@@ -15,10 +15,12 @@ does not. The sender stays armed until `require_neutral`, `disarm` or `unlearn` 
   depends on the Zenoh session that stamps its commands. Therefore a speed of one shared identity
   cancels the zeros of all shared identities.
 
-A live sender keeps its place before other senders. Two events must not cost it this place: a stall
-of the daemon, and doubtful stamps, for example because the sender's clock was set. Otherwise a
-sender that holds the robot still would lose the robot to a sender of speeds. In these cases, the
-sender keeps its place for at most `PLACE_NS` after its last accepted command.
+A sender is present while it takes part in the choice of the arbiter. It is present while it is
+live, which means that its last accepted command is not older than the timeout of its source. Two
+events must not end its presence: a stall of the daemon, and doubtful stamps, for example because
+the sender's clock was set. Otherwise a sender that holds the robot still would lose the robot to a
+sender of speeds. After these events, the sender stays present for at most `PLACE_NS` after its last
+accepted command.
 """
 
 from __future__ import annotations
@@ -28,9 +30,10 @@ from acsard.core.motion.freshness import LONGEST_PROOF_NS, Verdict
 from acsard.core.values import REST, Command
 
 PLACE_NS = 2 * LONGEST_PROOF_NS
-"""Longest time for which a sender keeps its place without an accepted command, ns, and longest time
-for which it keeps the robot without being armed after its clock was set. A proof of its clock ends
-within this time, even if the proof has the longest duration and restarts with its second half."""
+"""Longest time after its last accepted command for which a sender takes part in the choice of the
+arbiter, ns. It is also the longest time for which an unarmed sender keeps control of the robot
+after its clock was set. A proof of the clock ends within this time, even if the proof has the
+longest duration and restarts with its second half."""
 
 
 class Sender:
@@ -41,7 +44,7 @@ class Sender:
         self._neutral_first = neutral_first
         self._armed = self._proven_armed = not neutral_first
         self._zero_ns: int | None = None
-        """Arrival of the zero after which `commands.neutral_pause` runs, monotonic ns.
+        """Monotonic time of arrival of the zero after which `commands.neutral_pause` runs, ns.
 
         None if there is no such zero or `cancel_zero` has followed it. Only a shared identity needs
         this value.
@@ -53,22 +56,25 @@ class Sender:
         self._number: int | None = None
         """Sequence number of the last accepted command, or None."""
         self._ended: Command | None = None
-        """The last zero with a doubtful stamp that ended a speed, or None. An older speed that
-        arrives after this zero must not move the robot again."""
+        """The last zero that ended a speed although the zero's stamp kept it from being accepted,
+        or None. An older speed that arrives after this zero must not move the robot again."""
         self.clock = ""
         """Name of the clock that stamped the last command that was not refused."""
         self.twist = REST
         self.arrived_ns: int | None = None
-        """Arrival of the last accepted command since `require_neutral`, monotonic ns."""
+        """Monotonic time of arrival of the last accepted command, ns; None if none was accepted
+        since `require_neutral`."""
         self._present_ns = 0
-        """Arrival of the last command for which the sender keeps its place, monotonic ns. A stall
-        of the daemon moves this time to the end of the stall."""
+        """Monotonic time of arrival of the last command for which the sender counts as present, ns.
+        A stall of the daemon moves this time to the end of the stall."""
         self.came_ns = 0
-        """Arrival of the command that ended the sender's last silence, monotonic ns."""
+        """Monotonic time of arrival of the command that ended the sender's last silence, ns."""
         self.zeros_ns: int | None = None
-        """Arrival of the first zero since the last speed or silence, monotonic ns, or None."""
+        """Monotonic time since which the sender has sent only zeros, without falling silent, ns;
+        None if its last command was a speed."""
         self.speeds_ns: int | None = None
-        """Arrival of the first speed since the last zero or silence, monotonic ns, or None."""
+        """Monotonic time since which the sender has sent only speeds, without falling silent, ns;
+        None if its last command was a zero."""
         self.disarmed_ns: int | None = None
         """Monotonic time at which `disarm` last disarmed the sender, ns, or None."""
         self.ros = False
@@ -76,21 +82,21 @@ class Sender:
         self.shared = False
         """Whether several programs may share this identity."""
         self.noticed_ns = 0
-        """Monotonic time of the last message, ns, even if that message was refused."""
+        """Monotonic time of arrival of the last message, ns, even if that message was refused."""
         self._doubted_ns: int | None = None
         self.doubt: Verdict = "unproven"
-        """The verdict on the last command that was not accepted because of its stamp."""
+        """The verdict on the last command whose stamp kept it from being accepted."""
 
     def use(self, timeout_ns: int, pause_ns: int) -> None:
         """Apply this command timeout and this `commands.neutral_pause`, both in ns, from now on."""
         self._timeout_ns, self._pause_ns = timeout_ns, pause_ns
 
     def live(self, now_ns: int) -> bool:
-        """Return whether the last command is not older than the timeout of its source."""
+        """Return whether the last accepted command is not older than the timeout of its source."""
         return self.arrived_ns is not None and now_ns - self.arrived_ns <= self._timeout_ns
 
     def present(self, now_ns: int) -> bool:
-        """Return whether the sender keeps its place before other senders.
+        """Return whether the sender takes part in the choice of the arbiter.
 
         It does while it is live. It also does in two other cases, for at most `PLACE_NS` after its
         last accepted command: while it goes on sending commands with doubtful stamps, without a
@@ -103,14 +109,16 @@ class Sender:
         )
 
     def rank(self, now_ns: int) -> tuple[bool, int]:
-        """Return the sort key of the sender among equally armed senders of one priority.
+        """Return the sort key of the sender among senders whose sources have equal priorities.
 
-        Live senders come first, and then those that began to send first.
+        Live senders come before senders that are not live. Otherwise, the sender that began to send
+        first comes first. Within one source, however, armed senders always come before unarmed
+        ones.
         """
         return not self.live(now_ns), self.came_ns
 
     def doubtful(self, now_ns: int) -> bool:
-        """Return whether a recent command was not accepted because of its stamp."""
+        """Return whether the stamp of a recent command kept the command from being accepted."""
         return self._doubted_ns is not None and now_ns - self._doubted_ns <= self._timeout_ns
 
     def armed(self, now_ns: int) -> bool:
@@ -119,37 +127,44 @@ class Sender:
         return self._armed
 
     def require_neutral(self) -> None:
-        """Forget the last command, and require a zero again if the neutral-first rule is on."""
+        """Forget the last command. The sender must send a zero again before it drives the robot.
+
+        If the neutral-first rule is off, the sender stays armed and need not send a zero.
+        """
         self.arrived_ns = self._zero_ns = self._proven_zero_ns = None
         self._armed = self._proven_armed = not self._neutral_first
 
     def disarm(self, now_ns: int) -> None:
-        """Require a zero again because the sender's clock was set. The sender keeps its place."""
+        """Disarm the sender because its clock was set. It must send a zero again before it drives.
+
+        It still takes part in the choice of the arbiter. If the neutral-first rule is off, the
+        sender stays armed.
+        """
         if self.armed(now_ns):
             self.disarmed_ns = now_ns
         self._zero_ns = self._proven_zero_ns = None
         self._armed = self._proven_armed = not self._neutral_first
 
     def holds(self, now_ns: int) -> bool:
-        """Return whether the sender may keep the robot if it controls the robot already.
+        """Return whether the sender may keep control of the robot if it has control already.
 
-        It may if it keeps its place (`present`) and one of these conditions holds: it is armed,
-        `disarm` disarmed it at most `PLACE_NS` ago, or `commands.neutral_pause` runs after its
-        zero.
+        It may if it takes part in the choice (`present`) and one of these conditions holds: it is
+        armed, `disarm` disarmed it at most `PLACE_NS` ago, or `commands.neutral_pause` runs after
+        its zero.
         """
         just_set = self.disarmed_ns is not None and now_ns - self.disarmed_ns <= PLACE_NS
         waits = just_set or self._zero_ns is not None
         return self.present(now_ns) and (waits or self.armed(now_ns))
 
     def unlearn(self) -> None:
-        """Undo the effect of zeros with unproven stamps, which the network may have delayed."""
+        """Undo the effect of zeros with unproven stamps. The network may have delayed them."""
         self._armed, self._zero_ns = self._proven_armed, self._proven_zero_ns
 
     def resume(self, before_ns: int, now_ns: int) -> None:
         """Continue after the daemon stood still from `before_ns` to `now_ns` (monotonic times).
 
         The bus may deliver the commands of that time only after this step. Therefore the sender
-        keeps its place for one timeout more, at most until `PLACE_NS` after its last accepted
+        stays present for one timeout more, at most until `PLACE_NS` after its last accepted
         command. A running `commands.neutral_pause` does not advance during the stall, and lasts for
         at least `EXCUSE_NS` after it.
         """
@@ -222,7 +237,11 @@ class Sender:
                 self._ended = None
 
     def _tell_apart(self, zero: bool, now_ns: int, present: bool) -> None:
-        """Record since when the sender has sent only zeros, or only speeds."""
+        """Record since when the sender has sent only zeros, or only speeds.
+
+        `zero` is true if the command that arrives at `now_ns` is a zero. `present` is false if this
+        command ends a silence of the sender.
+        """
         since_ns = self.zeros_ns if zero else self.speeds_ns
         if since_ns is None or not present:
             since_ns = now_ns
@@ -251,7 +270,7 @@ class Sender:
         self._doubted_ns, self.doubt, self.ros = command.arrived_ns, why, command.ros
 
     def _settle(self, now_ns: int) -> None:
-        """Arm a sender with a shared identity if no speed came for `commands.neutral_pause`."""
+        """Arm a shared identity if `commands.neutral_pause` is over after its zero."""
         if self._zero_ns is not None and now_ns - self._zero_ns >= self._pause_ns:
             self._armed = True
             if self._proven_zero_ns == self._zero_ns:
@@ -259,7 +278,7 @@ class Sender:
 
 
 def _later(mark: int | None, last: int | None) -> bool:
-    """Return whether a stamp or number is higher than the last one; False if one is missing."""
+    """Return whether a stamp or a sequence number is higher than `last`; False if one is None."""
     return mark is not None and last is not None and mark > last
 
 
