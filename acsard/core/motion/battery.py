@@ -1,9 +1,9 @@
 """Follows the battery that the board reports, and decides when an empty battery stops the robot.
 
-The thresholds in `[battery]` are compared with the mean of the voltage or the charge over time,
-because the current of starting motors makes the voltage drop for some tenths of a second. An empty
-battery latches a stop, which `lifecycle.py` keeps. The call `clear` does not release the stop until
-the mean has risen above the threshold by `battery.hysteresis`.
+The thresholds in `[battery]` apply to a running mean of the voltage or of the charge. They do not
+apply to single values, because starting motors make the voltage drop for some tenths of a second.
+An empty battery latches a stop, which `lifecycle.py` keeps. The call `clear` does not release the
+stop until the mean has risen above the threshold by `battery.hysteresis`.
 
 If the board stops reporting its battery, the level becomes "unknown" and the robot does not stop: a
 robot that blocks the way is the greater danger, and the voltage falls slowly.
@@ -19,24 +19,25 @@ from acsard.core.link.board_status import BoardStatus
 from acsard.core.values import NS_PER_S, BatteryLevel, BatteryStatus, Event
 
 TIME_CONSTANT_S = 10.0
-"""Time constant of the mean, s. A drop of 2 V for 0.3 s at a motor start lowers the mean by 0.06 V.
-A battery takes minutes from one level to the next, so the robot reacts soon enough."""
+"""Time constant of the running mean of the voltage or charge, s. A drop of 2 V for 0.3 s at a motor
+start lowers the mean by 0.06 V. A battery takes minutes from one level to the next, so the robot
+reacts soon enough."""
 
 SETTLE_S = 3.0
-"""Time that the reports of the battery must cover before their mean decides the level, s. The time
-starts from 0 after each silence of the board, and each interval between two reports counts as at
-most `LONGEST_NS`. A motor start in this time lowers the mean by up to a tenth of the voltage
-drop."""
+"""Time that the reports of the battery must cover before their running mean decides the level, s.
+This time is the sum of the intervals between the reports. Each interval counts as at most
+`LONGEST_NS`, and a silence of the board resets the sum to 0. A motor start in this time lowers the
+mean by up to a tenth of the voltage drop."""
 
 SILENT_S = 5.0
-"""Age at which a value of the battery is dropped, s. At one report a second, four consecutive
-reports may be lost without an effect."""
+"""A value of the battery is dropped when it is older than this, s. If the board sends one report a
+second, four consecutive reports may be lost without an effect."""
 
 LONGEST_NS = 300_000_000
-"""Largest weight of a report in the mean, ns: the duration of a motor start. The weight is the time
-since the previous report. Without this bound, a report during a motor start would weigh too much
-after a gap. The bound has a price: with one report a second, the mean follows the voltage at only a
-third of the speed."""
+"""Largest weight of one report in the running mean, ns. The weight of a report is the time since
+the previous report, but at most this limit, which is the duration of a motor start. Without the
+limit, a report during a motor start would weigh too much after a gap. The limit has a price: if the
+board sends one report a second, the mean follows the voltage at only a third of the speed."""
 
 EMPTY = "battery below "
 """The first words of the reason for a stop by an empty battery (`Battery.why`)."""
@@ -131,10 +132,10 @@ class Battery:
         self._awaited = True
 
     def forget(self) -> None:
-        """Forget the level, unless it comes from the board that answers now.
+        """Forget the level, unless the board that is connected now has reported it.
 
-        It does if the board has reported the value that `battery.measure` names since the port was
-        opened.
+        The board has reported it if the value that `battery.measure` names has arrived since the
+        port was opened.
         """
         if self._awaited:
             self._known, self._told, self._mean = "ok", None, None

@@ -25,8 +25,8 @@ AWAY_SPEED = 0.1
 """Highest speed away from a pressed bumper, m/s."""
 
 DIRECTIONS: dict[Place, int] = {"front": -1, "rear": 1, "left": 0, "right": 0}
-"""For a bumper at each place, the sign of the linear speeds that lead away from it. It is 0 if no
-straight motion leads away."""
+"""Maps the place of a bumper to the sign of the linear speed that drives the robot away from this
+bumper. The sign is 0 if no straight motion leads away from it."""
 
 ALLOWED = {-1: "backwards", 1: "forwards"}
 

@@ -44,7 +44,7 @@ SILENT_S = 0.5
 """Time without a report after which an input counts as pressed, s: five status lines at 10 Hz."""
 
 LATE_NS = 150_000_000
-"""Longest time between two steps of the control loop, ns, for which this computer does not count as
+"""If more than this time passes between two steps of the control loop, ns, this computer counts as
 late. The longest control period that can be configured is 100 ms."""
 
 EXCUSE_NS = 100_000_000
@@ -76,7 +76,7 @@ class BoardInput(ABC):
     silent: str
     """The reason of a stop that is latched because the board does not report the inputs."""
     events: tuple[EventName, EventName]
-    """The name of the event of a press, and the name of the event of a release."""
+    """Names of two log events: the one for a press, and the one for a release."""
 
     def __init__(self, use: EstopUse) -> None:
         self.use = use
@@ -182,17 +182,17 @@ class EmergencyStop(BoardInput):
     def __init__(self, use: EstopUse, unpowered: bool = False) -> None:
         super().__init__(use)
         self.driver_fault = False
-        """Whether the last `look` had a report of a motor-driver fault that counts.
+        """Whether the status lines in the last `look` reported a motor-driver fault that counts.
 
         A fault does not count while the drivers may have no power (`_unpowered`).
         """
         self._unpowered = unpowered
-        """Whether the emergency stop was pressed since the robot last had no latched stop.
+        """Whether the emergency stop has been pressed, and a stop has been latched ever since.
 
         The emergency stop cuts the power of the motor drivers, and a driver without power reports a
         fault. The power may come back some time after the button is released. Therefore no driver
-        fault counts until `clear` has released the stop, which it does not while a driver reports
-        a fault.
+        fault counts until `clear` has released the stop. The call `clear` is refused while a driver
+        reports a fault.
         """
 
     def look(self, reports: Sequence[tuple[int, BoardStatus]], now_ns: int) -> list[Event]:

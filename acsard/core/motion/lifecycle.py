@@ -29,8 +29,9 @@ from acsard.core.motion.modes import GOING_DOWN, Mode, RefusedError, mode_of, re
 from acsard.core.values import NS_PER_S, Instant, Latch, Latches
 
 LOOK_FIRST_S = 2.0
-"""Time after a stop, a `deactivate` or the start of the daemon in which a request must name the
-number of the latch, s. The network seldom takes longer to deliver a packet."""
+"""For this time after a stop, a `deactivate` or the start of the daemon, s, a call `clear` or
+`activate` must name the number of the latch, unless it can only release a fault. The network seldom
+takes longer to deliver a packet."""
 
 MAX_CLIENTS = 4
 """Largest number of clients among the earlier causes of a stop. If more clients stop the robot, the
@@ -294,7 +295,11 @@ class Lifecycle:
         )
 
     def _require_seen_stop(self, asked_ns: int) -> None:
-        """Raise `RefusedError` if the sender of a call `clear` may not know the latched stop."""
+        """Raise `RefusedError` if the sender of a call `clear` may not know the latched stop.
+
+        `asked_ns` is the monotonic time at which the call arrived. Do nothing if no stop is
+        latched.
+        """
         stop = self.latches.stop
         if stop is None:
             return
@@ -310,7 +315,8 @@ class Lifecycle:
         """Raise `RefusedError` if the latch is so new that the sender may not know it.
 
         `set_ns` is the monotonic time at which the latch was set, `LONG_AGO_NS` if an earlier run
-        set it.
+        set it. `asked_ns` is the monotonic time at which the request arrived. `call` is the service
+        that the text of the error names.
         """
         began_ns = LONG_AGO_NS if self._began_ns is None else self._began_ns
         since = asked_ns - max(set_ns, began_ns)
@@ -360,12 +366,12 @@ def _not_in_force(number: int, still: str, call: str) -> str:
 
 
 def _still(latch: Latch) -> str:
-    """Return all causes of a latch as the end of the sentence "the robot is still ..."."""
+    """Return all causes of a latch as words that complete "the robot is still ..."."""
     return " and ".join([_stopped(cause) for cause in latch.causes])
 
 
 def _stopped(latch: Latch) -> str:
-    """Return the newest cause of a latch as the end of the sentence "the robot was ..."."""
+    """Return the newest cause of a latch as words that complete "the robot was ..."."""
     return latch.why if _asked_for(latch) else f"stopped ({latch.why})"
 
 

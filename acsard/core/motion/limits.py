@@ -39,7 +39,8 @@ class Limiter:
         self.state = _State(REST, 0.0, 0.0)
         """The allowed twist and the accelerations of the last step.
 
-        If a line was not written to the port, `Robot` restores the state of the last written one.
+        If the command line of a step was not written to the port, `Robot` sets `state` back to its
+        value at the last line that was written.
         """
         self.use(limits)
 
@@ -161,7 +162,7 @@ def _approach(
 
 
 def _flattenable(away: float, step: float, dt: float) -> float:
-    """Return the steepest acceleration that can fall to zero while the speed changes by `away`.
+    """Return the largest acceleration that can fall to zero while the speed changes by `away`.
 
     The acceleration falls by `step` in each period of `dt` s. If it starts at s and falls for n
     more periods, the speed changes by dt ((n + 1) s - step n (n + 1) / 2).

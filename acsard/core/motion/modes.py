@@ -34,7 +34,7 @@ class Mode(StrEnum):
 
 
 class RefusedError(AcsardError):
-    """A request that the robot does not allow now. The caller gets the text as the reason."""
+    """Error for a request that the robot does not allow now. Its text tells the client why."""
 
 
 def mode_of(
@@ -46,7 +46,11 @@ def mode_of(
     linked: bool,
     commanded: bool,
 ) -> Mode:
-    """Return the first mode of the module's list whose condition holds."""
+    """Return the first mode of the list in this module's docstring whose condition holds.
+
+    `linked` is true if the board is ready to drive the robot, and `commanded` is true if the robot
+    has a fresh command to follow.
+    """
     if shutting_down:
         return Mode.SHUTDOWN
     if fault:
