@@ -69,7 +69,7 @@ class ConsistencyChecks:
         return status if self._track is None else replace(status, track_use=self._track.use)
 
     def hear(self, samples: tuple[GyroSample, ...]) -> None:
-        """Store the gyro samples that arrived since the last step, the oldest first."""
+        """Store `samples`, which arrived since the last step and are in the order of arrival."""
         if self.gyro is not None:
             self.gyro.hear(samples)
 
@@ -100,19 +100,19 @@ class ConsistencyChecks:
         return found
 
     def taken_back(self, turn: float) -> float:
-        """Record that recomputing the pose without a faulty wheel has changed earlier turns.
+        """Record changes of earlier turns, after the pose was recomputed without a faulty wheel.
 
-        `turn` is the sum of the changes, rad, over the lines with `on_trial`. Return the angle that
-        the caller must subtract from the heading, rad: `turn` if the gyro is proven by now,
-        otherwise 0.
+        `turn` is the sum of the changes, rad, over the lines for which `on_trial` was true. Return
+        the angle that the caller must subtract from the heading, rad: `turn` if the gyro is proven
+        by now, otherwise 0.
         """
         return 0.0 if self.gyro is None else self.gyro.taken_back(turn)
 
     def learn(self, turned: float) -> Track | None:
-        """Learn from the last feedback line, which turned the pose by `turned` rad.
+        """Finish the checks of the last feedback line, which turned the pose by `turned` rad.
 
-        Set `events`, and return the effective track for the next lines. Return None without a gyro,
-        or if `[odometry] learned_track` is false.
+        Set `events` to the log events of this line, and return the effective track for the next
+        lines. Return None without a gyro, or if `[odometry] learned_track` is false.
         """
         gyro, track, self.events = self.gyro, self._track, self.wheels.events
         if gyro is None:

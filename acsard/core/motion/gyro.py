@@ -6,9 +6,9 @@ does not affect the wheels. The gyro's reading at rest is its bias (`gyro_bias.p
 of gyro and wheels gives the gyro's delay and the effective track (`gyro_match.py`).
 
 Until gyro and wheels have agreed in a turn, the heading comes from the wheels. After that turn, the
-heading is corrected by the difference to the gyro. A gyro that reads the opposite sign, degrees or
-zero is reported and not used (`gyro_trial.py`). If a gyro is silent, or if its rate does not match
-the wheels at all, the heading comes from the wheels.
+heading is corrected by the gyro's turn minus the wheels' turn up to then. A gyro that reads the
+opposite sign, degrees or zero is reported and not used (`gyro_trial.py`). If a gyro is silent, or
+if its rate does not match the wheels at all, the heading comes from the wheels.
 
 A sample that arrives late is included in the turn of the next line, so no turn is lost.
 """
@@ -36,25 +36,26 @@ assumed to continue turning at the rate of this sample."""
 
 LATEST_NS = NS_PER_S // 4
 """If the delay of a sample exceeds the smallest delay of earlier samples by more than this, ns, the
-clock of its sender was set."""
+clock of the sender is assumed to have been set."""
 
 SET_BACK_NS = NS_PER_S // 50
-"""A stamp earlier than the previous one by more than this, ns, shows that the sender's clock was
-set. Samples arrive in order, but a driver may swap two of them or measure their times with some
-jitter."""
+"""If a stamp is earlier than the previous one by more than this, ns, the clock of the sender is
+assumed to have been set. A smaller step back may have another cause: a driver may swap two samples
+or measure their times with some jitter."""
 
 DELAYS_NS = (-NS_PER_S // 10, 3 * NS_PER_S // 10)
-"""Range of the gyro's delay relative to the wheels, ns. An early gyro has a negative delay."""
+"""Range of the gyro's delay relative to the wheels, ns. The delay is negative if the gyro reports a
+turn earlier than the wheels do."""
 
 LEAST_DELAY_S = 0.002
-"""Smallest correction of the delay that is applied, s."""
+"""A measured error of the gyro's delay is corrected only if it is at least this large, s."""
 
 SLIP_S = 0.5
 """Seconds for which the wheels count as slipping after they last contradicted the gyro."""
 
 MOST_SLIP_S = 5.0
 """Longest plausible slip, s. If gyro and wheels contradict each other for longer, the gyro is not
-believed."""
+used until they agree again."""
 
 ENOUGH_BLOCKS = 20.0
 """Number of blocks of 0.1 s in which the robot must turn before the measured ratio of the gyro's
@@ -104,7 +105,7 @@ class Gyro:
     def __init__(self) -> None:
         self._rest_s = self._since_rest_s = 0.0
         self._learned: Track | None = None
-        """The effective track that was learned with an earlier gyro, None without one."""
+        """The effective track that was learned with an earlier gyro; None if there is none."""
         self.owes = False
         """Whether the wheels provided the turn of the last line because the gyro is not proven. If
         the gyro is proven later, the heading is corrected by the difference to the gyro's turn."""
@@ -117,7 +118,7 @@ class Gyro:
         """Start over with a gyro whose bias, delay and direction are unknown."""
         self._bias, self._match, self._trial = Bias(), Match(), Trial()
         self._heard: deque[tuple[int, GyroSample]] = deque(maxlen=256)
-        """Samples that no `turn` has used yet, each with its monotonic time of measurement, ns."""
+        """Samples that no `turn` has used yet, each with its monotonic time, ns (`_time_of`)."""
         self._promptest = MinimumDelay()
         self._last: GyroSample | None = None
         self._delay_ns = 0
@@ -145,14 +146,14 @@ class Gyro:
 
     @property
     def learned(self) -> Track | None:
-        """The effective track learned from this gyro or an earlier one, None without one."""
+        """The effective track learned from this gyro or an earlier one; None if there is none."""
         match = self._match
         if match.blocks < ENOUGH_BLOCKS or match.ratio <= 0.0:
             return self._learned
         return Track(1.0 / match.ratio, max(LEAST, match.spread / match.ratio))
 
     def hear(self, samples: tuple[GyroSample, ...]) -> None:
-        """Store the samples that arrived since the last step, the oldest first."""
+        """Store `samples`, which arrived since the last step and are in the order of arrival."""
         for sample in samples:
             if sample.anew:
                 # The track is a property of wheels and floor, so it stays valid with another gyro.
@@ -208,12 +209,12 @@ class Gyro:
         `_owed_variance` is its variance, rad2."""
 
     def taken_back(self, turn: float) -> float:
-        """Record that the turn in the pose has changed for one or more lines with `owes`.
+        """Record that the pose was recomputed over one or more lines for which `owes` was true.
 
-        `turn` is the sum of the changes, rad. Return the angle that the caller must subtract from
-        the heading, rad. If the gyro is proven by now, the heading has already been corrected to
-        the gyro's turn of these lines. The change must then be undone, so the result is `turn`.
-        Otherwise the result is 0.
+        `turn` is the sum of the changes of the turns in these lines, rad. Return the angle that the
+        caller must subtract from the heading, rad. If the gyro is proven by now, the heading has
+        already been corrected to the gyro's turn of these lines. The changes must then be undone,
+        so the result is `turn`. Otherwise the result is 0.
         """
         verdict = self._trial.verdict
         if verdict == "none yet":
@@ -223,9 +224,9 @@ class Gyro:
     # Samples.
 
     def _time_of(self, sample: GyroSample) -> int:
-        """Return the monotonic time of arrival of a sample, ns, minus the jitter of that time.
+        """Return the monotonic time at which `sample` would have arrived without jitter, ns.
 
-        The stamps show the jitter. Without stamps, the jitter counts as 0.
+        The stamps of the samples show the jitter. Without stamps, the jitter counts as 0.
         """
         last, self._last = self._last, sample
         if last is None or sample.stamp_ns is None or last.stamp_ns is None:
@@ -239,7 +240,7 @@ class Gyro:
     def _take(self, until_ns: int, resting: bool) -> None:
         """Process the samples until the monotonic time `until_ns`.
 
-        At rest, learn the bias from them. Otherwise, add their turn to `_angle`.
+        If `resting` is true, learn the bias from them. Otherwise, add their turn to `_angle`.
         """
         bias, heard = self._bias, self._heard
         until_ns += self._delay_ns
@@ -264,7 +265,9 @@ class Gyro:
     def _try(self, wheels: float, angle: float, variance: float, dt: float, resting: bool) -> bool:
         """Test a gyro that is not proven yet, and return whether the wheels must provide this turn.
 
-        While the wheels rest, the gyro provides the turn, because a person may turn the robot.
+        `wheels` and `angle` are the turns in the last `dt` s according to the wheels and to the
+        gyro, rad, and `variance` is the variance of `angle`, rad2. If the wheels rest (`resting`),
+        the gyro provides the turn, because a person may turn the robot.
         """
         trial, known = self._trial, self._bias.known
         if not trial.open or resting:

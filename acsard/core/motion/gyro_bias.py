@@ -19,15 +19,16 @@ WALK = 1e-4
 """Random walk of a cheap gyro's bias with temperature, rad/s per square root of a second."""
 
 UNLIKELY = 5.0
-"""Largest difference of a sample at rest from the bias that counts as noise, in standard
-deviations. `SLACK` is added to it."""
+"""A sample at rest counts as noise if it differs from the bias by at most this number of standard
+deviations plus `SLACK`. A sample that differs by more contradicts the bias."""
 
 SLACK = 0.01
 """Difference of a sample from the bias, rad/s, that is allowed in addition to `UNLIKELY` standard
 deviations. A robot that stands may vibrate."""
 
 LEAST_NOISE = 1e-5
-"""Smallest assumed standard deviation of a sample, rad/s. Coarse gyros may repeat one value."""
+"""Smallest assumed standard deviation of a sample, rad/s. A coarse gyro may repeat one value, so
+its measured standard deviation may be 0."""
 
 ANEW_S = 1.0
 """If the reading at rest differs from the bias but stays constant for this time, s, this reading
@@ -83,7 +84,10 @@ class Bias:
         return True
 
     def _doubt(self, rate: float, variance: float, dt: float, noise: float) -> bool:
-        """Process a sample that contradicts the bias; return True if the bias changes."""
+        """Process a sample that contradicts the bias; return True if the bias changes.
+
+        `noise` is the variance of the samples so far, rad2/s2. For the other arguments, see `rest`.
+        """
         other = self._other = self._other or Bias()
         if not other.rest(rate, variance, dt) or other._rested_s < ANEW_S:
             return False

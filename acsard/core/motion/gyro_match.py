@@ -100,7 +100,8 @@ class Match:
 
     def __init__(self) -> None:
         self._ww, self._wg = 1.0 / ROUGH**2, 1.0 / ROUGH**2
-        """Least-squares sums. They start with the ratio 1 and the standard deviation `ROUGH`."""
+        """Sums of the least-squares fit. Their initial values stand for the ratio 1 with the
+        standard deviation `ROUGH`."""
         self._wd, self._dg, self._dd = NO_DELAY
         self._off = self._way = 0.0
         """Sums over the present stretch, rad. `_way` is the turn of the wheels. `_off` is the

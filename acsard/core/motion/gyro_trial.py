@@ -1,9 +1,9 @@
 """Tests in the first turn whether a gyro measures rad/s about an axis that points up.
 
-A gyro that is mounted upside down, reads degrees or is disconnected reports another turn than the
-wheels. A sound gyro also reports another turn if the wheels slip. Therefore a gyro is not believed
-until it has agreed with the wheels in a turn once. The bounds for this agreement are wide, because
-wheels that skid turn the robot by less than they roll.
+A gyro that is mounted upside down, reads degrees or is disconnected reports a turn that differs
+from that of the wheels. If the wheels slip, a sound gyro also reports a different turn. Therefore a
+gyro is not used until it has agreed with the wheels in a turn once. The bounds for this agreement
+are wide, because wheels that skid turn the robot by less than they roll.
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ lower rate while the robot drives straight."""
 
 SLOWEST, STRETCH_S = 0.05, 0.5
 """`SLOWEST` is the smallest mean turn rate according to the wheels that counts as a turn, rad/s.
-`STRETCH_S` is the time for this mean, s."""
+`STRETCH_S` is the duration of the intervals over which the mean is taken, s."""
 
 PROPORTIONS = (0.25, 2.5)
-"""Range of the robot's true turn divided by the turn according to the wheels, on any floor."""
+"""Range of a ratio: the robot's true turn divided by its turn according to the wheels. The ratio is
+within this range on any floor."""
 
 PROVED, REFUTED = 0.1, 0.4
 """Smallest turn to the left or to the right according to the wheels, rad, that proves a gyro
@@ -32,8 +33,8 @@ REFUTED_S = 0.3
 long as this."""
 
 DEGREES = (15.0, 150.0)
-"""Range of the gyro's turn divided by the wheels' turn if the gyro reads degrees. The exact value
-would be 57."""
+"""Range of a ratio: the gyro's turn divided by the wheels' turn, if the gyro reads degrees. Without
+slip and errors, the ratio is 57."""
 
 Verdict = Literal["none yet", "good", "reversed", "in degrees", "dead", "not believed"]
 

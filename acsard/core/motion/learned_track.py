@@ -13,17 +13,18 @@ from msgspec import Struct
 from acsard.core.values import Event, GyroStatus, Level, TrackUse
 
 LEAST = 0.05
-"""Smallest relative standard deviation of a learned track, because floor and turn rate may change.
-The value is half of `gyro_match.FINE`, because the mean error over a whole drive is smaller than
-the error at one moment."""
+"""A learned track never has a smaller relative standard deviation than this, because floor and turn
+rate may change. The value is half of `gyro_match.FINE`, because the mean error over a whole drive
+is smaller than the error at one moment."""
 
 CERTAIN, UNCERTAIN = 0.1, 0.2
 """Limits of the learned track's relative standard deviation. An uncertain track becomes certain
 below `CERTAIN`, and a certain track becomes uncertain above `UNCERTAIN`."""
 
 BOUNDS = (0.5, 2.5)
-"""Range of the learned track, divided by the configured one. The effective track is 1.4 to 1.9
-times the wheel separation on most floors, and 2.5 times on slippery ones."""
+"""Range of a ratio: the learned track divided by the configured one. Outside this range, the
+learned track is not used. The effective track is 1.4 to 1.9 times the wheel separation on most
+floors, and 2.5 times on slippery ones."""
 
 INWARDS = 1.05
 """Factor that narrows `BOUNDS` for a learned track that is not in use: such a track comes into use
