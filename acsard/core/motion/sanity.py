@@ -3,7 +3,7 @@
 `Sanity` rejects a line in which a wheel turns, or changes its speed, faster than any wheel can. The
 daemon does not use such a line, and several in a row are a fault. If more than one line in a
 hundred is impossible, the daemon logs a warning: either the wire damages lines, or a bound is too
-low and true lines are rejected. `wheel_faults.py` checks whether the wheels obey their commands.
+low and true lines are rejected. `wheel_faults.py` checks whether the wheels follow their commands.
 
 A plain line has no checksum, so a damaged line may look possible, and then the true lines after it
 look impossible. Therefore a possible line is trusted only if it agrees with the possible line
@@ -24,8 +24,8 @@ REPEATED = 3
 """Number of impossible lines in a row that latch a fault: 30 ms at 100 Hz."""
 
 WINDOW = 1000
-"""Number of lines in a window, in which impossible lines are counted. A window lasts 10 s at
-100 Hz."""
+"""Number of lines in a window. The daemon counts the impossible lines of each window. A window
+lasts 10 s at 100 Hz."""
 
 SHARE = 0.01
 """If more than this fraction of the lines in a window is impossible, one warning is logged."""
@@ -54,15 +54,15 @@ class Sanity:
         self._settings = feedback
         self._last: WheelSpeeds | None = None
         self._trusted = False
-        """Whether `_last` agreed with the possible line before it. If it did, a next line with the
-        speeds of that earlier line would be possible too."""
+        """Whether the line `_last` is trusted. It is if it differs so little from the possible line
+        before it that the next line may have the speeds of that earlier line again."""
         self._rejected: list[tuple[WheelSpeeds, float]] = []
         """The newest impossible lines since `_last`: pairs of the speeds and the time since
         `_last`, s. Lines with a speed over `feedback.wheel_speed` are not included."""
         self._since = 0.0
         self._longest = 0.0
-        """Longest time that a recent line covers, s. The speeds in a line are means over this time.
-        A line that covers t s counts as recent for t s."""
+        """Longest time that a recent line covers, s. The speeds in a line are means over the time
+        that the line covers. A line that covers t s counts as recent for t s."""
         self._impossible = 0
         self._lines = self._dropped = 0
         """Numbers of all lines and of impossible lines in the present window."""
@@ -122,21 +122,27 @@ class Sanity:
         return ""
 
     def _most(self, since: float, longest: float) -> float:
-        """Return the largest possible change of a speed within `since` s, rad/s.
+        """Return the largest possible change of a wheel's speed within `since` s, rad/s.
 
         `longest` is the longest time that one of the recent lines covers, s (see `_longest`).
         """
         return self._settings.wheel_acceleration * max(since, (since + longest) / 2) + SLACK
 
     def _agrees(self, line: Feedback, longest: float) -> bool:
-        """Return whether a line agrees with one of the impossible lines in `_rejected`."""
+        """Return whether a line agrees with one of the impossible lines in `_rejected`.
+
+        `longest` is the longest time that one of the recent lines covers, s (see `_longest`).
+        """
         return any(
             not self._jump(line, speeds, self._most(self._since - since, longest))
             for speeds, since in self._rejected
         )
 
     def _count(self, why: str) -> None:
-        """Count a line in the window, and set the warning if it is due."""
+        """Count a line in the window, and set `warning` if too many lines are impossible now.
+
+        `why` is the reason why the line is impossible, "" for a possible line.
+        """
         self._lines += 1
         self.warning = None
         if why:

@@ -28,11 +28,13 @@ FAULT_COUNTS, FAULT_ANGLE = 3.5, 0.05
 `FAULT_COUNTS` encoder counts plus `FAULT_ANGLE` rad."""
 
 FOLLOWED_COUNTS, FOLLOWED_ANGLE = 2.5, 0.01
-"""After a new command, a wheel that repeats its old speed is called stuck only if the angle of a
-healthy wheel would differ by `FOLLOWED_COUNTS` encoder counts plus `FOLLOWED_ANGLE` rad."""
+"""After a new command, a wheel that repeats its old speed is called stuck only when a healthy wheel
+would have rolled a clearly different angle. The difference must be at least `FOLLOWED_COUNTS`
+encoder counts plus `FOLLOWED_ANGLE` rad."""
 
 LEAVES = 0.05
-"""Least change of the command, rad/s, after which a healthy wheel must report another speed."""
+"""Smallest change of the command, rad/s, after which a healthy wheel must report a different
+speed."""
 
 VOTE = 1 / 3
 """A reference (a gyro or the command) decides which of two wheels is faulty only if the reference
@@ -40,8 +42,8 @@ is clearly nearer to one of them. The two distances from the reference must diff
 fraction of the difference between the wheels."""
 
 HAND_S = 0.3
-"""Time for which a wheel must repeat one speed without a command before it is called stuck, s. A
-hand cannot turn a wheel as evenly as this."""
+"""If neither a command nor a gyro shows which wheel is right, a wheel must repeat one speed for
+this time, s, before it is called stuck. A person cannot turn a wheel so evenly by hand."""
 
 DEAD, REVERSED = 0.1, 0.3
 """Fractions of the angle that the other wheel of the side rolled. A wheel is dead if it rolled by
@@ -128,7 +130,7 @@ class Suspect:
         return sign is not None
 
     def _sign(self, own: float, other: float, same: bool, count: float) -> WheelFault | None:
-        """Return the sign of a fault that this line shows, or None."""
+        """Return the sign of a fault that this line shows, or None (arguments: see `looks`)."""
         if self.sign == "stuck" and same:
             return "stuck"
         if reverses(own, other, count) or (self.sign == "reversed" and own * other == 0.0):
@@ -148,8 +150,10 @@ class Suspect:
     ) -> None:
         """Compare both wheels with the references in this line.
 
-        `own`, `other` and `gyro` are the angles of this wheel, of the other wheel of its side, and
-        of the side according to a gyro, rad.
+        `own`, `other` and `gyro` are the angles that this wheel, the other wheel of its side, and
+        the side according to a gyro rolled in `dt` s, rad. `gyro` is None without a trusted gyro.
+        `count` is the angle of an encoder count, rad. `expected` gives the speed of a healthy
+        wheel.
         """
         slow, command = expected.speed, expected.commanded
         self._begun = abs(own) if self._begun is None else self._begun
@@ -178,7 +182,10 @@ class Suspect:
         return self.sign == "stuck" and not self._known and self._seconds >= HAND_S
 
     def _plain(self, ballot: _Ballot) -> bool:
-        """Return whether the difference is too large to be slip of the other wheel."""
+        """Return whether the two wheels differ by more than slip of the other wheel explains.
+
+        Only the sign "stuck" needs this test. For the other signs, the result is True.
+        """
         return self.sign != "stuck" or ballot.share >= STUCK
 
 
@@ -199,18 +206,18 @@ class Stuck:
         self._seconds = self._followed = self._other = 0.0
 
     def left_by(self, command: float) -> bool:
-        """Return whether the command has changed since the wheel first reported its present speed.
+        """Return whether the command has changed since the wheel began to repeat its present speed.
 
-        `command` is the present command, rad/s.
+        `command` is the present command, rad/s. A change below `LEAVES` does not count.
         """
         return abs(command - self._command) >= LEAVES
 
     def says(self, same: bool, apart: float, dt: float, count: float, expected: Expected) -> bool:
-        """Add a line, and return whether the encoder is stuck.
+        """Add a feedback line of `dt` s, and return whether the encoder is stuck.
 
         `same` is true if the wheel turns and repeats the speed of the line before. `apart` is the
         angle by which the other wheel of the side turned further than this wheel, rad. `count` is
-        the angle of an encoder count, rad.
+        the angle of an encoder count, rad. `expected` gives the speed of a healthy wheel.
         """
         slow, command = expected.speed, expected.commanded
         leaves = command - self._command

@@ -39,8 +39,9 @@ COARSEST, FINEST = math.tau / 16, math.tau / 2000
 not configured."""
 
 RECUR, SOUGHT = 3, 1000
-"""A small wheel angle is taken as one encoder count if an angle of at most this size occurs `RECUR`
-times within `SOUGHT` lines. A single small angle may come from a damaged line."""
+"""If the number of counts is not configured, the daemon learns the angle of one encoder count. This
+is the `RECUR`-th smallest angle that a front wheel rolled in a line, within `SOUGHT` lines. The
+smallest angle alone may come from a damaged line."""
 
 LEAST = 0.005
 """A commanded wheel speed below this, rad/s, counts as zero, because the line to the board has two
@@ -86,8 +87,8 @@ class _Side:
         self.late = False
         """Whether a wheel that is not ignored turns too slowly."""
         self._out_s = 0.0
-        """Time for which the ignored wheel has contradicted both the other wheel and its command,
-        s."""
+        """Time for which the ignored wheel has contradicted both the other wheel of its side and
+        its command, s."""
         self.slip_s = self._odd_s = self._agreed_s = 0.0
         self.event: Event | None = None
 
@@ -179,7 +180,8 @@ class _Side:
         """Test both wheels for a stuck encoder, and return whether this line proves one stuck.
 
         The pose then ignores this wheel. `turned` contains the angles that all wheels rolled in the
-        line, and `count` is the angle of an encoder count, rad.
+        line, and `same` says which wheels repeat the speed of the line before. `count` is the angle
+        of an encoder count, rad.
         """
         if self.out is not None:
             return False
@@ -395,8 +397,8 @@ class WheelFaults:
 
         If it does, the pose ignores the faulty wheel from now on. The caller must find the earlier
         lines in which this wheel was wrong (`was_faulty`). `turned` contains the angles that the
-        wheels rolled in the line, rad. `turn` is the turn that the wheels should show according to
-        a gyro, rad; None without a trusted gyro.
+        wheels rolled in the last `dt` s, rad, and `speeds` are the reported speeds. `turn` is the
+        turn that the wheels should show according to a gyro, rad; None without a trusted gyro.
         """
         slow = self._left.late or self._right.late
         if self.events or slow != self._late:
@@ -461,7 +463,10 @@ class WheelFaults:
         return self._found is not None and self._found.was_faulty(before, self._last)
 
     def _seek(self, speeds: WheelSpeeds, dt: float) -> None:
-        """Learn the angle of an encoder count: the smallest wheel angle that occurs repeatedly."""
+        """Learn the angle of an encoder count: the smallest wheel angle that occurs repeatedly.
+
+        `speeds` are the speeds in a line that covers `dt` s. See `RECUR` and `SOUGHT`.
+        """
         self._period += SMOOTHED * (dt - self._period)
         self._looked += 1
         if self._looked > SOUGHT:

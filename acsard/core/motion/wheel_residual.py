@@ -16,9 +16,10 @@ weight (`MEMORY_S`). The wheels contradict each other if
     |D - r A| > SHARE A + COUNTS c + LEAST
 
 where D is the sum of the front wheel's angles minus the sum of the rear wheel's angles, rad, A is
-the sum of the side's angles, rad, r is the learned fraction, and c is the angle of an encoder
-count, rad. The wheels slip if |D - r A| exceeds this limit by more than LAG_S |v - mean of v|,
-where v is the speed of the side, rad/s. This term is the effect of a motor that reacts later.
+the sum over the lines of the mean angle of both wheels, rad, r is the learned fraction, and c is
+the angle of an encoder count, rad. The wheels slip if |D - r A| exceeds this limit by more than
+LAG_S |v - mean of v|, where v is the speed of the side, rad/s. This term is the effect of a motor
+that reacts later.
 
 Without slip, the angles of two wheels can differ by two counts. Therefore a slip by the fraction s
 at v rad/s is certain only after 2 c / (s v) seconds. With 96 counts per revolution, a slip of a
@@ -35,8 +36,8 @@ MEMORY_S = 0.14
 """Time after which the weight of an angle in the sums has fallen to 1 / e, s."""
 
 SHARE = 0.05
-"""Allowed difference of two wheels, as a fraction of their angle. It is half of the slip of 10 %
-that must be found."""
+"""Allowed difference of the angles of two wheels, as a fraction of their mean angle. It is half of
+the slip of 10 % that must be found."""
 
 COUNTS = 1.2
 """Allowed difference of the angles of two wheels, in encoder counts. Wheels without slip rarely
@@ -46,7 +47,8 @@ LAG_S = 0.03
 """Allowed delay of one motor relative to the other, s."""
 
 LEAST = 0.002
-"""Further allowed difference of two wheels, rad. Speeds with two decimals and backlash cause it."""
+"""Allowed difference of the angles of two wheels, rad, in addition to `SHARE` and `COUNTS`.
+Backlash and the rounding of speeds to two decimals cause it."""
 
 UNEQUAL = 0.05
 """Largest fraction by which two healthy wheels of a side may differ permanently."""
@@ -101,9 +103,10 @@ class Residual:
         return True
 
     def stand_in(self, front: bool) -> float:
-        """Return the ratio of the angles of the wheels.
+        """Return the factor that computes the angle of one wheel from the angle of the other wheel.
 
-        The ratio is front / rear, or rear / front if `front` is false.
+        If `front` is true, the front wheel's angle is the rear wheel's angle times the result.
+        Otherwise, the rear wheel's angle is the front wheel's angle times the result.
         """
         more = 1.0 + self.ratio / 2, 1.0 - self.ratio / 2
         return more[0] / more[1] if front else more[1] / more[0]

@@ -2,13 +2,14 @@
 
 `Expected` is the only model of a healthy wheel: its speed follows the command with a first-order
 lag. `suspect_wheel.py` uses it to decide which of two wheels is wrong, and `Witness` uses it to
-decide whether a wheel obeys. The bounds around the expected speed leave room for load, slip and
-coarse encoders. Only behavior that no healthy wheel shows is evidence, and evidence must last.
+decide whether a wheel follows its command. The bounds around the expected speed leave room for
+load, slip and coarse encoders. Behavior is evidence only if no healthy wheel shows it, and evidence
+proves a fault only if it lasts.
 
-If a wheel stands, turns against its command or turns too fast, it still counts as obeying while its
-speed approaches the command. If a wheel turns in the right direction but too slowly, the daemon
-logs a warning with the ratio of the speeds: the load, the battery or `feedback.response_time` may
-be the cause.
+If a wheel stands, turns against its command or turns too fast, it is not evidence of a fault while
+the wheel's speed approaches the command. If a wheel turns in the right direction but too slowly,
+the daemon logs a warning with the ratio of the speeds: the load, the battery or
+`feedback.response_time` may be the cause.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ SLACK = 2.0
 robot at rest can look like any fault."""
 
 COMMANDED = 0.3
-"""Smallest commanded speed that can show which of two wheels is right, rad/s."""
+"""A command can show which of two wheels is right only if its speed is at least this, rad/s."""
 
 SLOWEST = 3.0
 """Response time of a slow robot's wheels, as a multiple of `feedback.response_time`."""
@@ -31,7 +32,8 @@ CLEAR = 1.0
 smoothing is the time in which a wheel at this speed turns by one encoder count."""
 
 NEARER = 1.0
-"""A wheel counts as obeying if its speed has approached the command by more than this, rad/s."""
+"""If a wheel is too fast, stands or turns against its command, but its speed comes closer to the
+command by more than this, rad/s, its behavior is not evidence of a fault."""
 
 RATIO_S = 2.0
 """Time of driving, s, after which the angle that a wheel rolled is compared with the angle that it
@@ -99,11 +101,11 @@ class Expected:
 
 
 class Witness:
-    """The evidence that one wheel does not obey its command, or is slower than expected."""
+    """The evidence that one wheel does not follow its command, or is slower than expected."""
 
     def __init__(self) -> None:
         self.driven = False
-        """Whether any wheel is commanded to turn, or this wheel has not rested since then."""
+        """True while any wheel is commanded to turn, and then until this wheel has come to rest."""
         self.ratio = 1.0
         """Angle that the wheel rolled in `RATIO_S` of driving, divided by the expected angle."""
         self.slow = False
@@ -131,7 +133,7 @@ class Witness:
         that is too fast, the deviation is its speed. Otherwise it is the speed of the wheel in the
         direction opposite to the command."""
         self._wrong = False
-        """Whether the wheel was too fast, stood, or turned against its command in the last line."""
+        """Whether the wheel was too fast, stood or turned the wrong way in the last line."""
         self._seconds = self._went = self._way = 0.0
 
     def coast(self, seen: float, dt: float, count: float) -> None:
