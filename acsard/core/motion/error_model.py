@@ -48,8 +48,8 @@ MOST = 1e9
 """Largest variance of a twist, m2/s2 and rad2/s2. It means "unknown"."""
 
 LEAST = 1e-8
-"""Smallest variance of a twist, m2/s2 and rad2/s2. Filters treat a smaller variance as
-an error."""
+"""Smallest variance of a twist, m2/s2 and rad2/s2. Filters that use the published twist treat a
+smaller variance as an error."""
 
 PERIOD = 0.01
 """Period of the feedback lines that is assumed until it is measured, s."""
@@ -60,7 +60,7 @@ because periods vary: several lines may be read at the same time."""
 
 
 class Noise:
-    """Computes the noise of a step: the variances of its distance and its turn."""
+    """Computes the noise of a step: the variances and the covariance of its distance and turn."""
 
     def __init__(self, odometry: OdometryConfig, track: float) -> None:
         """Use the variances in `odometry`. `track` is the effective track, m."""
@@ -132,7 +132,8 @@ def columns(
 
     The parameters are the multipliers m_l, m_r and m_L, the ratio m_r / m_l, a scale that
     multiplies all lengths, and the fraction of each distance that the wheels lose by slip. The
-    scale and the slip share one column. A parameter with a standard deviation of 0 has no column.
+    scale and the slip share one column. The standard deviations of these parameters come from
+    `odometry`. A parameter with a standard deviation of 0 has no column.
 
     If `learned` is not None, the last column is for the error of the learned track. The numbers in
     this column are 0 while the configured track is in use.
@@ -202,7 +203,7 @@ class TwistUncertainty:
         """Return the variances of the twist of a feedback line.
 
         Args:
-            twist: the twist.
+            twist: the twist that the line reports, m/s and rad/s.
             dt: the time since the line before, s; 0 if it is unknown.
             step: the quantization step of the wheel speeds in the feedback lines, rad/s; 0 if it
                 is unknown.
@@ -240,7 +241,10 @@ class TwistUncertainty:
         )
 
     def slipping(self, variances: TwistVariances) -> TwistVariances:
-        """Return all variances times `SLIPPING`, because the wheels may slip in any direction."""
+        """Return all variances times `SLIPPING`, but at most `MOST`, because the wheels slip.
+
+        The lateral variance grows too, because the wheels may slip in any direction.
+        """
         return TwistVariances(
             min(SLIPPING * variances.linear, MOST),
             min(SLIPPING * variances.lateral, MOST),

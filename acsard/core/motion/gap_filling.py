@@ -3,11 +3,11 @@
 `Rolling` computes the angles that the wheels rolled since the last plausible feedback line. (An
 implausible line is a line that `sanity.py` or `Confirmation` rejects.) `Rolling` uses the first of
 these sources that exists: the encoder counts in the line, whole counts that are recovered from the
-speeds in the line, or these speeds times the time. Each moment and each count is used exactly once.
-In a gap that no line covers, `Rolling` assumes the speed before the gap for the first half of the
-gap, and the speed after the gap for the second half. If the daemon commanded rest during the first
-half, the speed before the gap is assumed only until that command. The motion during implausible
-lines, and in the gaps before them, is computed with the next plausible line.
+speeds in the line, or these speeds times the time. It uses no time and no count twice, and leaves
+none out. In a gap that no line covers, `Rolling` assumes the speed before the gap for the first
+half of the gap, and the speed after the gap for the second half. If the daemon commanded rest
+during the first half, the speed before the gap is assumed only until that command. The motion
+during implausible lines, and in the gaps before them, is computed with the next plausible line.
 
 A damaged line after a gap would falsify the motion of the whole gap. `Confirmation` therefore holds
 a line with a doubtful speed until other lines confirm this speed or refute it.
@@ -30,9 +30,9 @@ from acsard.core.values import REST, Twist, WheelSpeeds
 
 MAX_LOST_S, MAX_LOST = 0.05, 1
 """Limits for consecutive implausible lines without encoder counts: `MAX_LOST_S` for their total
-duration, s, and `MAX_LOST` for their number. If one of the limits is kept, the robot is assumed to
-have moved at the speed of the next plausible line. Otherwise, its motion during these lines is
-unknown."""
+duration, s, and `MAX_LOST` for their number. If the lines exceed both limits, the motion of the
+robot during them is unknown. Otherwise, the robot is assumed to have moved at the speed of the next
+plausible line."""
 
 NOWHERE = (0.0, 0.0, 0.0, 0.0)
 
@@ -48,17 +48,18 @@ FIRST, MOST = 4.0, 300.0
 and `GUESS` has the weight `FIRST`. The total weight is limited to `MOST` (a minute of driving)."""
 
 GROWTH = 5
-"""Exponent in the growth of a gap's variance with the duration of the gap (`Gaps`)."""
+"""The variance of the motion in a gap grows with this power of the gap's duration (`Gaps`)."""
 
 
 class Rolled(Struct, frozen=True, gc=False):
     """Angles that the wheels rolled since the last plausible line, rad, in `WHEELS` order."""
 
     pieces: tuple[Motors, ...]
-    """Angles from the speeds, rad, in the order of time. Each item is one arc of the path, and has
-    at least one angle that is not zero."""
+    """Angles that are computed from the speeds, rad. Each item is one arc of the path, and has at
+    least one angle that is not zero. The items are in the order of time."""
     turned: Motors
-    """Angles from encoder counts, rad. This motion came before the motion in `pieces`."""
+    """Angles that are computed from encoder counts, rad. The odometry adds this motion to the pose
+    before that in `pieces`."""
     seen: Motors
     """Angles in the last `seconds` s, rad. If they come from speeds, they have the rounding errors
     of these speeds."""
@@ -86,9 +87,10 @@ class Rolling:
     def forget(self) -> None:
         """Forget the implausible lines since the last plausible one."""
         self._lost = self._gap = self._bridged = self._counted = 0.0
-        """Times, s. `_lost` is covered by implausible lines without counts, and `_counted` by
-        implausible lines with counts. `_bridged` and `_gap` are the gaps before the lines without
-        counts: those that can be filled, and those that cannot."""
+        """Durations, s. `_lost` is the time that implausible lines without counts cover, and
+        `_counted` the time that implausible lines with counts cover. `_bridged` and `_gap` are the
+        gaps before the lines without counts: `_bridged` is the total of those that can be filled,
+        and `_gap` is the total of those that cannot."""
         self._turned, self._skipped = NOWHERE, 0
 
     @property
@@ -160,7 +162,7 @@ def times(a: Motors, factor: float) -> Motors:
 
 
 class Confirmation:
-    """Holds back a line with a doubtful speed that counts for longer than usual.
+    """Holds back a line that reports a doubtful speed and covers more time than usual.
 
     After a gap, one damaged line would falsify the motion of the whole gap. Damage can be detected,
     because it changes one wheel alone, while motion changes the speeds of both wheels of a side
@@ -168,11 +170,12 @@ class Confirmation:
     motion of a wheel. Two lines agree if no wheel alone has changed its speed so much that this
     change could falsify the motion by more than A.
 
-    A line of the usual duration is used immediately. A line that counts for longer is used
+    A line of the usual duration is used immediately. A line that covers more time is used
     immediately if it agrees with the last line that was used. Otherwise it is held, and the next
     line decides:
 
-    - If the next line agrees with the held line, both are used, because a wheel did change alone.
+    - If the next line agrees with the held line, both are used, because one wheel really changed
+      its speed alone.
     - If the next line agrees with the last line that was used, the held line is dropped.
     - If the next line agrees with neither, both are held, and the third line decides: a line that
       differs much more from the other two than they do from each other is dropped.
@@ -235,8 +238,9 @@ class Confirmation:
 def _alone(a: Motors, b: Motors, steps: Motors) -> float:
     """Return the largest speed change of one wheel that the other wheel of its side did not make.
 
-    The speeds change from `b` to `a`, rad/s. `steps` are the quantization steps of the speeds,
-    rad/s. A change by one known step does not count.
+    `a` are the speeds after the change, and `b` those before it, rad/s. `steps` are the
+    quantization steps of the speeds, rad/s, infinite if unknown. A change by one known step does
+    not count.
     """
     changes, largest = tuple(map(sub, a, b)), 0.0
     # The wheels i and 3 - i in `WHEELS` order are those of one side.
@@ -247,7 +251,7 @@ def _alone(a: Motors, b: Motors, steps: Motors) -> float:
 
 
 class Gaps:
-    """Estimates the variances of the motion in gaps.
+    """Estimates the variances of the motion in gaps of the feedback.
 
     Let s be the standard deviation of the acceleration, m/s2 or rad/s2. After t s without lines,
     the true motion deviates by s t^2 / 2 from the motion at the known speeds, so the variance of
@@ -269,7 +273,7 @@ class Gaps:
         self.interrupt(REST)
 
     def interrupt(self, twist: Twist) -> None:
-        """Discard the unfinished measurement, and start a new one with the speeds `twist`."""
+        """Discard the unfinished measurement of the acceleration; start a new one at `twist`."""
         self._first, self._seconds, self._distance, self._turn = twist, 0.0, 0.0, 0.0
         self._bridged, self._given = 0.0, (0.0, 0.0)
 

@@ -64,7 +64,7 @@ class Step(Struct, frozen=True, gc=False):
     """The turn that a gyro measured, None if the wheels provided the turn."""
     speeds: WheelSpeeds
     turn: float
-    """Change of the heading by the line, rad."""
+    """Change of the heading that this line caused, rad."""
     on_trial: bool
     """Whether the turn came from the wheels because the gyro was not proven yet."""
     share: float = 1.0
@@ -288,7 +288,11 @@ class Odometry:
         speeds: WheelSpeeds,
         slips: bool,
     ) -> float:
-        """Advance the pose by the angles of the wheels; return the turn of the pose, rad."""
+        """Advance the pose by the angles of the wheels; return the turn of the pose, rad.
+
+        `pieces` contains the angles, rad, one item for each arc. `turn` is the turn according to a
+        gyro, or None if the wheels must provide the turn. `slips` is true if the wheels slip.
+        """
         path, turned = self._path, 0.0
         pose, variance = path.pose, None if turn is None else turn.variance
         for piece in pieces:
@@ -303,9 +307,11 @@ class Odometry:
         return turned
 
     def _go_on(self, bridged: float, feedback: Feedback, before: Twist, twist: Twist) -> None:
-        """Add the uncertainty of a filled gap. Without a gap, measure how the twist changes.
+        """Add the uncertainty of a filled gap; without a gap, measure how the twist changes.
 
-        A gap that was not filled restarts the measurement.
+        `bridged` is the duration of the filled gap, s; 0 without one. `before` and `twist` are the
+        twists of the line before and of this line. A gap that was not filled restarts the
+        measurement.
         """
         if bridged > 0.0:
             self.bridged += bridged
@@ -330,7 +336,11 @@ class Odometry:
         return variances
 
     def _stand(self, seconds: float, before: Twist, after: Twist) -> None:
-        """Add the uncertainty of `seconds` s of unknown motion, without moving the pose."""
+        """Add the uncertainty of `seconds` s of unknown motion, without moving the pose.
+
+        `before` and `after` are the twists before and after this time. If both are zero, the time
+        does not count as a gap in which the robot moved.
+        """
         if before != REST or after != REST:
             self.gaps += 1
             self.unseen += seconds

@@ -1,10 +1,10 @@
 """Adds arcs to a pose. Rounding errors do not build up, even over millions of arcs.
 
-An arc of length d through the angle a, from a pose with the heading yaw, has a chord of length d
-sin(a / 2) / (a / 2) in the direction yaw + a / 2. The rounding error of each sum is kept and added
-to the next sum (Kahan, Further Remarks on Reducing Truncation Errors, 1965). When yaw is wrapped,
-exactly 2 pi is subtracted and not the double nearest to 2 pi (`TAU_REST`), so that many revolutions
-cause no error either.
+Let an arc have the length d and the angle a, and start from a pose with the heading yaw. Its chord
+then has the length d sin(a / 2) / (a / 2) and the direction yaw + a / 2. The rounding error of each
+sum is kept and added to the next sum (Kahan, Further Remarks on Reducing Truncation Errors, 1965).
+When yaw is wrapped, exactly 2 pi is subtracted and not the double nearest to 2 pi (`TAU_REST`), so
+even many revolutions cause no error.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Path:
 
 
 def plus(a: float, b: float) -> tuple[float, float]:
-    """Return a pair: the double nearest to a + b, and its exact rounding error (Knuth)."""
+    """Return a pair: the double nearest to a + b, and its exact rounding error (Knuth's TwoSum)."""
     total = a + b
     of_b = total - a
     return total, (a - (total - of_b)) + (b - of_b)

@@ -36,10 +36,10 @@ def bracket(a: Vector, b: Vector) -> Planar:
 
 
 def brackets(a: Vector, p: PoseCovariance, times: float) -> tuple[Vector, Vector]:
-    """Return the rows x and y of the matrix `times` E[[a, e] e'], whose row yaw is always 0.
+    """Return two rows, x and y, of the matrix E[[a, e] e'] times the number `times`.
 
-    e is a random pose error with the covariance `p`, E is the expected value, [a, e] is the Lie
-    bracket, and ' means transposed.
+    The third row, yaw, is always 0. `a` is a fixed pose error, and e is a random pose error with
+    the covariance `p`. E is the expected value, [a, e] is the Lie bracket, and ' means transposed.
     """
     x, y, yaw = times * a[0], times * a[1], times * a[2]
     return (
@@ -78,9 +78,10 @@ def twice_bracketed(p: PoseCovariance, a: Vector) -> PoseCovariance:
 
 
 def seen_from(error: Vector, dx: float, dy: float) -> Vector:
-    """Return a pose `error` as it is after the robot has moved by `dx`, `dy` m in odom.
+    """Return the value of a pose `error` after the robot has moved by `dx`, `dy` m in odom.
 
-    Both errors are in axes parallel to odom, with the origin at the robot.
+    The given and the returned error are both in axes parallel to odom, with the origin at the
+    robot.
     """
     x, y, yaw = error
     return x - dy * yaw, y + dx * yaw, yaw
@@ -133,8 +134,8 @@ def stepped(
 ) -> PoseCovariance:
     """Return the covariance of the pose after a step by `dx`, `dy` m, with the noise of the step.
 
-    The result is that of `added(carried(p, dx, dy), along, yaw, both, c, s)`. One function is
-    faster, and the covariance is updated for each feedback line.
+    The result is that of `added(carried(p, dx, dy), along, yaw, both, c, s)`. This single function
+    is faster than the two calls, and it runs for each feedback line.
     """
     xyaw, yyaw, yawyaw = p.xyaw, p.yyaw, p.yawyaw
     cc, cs = along * c, along * s

@@ -1,7 +1,7 @@
 """Adds the effects of second order to the covariance of the pose.
 
 If the true heading deviates from the estimated one and returns, the robot ends short of the
-estimated place, and never beyond it. This is an effect of second order. On a straight drive, it
+estimated position, and never beyond it. This is an effect of second order. On a straight drive, it
 causes nearly the whole error along the path: after 60 m with k = 1e-5 (`error_model.py`) the
 first-order error is 17 mm, but the true error is 0.12 m.
 
@@ -57,16 +57,21 @@ NOTHING = PoseCovariance(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class SecondOrder:
-    """Computes the terms of second order in the covariance of x and y (symbols: see the module)."""
+    """Computes the terms of second order in the covariance of x and y.
+
+    The symbols such as [x, n], M_i and C_ik are those of the module's docstring.
+    """
 
     def __init__(self, columns: int) -> None:
         self._noise: Vector = ORIGIN
-        """Covariance (xx, xy, yy), m2, of the sum of all [x, n] / 2 and M_i of the module."""
+        """Covariance (xx, xy, yy), m2, of the sum of all [x, n] / 2 and all M_i (see the
+        module)."""
         self._with_x: list[tuple[Vector, Vector]] = []
-        """For each parameter, the covariance of M_i with the error x of the module. The two rows
-        are those of the components of M_i along the x and the y axis."""
+        """For each parameter, the covariance of M_i with the error x (see the module). The first
+        row is for the component of M_i along the x axis, and the second row for that along the y
+        axis."""
         self._bent: dict[tuple[int, int], Planar] = {}
-        """C_ik of the module for each pair of parameters, m. The larger index comes first."""
+        """C_ik (see the module) for each pair of parameters, m. The larger index comes first."""
         for _ in range(columns):
             self.widen()
         self.xx = self.xy = self.yy = 0.0
@@ -88,12 +93,13 @@ class SecondOrder:
     ) -> PoseCovariance:
         """Add a stretch of the path, and return the covariance that the caller must add to p + q.
 
-        The result is the contribution of the last two terms of the series in the module. All
-        arguments must be expressed at the robot's place at the end of the stretch
+        The result is the contribution of the last two terms of the series in the module's
+        docstring. All arguments must be expressed at the robot's position at the end of the stretch
         (`se2.seen_from`). The caller must first call `carry` with the displacement of the stretch.
 
-        `p` and `q` are the covariances of the noise on the path before and on the stretch. `j` and
-        `w` have a column for each parameter: its effects on the path before and on the stretch.
+        `p` and `q` are the covariances of the noise on the path before the stretch and on the
+        stretch itself. `j` and `w` have a column for each parameter: its effects on the path before
+        and on the stretch.
         """
         xyaw, yyaw, yawyaw = p.xyaw, p.yyaw, p.yawyaw
         for x, y, yaw in j:
@@ -117,7 +123,10 @@ class SecondOrder:
     def _bend_noise(
         self, i: int, p: PoseCovariance, q: PoseCovariance, column: Vector, new: Vector
     ) -> None:
-        """Add ([J_i, n] + [x, W_i]) / 2 to M_i of the module. J_i is `column`, and W_i is `new`."""
+        """Add ([J_i, n] + [x, W_i]) / 2 to M_i (see the module) for the parameter `i`.
+
+        `p` and `q` are the covariances of x and of n. `column` is J_i, and `new` is W_i.
+        """
         x, y = self._with_x[i]
         by_new_x, by_new_y = brackets(new, p, -0.5)
         by_noise_x, by_noise_y = brackets(column, q, 0.5)

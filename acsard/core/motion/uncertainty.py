@@ -116,8 +116,8 @@ class PoseUncertainty:
             self._p = added(self._p, *self._phase, self._cos, self._sin)
         self._effects = self._parameters
         self._columns: list[Vector] = [ORIGIN for _ in self._effects]
-        """The columns of the matrix J of the module. The columns for the gyro's scale and for gaps
-        are added when needed."""
+        """The columns of the matrix J (see the module). The columns for the gyro's scale and for
+        gaps are added when needed."""
         self._of_gyro = self._of_gaps = -1
         """Indices in `_columns` of the column for the gyro's scale and of the column for gaps. An
         index is -1 if there is no such column yet."""
@@ -139,7 +139,8 @@ class PoseUncertainty:
         `dx` and `dy` are the displacement in odom, m, and `heading` is the direction of the chord,
         rad. If a gyro measured the turn, `variance` is the turn's variance, rad2, and `scale` is
         the relative standard deviation of the gyro's scale. The errors of the parameters then
-        affect only the distance.
+        affect only the distance. If `slips` is true, the noise of the wheels is larger by the
+        factor `SLIPPING`.
         """
         if self._lost:
             self._forget_where(distance, turn)
@@ -202,7 +203,10 @@ class PoseUncertainty:
         return len(self._columns) - 1
 
     def _forget_where(self, distance: float, turn: float) -> None:
-        """Make the whole pose unknown if the robot moves while its place or heading is unknown."""
+        """Make the whole pose unknown if the robot moves while its position or heading is unknown.
+
+        `distance`, m, and `turn`, rad, are the motion. If both are 0, nothing changes.
+        """
         if distance or turn:
             self.covariance = NOWHERE
 
@@ -221,9 +225,10 @@ class PoseUncertainty:
     ) -> None:
         """Update the matrix J of the parameters' effects after a step: J <- F J + G_p.
 
-        Half of the heading error of the step acts on the displacement of the step itself, because
-        the direction of the chord is the old heading plus half of the turn. If a gyro measured the
-        turn, `scale` is the relative standard deviation of the gyro's scale. Otherwise it is None.
+        The step is an arc of `distance` m through `turn` rad, with the displacement `dx`, `dy` m in
+        odom. Half of the heading error of the step acts on this displacement, because the direction
+        of the chord is the old heading plus half of the turn. If a gyro measured the turn, `scale`
+        is the relative standard deviation of the gyro's scale. Otherwise it is None.
         """
         c, s, more = self._cos, self._sin, 0.0
         columns: list[Vector] = []
