@@ -299,7 +299,9 @@ def words(
 ) -> str:
     """Return a sentence for the operator about the state of the link while the port is open.
 
-    `longest_reply` is the highest value that the setting `mcu.reply_period` may have, s.
+    `check` is the negotiation of the checksum, `hearing` is the diagnosis of a silence, and
+    `lateness` knows the late control steps. `longest_reply` is the highest value that the setting
+    `mcu.reply_period` may have, s.
     """
     if link.state in ("booting", "stale"):
         heard = hearing.heard
@@ -331,7 +333,7 @@ def _sparse(sparse_s: float, longest_reply: float) -> str:
 
 
 def check_event(check: Negotiation, wants_samples: bool) -> Event:
-    """Return the event that reports a new form of the lines, plain or checked.
+    """Return the event for the log which says that the lines are now plain, or now checked.
 
     The event is a warning if the board does not support the check, or if `wants_samples` is true
     and the board does not send its encoder counts.

@@ -98,10 +98,10 @@ MENDS: dict[Trouble, str] = {
 }
 
 TRIES = 3
-"""Number of unanswered questions of one kind after which the daemon concludes that the board does
+"""After this number of unanswered questions of one kind, the daemon concludes that the board does
 not know this kind. A question is a stop line with a sequence number and a checksum. Questions of
 the first kind ask for a sample, and those of the second kind have no request letters. If the daemon
-wants no samples, a single question with `ASK_NOTHING` takes the place of the first kind."""
+wants no samples, it sends a single question with `ASK_NOTHING` instead of the first kind."""
 
 WINDOW = 64
 """Largest number of written lines whose answers the daemon waits for. It is far below the number of

@@ -79,9 +79,9 @@ lines that an adapter batches. `HELD_NS` limits both."""
 
 HELD_NS = 25_000_000
 """Longest time for which an adapter is assumed to hold a line back, ns. An FTDI chip holds it for
-16 ms. A line that is later than this probably answers a command that was sent between two periods,
-so `FreeRunningTimes` finds no clock. It also finds none for a slow board whose lines vary by more
-than this time."""
+16 ms. If a line comes later than this, `FreeRunningTimes` finds no clock. Such a line probably
+answers a command that was sent between two periods, or comes from a slow board whose lines vary by
+more than this time."""
 
 EARLY_ALONE, ALONE = 0.55, 12
 """A read confirms a clock if it comes at most `EARLY_ALONE` periods after its slot. The earliest
@@ -304,7 +304,10 @@ class FreeRunningTimes:
             yield own, LATE_BATCHED, slope
 
     def _begin(self, at_ns: int) -> None:
-        """Start a new window. `_lossy` counts its reads that follow missing lines."""
+        """Start a new window at the monotonic time `at_ns`.
+
+        `_lossy` counts the reads of the window that follow missing lines.
+        """
         self._window_ns: int = at_ns
         self._least = math.inf
         self._count: int = 0
@@ -312,7 +315,10 @@ class FreeRunningTimes:
         self._lossy: int = 0
 
     def _follow(self, at_ns: int) -> None:
-        """Correct the clock after a window by equations (2) and (3), or give it up as wrong."""
+        """Correct the clock by equations (2) and (3) of the class, or give it up as wrong.
+
+        The window that shows the error of the clock ended at the monotonic time `at_ns`.
+        """
         least, slots = self._least, self._passed
         lossy, self._share = self._share, self._lossy / self._count
         if (lossy + self._share) / 2 > LOSSY_READS or least < -EARLY or least == math.inf:

@@ -149,8 +149,9 @@ def left_out(config: Config) -> frozenset[str]:
 def ros_names(ros: RosConfig, silent: Container[str] = ()) -> tuple[RosName, ...]:
     """Return the ROS topics and services of a robot.
 
-    A topic that accepts Twist and TwistStamped appears twice, once for each type. `silent` contains
-    the native keys to leave out, as `left_out` returns them.
+    A topic that accepts Twist and TwistStamped appears twice, once for each type. `ros` is the
+    table `[ros]` of the configuration. `silent` contains the native keys to leave out, as
+    `left_out` returns them.
     """
     kinds = [kind for kind in TWISTS if ros.cmd_vel_type in ("auto", kind)]
     return (
