@@ -51,7 +51,7 @@ class BoardStatus(Struct, frozen=True):
     estop: bool | None = None
     """Whether the emergency stop is pressed."""
     bumpers: tuple[bool, ...] | None = None
-    """For each bumper whether it is pressed, 1 to 4 values in the order of the board."""
+    """Whether each bumper is pressed: 1 to 4 values, in the order in which the board sends them."""
     driver_fault: bool | None = None
     volts: float | None = None
     """Battery voltage, V."""
@@ -70,7 +70,7 @@ def merged(status: BoardStatus, newer: BoardStatus) -> BoardStatus:
 
 
 def shown(status: BoardStatus) -> dict[str, str]:
-    """Return a map of the names that users see to the values of `status` as text.
+    """Return the values of `status` as text, by names that users see, such as `motor_driver`.
 
     Fields of `status` that are None are left out.
     """

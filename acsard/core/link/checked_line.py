@@ -35,7 +35,7 @@ _REPLY = re.compile(rb"([a-dnp0-9., ]*)#([0-9A-F]{2})(?:@([0-9A-F]{20}))?\*([0-9
 
 
 class Reading(Struct, frozen=True):
-    """The sample fields of a reply. The board took all five numbers when it read its encoders.
+    """The sample fields of a reply: the board's clock and encoder counts at the same moment.
 
     `mcu_ms` is the board's clock in ms. `counts` are the encoder counts of the motors a to d. A
     count rises when its motor turns in the `p` direction. All five numbers are modulo 65536.
@@ -46,9 +46,10 @@ class Reading(Struct, frozen=True):
 
 
 class Checked(Struct, frozen=True):
-    """A reply with a correct CRC. `sequence` is the number of the command that was answered.
+    """A reply with a correct CRC, split into its parts.
 
-    `plain` is the part before `#`. `reading` is None if the reply has no sample fields.
+    `plain` is the part before `#`. `sequence` is the sequence number, which is that of the command
+    that the reply answers. `reading` is None if the reply has no sample fields.
     """
 
     plain: bytes
@@ -57,9 +58,10 @@ class Checked(Struct, frozen=True):
 
 
 def seal(line: bytes, sequence: int, letters: bytes = b"") -> bytes:
-    """Return the plain command `line` in its checked form, with CR LF at its end.
+    """Return the checked form of a plain command, with CR LF at its end.
 
-    `sequence` is 0 to 255. `letters` are the request letters, b"" for none.
+    `line` is the plain command, with or without CR LF. `sequence` is the sequence number, 0 to 255.
+    `letters` are the request letters, b"" for none.
     """
     body = b"%b#%02X%b" % (line.removesuffix(b"\r\n"), sequence, letters)
     return b"%b*%04X\r\n" % (body, binascii.crc_hqx(body, 0))

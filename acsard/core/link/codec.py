@@ -32,12 +32,12 @@ Reason = Literal[
 
 _TOKEN = rb"([abcd][pn])([0-9]{1,2}\.[0-9]{1,3})"
 TOKENS = _TOKEN + (rb", *" + _TOKEN) * 3
-"""The four values of a line, as a regular expression."""
+"""Regular expression for the four values in a plain line, without a trailing comma."""
 _LINE = re.compile(TOKENS + rb"(?:, *)?")
 
 
 class FrameError(AcsardError):
-    """The error for an invalid line. `reason` is the name of the counter of such lines."""
+    """The error for an invalid line. `reason` is the kind of error, such as "crc_error"."""
 
     def __init__(self, reason: Reason, line: bytes) -> None:
         super().__init__(reason, line)
@@ -50,7 +50,7 @@ class FrameError(AcsardError):
 
 
 class Codec:
-    """An encoder and decoder of lines for one wiring of the motors."""
+    """An encoder and decoder of plain lines for the wiring (motors to wheels) of one robot."""
 
     def __init__(self, wheels: WheelMap, trailing_comma: bool = False) -> None:
         motors = (wheels.front_right, wheels.front_left, wheels.rear_left, wheels.rear_right)
@@ -86,7 +86,10 @@ class Codec:
         return ",".join(tokens).encode() + self._end
 
     def wheels(self, motors: Motors) -> Motors:
-        """Return values of the motors a to d in the order `WHEELS`, positive for forward motion."""
+        """Convert four values of the motors a to d, such as speeds, to values of the wheels.
+
+        The result is in the order `WHEELS`. Its values are positive if a wheel turns forward.
+        """
         wheel = [0.0] * 4
         for motor, (_, index, sign) in zip(motors, self._wiring, strict=True):
             wheel[index] = motor * sign

@@ -1,8 +1,8 @@
 """Detects echoes: lines that the daemon wrote to the serial port and then receives from it.
 
 Lines come back if TX and RX are connected to each other, or if a device at the far end sends all
-bytes back. Such a device may be the only one, or there may be a board behind it that also answers.
-This module detects the echo of plain lines, and of checked lines that ask for no sample.
+bytes back. Behind such a device, there may also be a board that answers. This module detects the
+echo of plain lines, and of checked lines that ask for no sample.
 """
 
 from __future__ import annotations
@@ -14,48 +14,51 @@ from msgspec import Struct
 from acsard.core.values import WheelSpeeds
 
 REPORTS = 20
-"""Number of sent lines in a row that must come back to count as an echo. 20 lines take 0.2 s at
-100 Hz."""
+"""Received lines count as an echo only if they repeat at least this number of successive sent
+lines. 20 lines take 0.2 s at 100 Hz."""
 
 OTHERS = 2
-"""Largest number of other reports between two successive echoes. These reports are the replies of a
-board behind an adapter that echoes. A board that reports by its own clock may send two in a row."""
+"""An echo is detected even if up to this number of other reports come between two sent lines that
+come back. A board behind an adapter that echoes sends such other reports. If it reports by its own
+clock, it may send two of them in a row."""
 
 CHANGE = 2.0
-"""A run is a series of successive sent lines that came back. It counts as an echo only if its speed
-changes from line to line add up to at least this sum, rad/s. For each line, only the change of the
-wheel that changes most is added. With coarse encoders, a smaller sum may be a coincidence."""
+"""A run is a series of successive sent lines that came back. Between each two successive lines of
+the run, only the largest of the four speed changes counts. The run counts as an echo only if the
+sum of these changes reaches `CHANGE`, rad/s. With coarse encoders, a smaller sum may be a
+coincidence."""
 
 CORNER = 0.025
-"""A run is a series of successive sent lines that came back. It counts as an echo only if a speed
-change from one line to the next differs by more than this, rad/s, from the speed change before it.
-Speeds in lines are rounded to 0.01 rad/s, so on a straight ramp two speed changes differ by up to
-0.02 rad/s. Therefore an echo may stay undetected while all ramps are gentler than 0.025 rad/s per
-line, which is 0.125 m/s2 for a wheel radius of 0.05 m at 100 Hz."""
+"""A run is a series of successive sent lines that came back. It counts as an echo only if two
+successive speed changes from line to line differ by more than `CORNER`, rad/s, as at the begin or
+the end of a ramp. Speeds in lines are rounded to 0.01 rad/s, so on a straight ramp two speed
+changes differ by up to 0.02 rad/s. Therefore an echo may stay undetected while all ramps are
+gentler than 0.025 rad/s per line, which is 0.125 m/s2 for a wheel radius of 0.05 m at 100 Hz."""
 
 LINES = 8
-"""Number of the newest sent lines with which `EchoDetector` compares a report. At 100 Hz, this
+"""`EchoDetector` compares each report with this number of the last sent lines. At 100 Hz, this
 detects an echo that comes back within 70 ms."""
 
 _Wheels = tuple[float, float, float, float]
 STEADY: _Wheels = (0.0, 0.0, 0.0, 0.0)
-"""Speed change between two lines with the same speeds, rad/s."""
+"""Change of the four wheel speeds between two lines with equal speeds, rad/s."""
 
 
 class _Run(Struct, gc=False):
     """A series of successive sent lines that came back."""
 
     report: int
-    """Number of the last report that equaled the last line of the run."""
+    """The number of the last report that equaled the last line of the run. The reports are numbered
+    from 1 as they come."""
     wheels: _Wheels
     """Speeds in the last line, rad/s."""
     slope: _Wheels | None = None
-    """Speed changes from the last line but one to the last line, rad/s. None if the run has only
-    one line."""
+    """Change of each wheel's speed between the last two lines of the run, rad/s. None if the run
+    has only one line."""
     lines: int = 1
     """Number of lines in the run."""
     change: float = 0.0
-    """Sum of the speed changes from line to line, rad/s. See `CHANGE`."""
+    """Sum of the speed changes between successive lines, rad/s, as `CHANGE` defines it."""
     corner: float = 0.0
     """Largest difference between two successive speed changes, rad/s. See `CORNER`."""
 
@@ -76,8 +79,8 @@ class EchoDetector:
 
     At rest every board looks like an echo, so lines without speed changes prove nothing. A device
     that echoes and also passes on replies, such as an RS-485 adapter with a board behind it, is
-    detected as soon as a device that only echoes. While all ramps are gentle (see `CORNER`), no
-    echo is detected.
+    detected just as quickly as a device that only echoes. While all ramps are gentle (see
+    `CORNER`), no echo is detected.
 
     A board that reports its set points looks exactly like an echo, and so may a simulator whose
     wheels have no lag. The daemon then does not drive until the port is opened again, and reports
@@ -93,8 +96,8 @@ class EchoDetector:
         """The last `LINES` sent lines, and one older line, so that a run that ends with the older
         line can continue."""
         self._runs: deque[_Run | None] = deque(maxlen=LINES + 1)
-        """For each line in `_sent`, the run of lines that came back and that ends with this line.
-        None if this line did not come back."""
+        """For each line in `_sent`, the run that ends with this line: the series of successive sent
+        lines that came back. None if this line did not come back."""
         self._reports = 0
         self._last: deque[_Wheels] = deque(maxlen=OTHERS + 1)
         """Wheel speeds in the last reports, rad/s."""

@@ -2,9 +2,10 @@
 
 The counts are cumulative, so no distance is missing after a lost line. The board sends the time of
 its own clock with the counts, so the time between two readings does not depend on when the host
-read the lines. Counts and milliseconds are modulo 65536. A difference of counts is used only if the
-count cannot have wrapped, and if the motors can have turned that far. Otherwise the caller computes
-the angle as speed times time. The module also detects a probable restart of the board.
+read the lines. Counts and milliseconds are modulo 65536. The difference between two counts is used
+only if the counts cannot have wrapped, and if a wheel at its highest speed can make that many
+counts. Otherwise the caller computes the angle as speed times time. The module also detects a
+probable restart of the board.
 """
 
 from __future__ import annotations
@@ -26,23 +27,24 @@ highest speed allows. This margin covers one count at each end of the interval, 
 gears."""
 
 ROUNDING_MS = 2
-"""Largest error of the time between two readings, ms. Each reading has an error of up to 1 ms."""
+"""Largest error of the time between two readings, ms. The time of each reading is in whole ms, so
+it is wrong by up to 1 ms."""
 
 LATEST_MS = 1000.0
-"""Largest delay of a line that `MinimumDelay` measures, ms. A longer delay is treated as this
-value, because the session restarts after a gap of one second anyway."""
+"""Limit on the delay of a line, ms. A line with a longer delay is treated as if it had this delay.
+A larger limit is not needed, because the session restarts after a gap of one second."""
 
 Unknown = Literal["unknown", "leap", "restarted"]
 """The reason why the difference between two readings of the encoders cannot be used.
 
-- unknown: there is no earlier reading, or it is too old
-- leap: no motor can have turned that far
+- unknown: there is no earlier reading, or it is so old that a count may have wrapped
+- leap: the difference is more than any motor can have turned
 - restarted: the board has probably restarted
 """
 
 
 class Turned(Struct, frozen=True):
-    """Angles in rad that the motors a to d turned during `dt` s of the board's clock."""
+    """Angles that the motors a to d turned, rad, and the time `dt` by the board's clock, s."""
 
     motors: Motors
     dt: float
@@ -54,13 +56,14 @@ class Encoders:
     def __init__(self, counts: int, wheel_speed: float, quiet_ns: int) -> None:
         """Start before the first reading of the encoders.
 
-        The delay of a reading is its arrival time minus the time of the board's clock. A restart
-        sets this clock to 0. The clock counts modulo 65536 ms, so it then seems to have jumped
-        ahead, and the delay of the next reading seems too small. If a delay is below the least
-        delay so far by more than `quiet_ns`, the board has probably restarted.
+        The delay of a reading is its arrival time minus the time that it contains, which comes from
+        the board's clock. A restart sets the board's clock to 0. The clock counts modulo 65536 ms,
+        so it then seems to have jumped ahead, and the delay of the next reading seems too small.
+        The board has probably restarted if a delay is more than `quiet_ns` below the least delay so
+        far.
 
         Args:
-            counts: Encoder counts per turn, 0 if unknown.
+            counts: Encoder counts per wheel turn, 0 if unknown.
             wheel_speed: The highest speed of a wheel, rad/s.
             quiet_ns: The duration of silence after which the link is stale, ns.
         """
@@ -76,7 +79,9 @@ class Encoders:
         self._last = None
 
     def turned(self, reading: Reading, at_ns: int) -> Turned | Unknown:
-        """Return how far the motors turned since the last reading, or why that is unknown.
+        """Return the angles by which the motors turned, or the reason why they are unknown.
+
+        The angles are those since the previous reading.
 
         `at_ns` is the monotonic time at which the reading arrived, ns. It serves only to detect
         that the board has restarted, or that a count may have wrapped.

@@ -26,50 +26,55 @@ from acsard.core.link.sample_time import BRIDGED_S, FreeRunningTimes, Placed, Pr
 from acsard.core.values import NS_PER_S, Instant, WheelSpeeds
 
 APART_NS = 1000
-"""Least time between the stamps of two lines, ns. Equal stamps would look like a single line."""
+"""Least difference between the sample times of two successive lines, ns. Two lines with equal
+sample times would look like a single line."""
 
 LATER = 0.05
 """Gain of the filter for the mean difference between the times that `PromptedTimes` and
 `FreeRunningTimes` give to a line."""
 
 FULL_READ = 1024
-"""Number of bytes in a full read of the port, after which the kernel may still hold more data."""
+"""If a read of the port contains at least this number of bytes, the kernel may hold more data."""
 
 DIFFERS = 1.5
-"""`ReplyStyle` evaluates a read of the port if two numbers differ by at least this: the number of
-reply periods since the last read, and the number of commands written since the last read.
-Scheduling alone causes a smaller difference."""
+"""`ReplyStyle` begins to evaluate the reads of the port when two numbers differ by at least this:
+the number of reply periods since the last read, and the number of commands written since the last
+read. Scheduling alone causes a smaller difference."""
 
 TELLING = 2.5
-"""`ReplyStyle` decides only if its two sums (of reply periods and of commands) differ by at least
-this number."""
+"""Let p be the number of reply periods and c the number of commands, both in the reads of the port
+that `ReplyStyle` evaluates. It decides only if p and c differ by at least this number."""
 
 LATEST = 100.0
-"""Longest time between two reads of the port that `ReplyStyle` evaluates, in reply periods."""
+"""`ReplyStyle` ignores a read of the port if more than this number of reply periods have passed
+since the read before it."""
 
 CLEAR = 0.5
-"""`ReplyStyle` compares two sums (of reply periods and of commands) with the number of received
-lines. It decides only if one sum is clearly nearer to this number than the other sum. The distances
-of the two sums from the number must differ by at least this share of the difference between the
-sums."""
+"""Let p be the number of reply periods, c the number of commands, and n the number of received
+lines, all in the reads of the port that `ReplyStyle` evaluates. It decides only if either p or c is
+clearly nearer to n: |p - n| and |c - n| must differ by at least `CLEAR` times |p - c|."""
 
 AFTER = 3
-"""Number of further reads of the port that `ReplyStyle` evaluates after a read that reaches
+"""`ReplyStyle` also evaluates this number of reads after each read of the port that reaches
 `DIFFERS`."""
 
 NEAR = 0.35
-"""`ReplyStyle` decides only if the nearer of its two sums (of reply periods and of commands) is
-close to the number of received lines. The difference may be at most this share of the received
-lines, or 1.5 lines if that is more. The share is not 0, because some lines get lost."""
+"""Let p be the number of reply periods, c the number of commands, and n the number of received
+lines, all in the reads of the port that `ReplyStyle` evaluates. It decides only if |p - n| or |c -
+n| is at most `NEAR` times n, or at most 1.5 if that is more. The limit is not 0, because some lines
+get lost."""
 
 
 class Feedback(Struct, frozen=True, gc=False):
-    """A good line. The board read its encoders at `at`, `dt` s after the previous sample.
+    """A good line, with its sample time and the motion since the previous line.
 
-    If the motion since the previous sample is unknown, `dt` is 0, and `gap` is the time since the
-    previous line, s. Otherwise, and in the first line, `gap` is 0. `turned` is the angle by which
-    each wheel turned since the previous line, rad, in `WHEELS` order. It comes from the encoder
-    counts in the lines, is valid even after a gap, and is None if unknown.
+    `at` is the time at which the board read its encoders, and `dt` is the time since the previous
+    sample, s. If the motion since the previous sample is unknown, `dt` is 0, and `gap` is the time
+    since the previous line, s. Otherwise, and in the first line, `gap` is 0.
+
+    `turned` is the angle by which each wheel turned since the previous line, rad, in `WHEELS`
+    order. It comes from the encoder counts in the lines, is valid even after a gap, and is None if
+    unknown.
     """
 
     at: Instant
@@ -78,14 +83,14 @@ class Feedback(Struct, frozen=True, gc=False):
     gap: float = 0.0
     turned: Motors | None = None
     bridged: float = 0.0
-    """Time at the beginning of `dt` for which the lines were lost, s. The odometry fills this time
-    with the speeds of the line before it and of the line after it."""
+    """Length of the part of `dt` in which lines were lost, s. It is the first part of `dt`. The
+    odometry fills it with the speeds of the line before it and of the line after it."""
     asked_ns: int | None = None
     """Monotonic time at which the daemon wrote the command that this line answers, ns. None if
     unknown."""
     since: float = 0.0
-    """Time since the previous line, s, for the plausibility checks. It is measured by the board's
-    clock if the line contains that clock, else by the arrival times. It is 0 after a silence or a
+    """Time since the previous line, s, which the plausibility checks use. It comes from the board's
+    clock if the line contains that clock, else from the arrival times. It is 0 after a silence or a
     gap."""
     heard_ns: int = 0
     """Monotonic time at which the host had received the whole line, ns."""
@@ -112,10 +117,9 @@ class ReplyStyle:
     """
 
     def __init__(self, speaks: bool) -> None:
-        """Start before the first read of the port.
+        """Start with the kind of the board unknown, unless `speaks` is true.
 
-        `speaks` is true if `mcu.reply_period` is set, so that the board is known to report by its
-        own clock.
+        `speaks` is true if `mcu.reply_period` is set. Then the board reports by its own clock.
         """
         self.speaks: bool | None = speaks or None
         """True if the board reports by its own clock, False if it answers each command, None while
@@ -169,10 +173,11 @@ class Timeline:
     def __init__(
         self, mcu: McuConfig, codec: Codec, wheel_speed: float, quiet_ns: int, rate_hz: float
     ) -> None:
-        """Start before the first line.
+        """Start before the first line from the board.
 
-        `wheel_speed` is the highest speed that a wheel can have, rad/s. `quiet_ns` is the duration
-        of silence after which the link is stale, ns. `rate_hz` is the daemon's control rate.
+        `codec` maps the motors to the wheels. `wheel_speed` is the highest speed that a wheel can
+        have, rad/s. `quiet_ns` is the duration of silence after which the link is stale, ns.
+        `rate_hz` is the daemon's control rate.
         """
         self._codec, self._baud_rate, self._quiet_ns = codec, mcu.baud_rate, quiet_ns
         self._encoders = Encoders(mcu.encoder_counts, wheel_speed, quiet_ns)
@@ -190,8 +195,8 @@ class Timeline:
         self._spoilt = False
         """Whether a bad or ignored line came since the last good line."""
         self._later = 0.0
-        """Mean time by which a line is later according to `PromptedTimes` than according to
-        `FreeRunningTimes`, ns."""
+        """Mean difference between two times of the same line, ns: the time that `PromptedTimes`
+        gives minus the time that `FreeRunningTimes` gives."""
         self.leaps = 0
         """Number of lines with impossible encoder counts. For such a line, the angle that a wheel
         turned is computed as speed times time."""
@@ -199,7 +204,7 @@ class Timeline:
         """Whether the board's clock in the last line shows that the board has restarted."""
 
     def forget(self) -> None:
-        """Start a new session, so the motion between the last line and the next one is unknown."""
+        """Start a new session. The motion between the last line and the next one is unknown."""
         self._encoders.forget()
         self._slots.forget()
         self._prompts.forget()
@@ -211,9 +216,10 @@ class Timeline:
         self._style.left()
 
     def read(self, at: Instant, size: int, lines: int, following: int) -> None:
-        """Process a read of the port at the time `at` that completes `lines` lines, at least one.
+        """Process a read of the port that completes at least one line.
 
-        The read contains `size` bytes. `following` is how many of them come after the end of the
+        `at` is the time of the read, `size` is its number of bytes, and `lines` is the number of
+        lines that it completes. `following` is the number of bytes in the read after the end of the
         last of these lines.
         """
         before, end_ns = self._end_ns, at.mono_ns
@@ -237,7 +243,7 @@ class Timeline:
     def spoilt(self) -> None:
         """Skip the next line of the read, because it is bad.
 
-        Also skip the command that this line may answer.
+        Also skip the command that this line may answer, unless the board reports by its own clock.
         """
         self._rest -= 1
         self._spoilt = True
@@ -320,9 +326,9 @@ class Timeline:
         return Placed("reads", int(self._end_ns - self._share_ns * self._rest))
 
     def _since_last(self, placed: Placed) -> tuple[float, float]:
-        """Return a pair: the time since the last good line, s, and the part of it to fill, s.
+        """Return the time since the last good line, and the part of it in which lines were lost, s.
 
-        Lines were lost in the part to fill. It is 0 if no line was lost.
+        The odometry fills this part. It is 0 if no line was lost.
 
         If the times of this line and of the last good line come from different clocks, the time is
         the difference of their `due_ns`, corrected by the mean offset between the clocks. Without
@@ -352,9 +358,9 @@ class Timeline:
         self._later += LATER * (later_ns - self._later)
 
     def _late_ns(self, clock: str) -> float:
-        """Return how much later the times of `clock` are than those of `FreeRunningTimes`, ns.
+        """Return the mean time by which `clock` is later than `FreeRunningTimes` for a line, ns.
 
-        The result is a mean over many lines.
+        `clock` is one of the values of `Placed.clock`.
         """
         if clock == "reads":
             return self._slots.late_ns
@@ -367,8 +373,9 @@ class Timeline:
     def _sampled(self, came_ns: int, placed: Placed, length: int) -> Instant:
         """Return the time at which the board began to send a line, which is its sample time.
 
-        `length` is the number of bytes of the line with its line end. `came_ns` is the monotonic
-        time at which the whole line had arrived, ns.
+        `came_ns` is the monotonic time at which the whole line had arrived, ns. `placed` is the
+        time of the line by the chosen clock. `length` is the number of bytes of the line with its
+        line end.
         """
         mono_ns = min(came_ns, placed.due_ns) - wire_ns(length, self._baud_rate)
         last, read = self._last, self._at

@@ -70,7 +70,8 @@ BLOCKED = (
 )
 
 WINDOW = 1000
-"""Number of sent lines after which `UnansweredLines` counts the answers: 10 s at 100 Hz."""
+"""`UnansweredLines` counts the answers each time this number of lines has been sent, which takes 10
+s at 100 Hz."""
 
 LOST = 0.02
 """Share of unanswered lines above which `UnansweredLines` warns. A good link loses no answer."""
@@ -79,15 +80,15 @@ LOST = 0.02
 def is_ours(words: str) -> bool:
     """Return whether `words` names this computer as the cause of a silence.
 
-    `words` is a result of `Lateness.words`.
+    `words` is the text of an event of the link, or the `reason` in `state`.
     """
     return HOST in words or SIMULATOR in words
 
 
 class Lateness:
-    """Detector of late control steps.
+    """Detector of control steps that come too late.
 
-    If a step is late, the cause of the silence before it is this computer, not the board.
+    If a step is late, this computer caused the silence before it, and the board did not.
     """
 
     def __init__(self, simulated: bool, quiet_ns: int) -> None:
@@ -175,7 +176,7 @@ class Heard(Struct):
 
     @property
     def counted(self) -> str:
-        """Number of received lines and the last bad line (or the last bytes), as text."""
+        """The number of received lines and the last bad line (or the last bytes), as text."""
         if self.statuses and not self.lines:
             return "only status lines were received"
         if not self.size:
@@ -216,16 +217,18 @@ class SilenceDiagnosis:
     def forget(self) -> None:
         """Discard the diagnosis, and start with a new interval at the next call of `judge`.
 
-        The reason is that the link is up, the output is blocked, or the port was opened or closed.
+        The caller does this if the link is up, if the output is blocked, or if the port was opened
+        or closed.
         """
         if self._since_ns is not None:
             self.heard, self.now, self._since_ns = None, Heard(), None
 
     def judge(self, now_ns: int) -> bool:
-        """Process a step without a link.
+        """Process a control step without a link.
 
-        Return True if this step ends the first interval, or an interval whose class of received
-        bytes (`Look`) differs from that of the interval before.
+        Such steps are divided into intervals of 3 s (`PATIENCE_NS`). Return True if this step ends
+        the first interval, or an interval whose class of received bytes (`Look`) differs from that
+        of the interval before.
         """
         if self._since_ns is None:
             self._since_ns = now_ns
@@ -259,7 +262,7 @@ class UnansweredLines:
         """Return the warning if it is due, else None.
 
         `sent` and `good` are the numbers of sent lines and of received good lines, both counted
-        since the daemon started.
+        since the daemon started. `linked` says whether the link is up.
         """
         if not linked or self._own_clock:
             self._since, self._told = None, False
@@ -296,7 +299,9 @@ def words(
 ) -> str:
     """Return a sentence for the operator about the state of the link while the port is open.
 
-    `longest_reply` is the highest value that the setting `mcu.reply_period` may have, s.
+    `check` is the negotiation of the checksum, `hearing` is the diagnosis of a silence, and
+    `lateness` knows the late control steps. `longest_reply` is the highest value that the setting
+    `mcu.reply_period` may have, s.
     """
     if link.state in ("booting", "stale"):
         heard = hearing.heard
@@ -328,7 +333,7 @@ def _sparse(sparse_s: float, longest_reply: float) -> str:
 
 
 def check_event(check: Negotiation, wants_samples: bool) -> Event:
-    """Return the event that reports a new form of the lines, plain or checked.
+    """Return the event for the log which says that the lines are now plain, or now checked.
 
     The event is a warning if the board does not support the check, or if `wants_samples` is true
     and the board does not send its encoder counts.

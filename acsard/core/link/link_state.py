@@ -3,8 +3,8 @@
 The inputs are received lines, silences and changes of the port. The states are:
 
 - down: the port is closed.
-- booting: the port was opened or the board has restarted, and fewer than GOOD_LINES good lines have
-  come since.
+- booting: the port was opened, or the board has restarted while the link was up. Fewer than
+  GOOD_LINES good lines in a row have come since.
 - up: good lines arrive in time.
 - stale: the link was up until one of these happened:
 
@@ -39,7 +39,8 @@ TABLE: dict[tuple[State, Sign], State] = {
     ("stale", "opened"): "booting",
     ("stale", "trusted"): "up",
 }
-"""Maps (state, sign) to the next state. A pair without an entry does not change the state."""
+"""Maps each pair of a state and an input (`Sign`) to the next state. A pair without an entry does
+not change the state."""
 
 WORDS: dict[State, str] = {
     "down": "the serial port is closed; it is being reopened",
@@ -52,22 +53,22 @@ WATCHDOG_S = 0.3
 """If the board receives no valid line from the daemon for this time, s, it stops the motors."""
 
 GOOD_LINES = 3
-"""Number of good lines in a row after which the link is trusted. Fewer prove little, because a
+"""The link comes up only after this number of good lines in a row. Fewer prove little, because a
 board may print anything after a reset."""
 
 BAD_LINES = 5
 """Number of bad lines in a row on a checked link after which the daemon renegotiates the check."""
 
 SPARSE = 2
-"""Number of silences in a row, with a single good line after each, from which the board's lines
-count as too sparse. One silence only means that the link was lost for a moment."""
+"""The board's lines count as too sparse after this number of silences in a row, if only a single
+good line follows each of them. One silence only means that the link was lost for a moment."""
 
 
 class Link:
     """The state of the link and its counts of good and bad lines. Only `sign` changes the state."""
 
     def __init__(self, quiet_ns: int) -> None:
-        """Start with the port closed. `quiet_ns` is the silence after which a link is stale, ns."""
+        """Start with the port closed. A silence of `quiet_ns` ns makes the link stale."""
         self.quiet_ns = quiet_ns
         self.state: State = "down"
         self.sparse_s = 0.0
@@ -131,7 +132,7 @@ class Link:
             self._good_in_row = 0
 
     def bad(self) -> bool:
-        """Count a bad line. Return True for the last of `BAD_LINES` bad lines in a row.
+        """Count a bad line. Return True if now exactly `BAD_LINES` bad lines have come in a row.
 
         On a checked link, the caller must then renegotiate the check.
         """

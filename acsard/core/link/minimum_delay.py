@@ -15,7 +15,7 @@ DRIFT = 0.01
 
 
 class MinimumDelay:
-    """The delay of the last event in excess of the minimum, in the caller's unit of time."""
+    """The delay of the last event minus the least delay so far, in the caller's unit of time."""
 
     def __init__(self, drift: float = DRIFT, most: float = math.inf) -> None:
         """Start before the first event.
@@ -27,11 +27,11 @@ class MinimumDelay:
         self.late = 0.0
 
     def add(self, ours: float, theirs: float) -> float:
-        """Process an event, and return its delay in excess of the minimum so far.
+        """Process an event, and return its delay minus the least delay so far.
 
-        If the result is negative, this event sets a new minimum. Unlike `measure`, this method does
-        not subtract the allowed drift from the result. `ours` is the time since the last event by
-        this computer's clock, and `theirs` is the same time by the other clock.
+        If the result is negative, this event sets a new least delay. Unlike `measure`, this method
+        does not subtract the allowed drift from the result. `ours` is the time since the previous
+        event by this computer's clock, and `theirs` is the same time by the other clock.
         """
         later = self.late + ours - theirs
         self.measure(ours, theirs)
@@ -39,13 +39,13 @@ class MinimumDelay:
         return later
 
     def measure(self, ours: float, theirs: float) -> float:
-        """Return by how much the delay of an event exceeds the minimum and the allowed drift.
+        """Return the delay of an event, minus the least delay and the allowed drift.
 
-        The minimum does not change until `believe` is called. The arguments are those of `add`.
+        The least delay does not change until `believe` is called. The arguments are those of `add`.
         """
         self.late = self.late + ours - theirs - self._drift * ours
         return self.late
 
     def believe(self) -> None:
-        """Make the delay of the last measured event the new minimum if it is below the minimum."""
+        """Set the least delay to the delay of the last measured event if that is smaller."""
         self.late = min(max(0.0, self.late), self._most)

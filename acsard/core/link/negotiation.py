@@ -12,8 +12,8 @@ check answers in the same form. The states of the negotiation are:
 - plain: only with mcu.link_check = "auto". The board answers, but without the check. The daemon
   asks again after the next gap.
 - checked: the board has answered a question correctly. Now the daemon accepts only checked replies.
-- sampled: as in checked. In addition, the replies contain the encoder counts that the lines ask
-  for.
+- sampled: the same as checked, but each line also asks for the encoder counts, and the replies
+  contain them.
 
 Once a board has answered with the check, the daemon accepts no plain replies until the port is
 reopened, because noise must not end the check.
@@ -39,7 +39,7 @@ from acsard.core.values import NS_PER_S, WheelSpeeds
 
 State = Literal["off", "waking", "asking", "plain", "checked", "sampled"]
 Sign = Literal["gap", "heard", "answer", "sample", "refusal", "samples_end"]
-"""The inputs of the state machine.
+"""The inputs of the state machine that negotiates the check.
 
 - gap: the negotiation starts again, because the port was opened or lines were missing or damaged
 - heard: a plain line came while the daemon was asking for the check
@@ -63,7 +63,8 @@ TABLE: dict[tuple[State, Sign], State] = {
     ("sampled", "gap"): "waking",
     ("sampled", "samples_end"): "checked",
 }
-"""Maps (state, sign) to the next state. A pair without an entry does not change the state."""
+"""Maps each pair of a state and an input (`Sign`) to the next state. A pair without an entry does
+not change the state."""
 
 IN_FORCE: dict[State, str] = {
     "off": "plain",
@@ -97,10 +98,10 @@ MENDS: dict[Trouble, str] = {
 }
 
 TRIES = 3
-"""Number of unanswered questions of one kind after which the daemon concludes that the board does
+"""After this number of unanswered questions of one kind, the daemon concludes that the board does
 not know this kind. A question is a stop line with a sequence number and a checksum. Questions of
 the first kind ask for a sample, and those of the second kind have no request letters. If the daemon
-wants no samples, a single question with `ASK_NOTHING` takes the place of the first kind."""
+wants no samples, it sends a single question with `ASK_NOTHING` instead of the first kind."""
 
 WINDOW = 64
 """Largest number of written lines whose answers the daemon waits for. It is far below the number of
@@ -163,7 +164,7 @@ class Negotiation:
         self.state: State = "off" if mcu.link_check == "off" else "waking"
         self.trouble: Trouble = ""
         self.settled_ns = 0
-        """Monotonic time at which the negotiation last ended, ns."""
+        """Monotonic time at which the last negotiation ended, ns."""
         first = (ASK_SAMPLE,) * TRIES if mcu.wants_samples else (ASK_NOTHING,)
         self._letters = (*first, *(b"",) * TRIES)
         self._question = b""
@@ -225,7 +226,10 @@ class Negotiation:
     # Lines to the board.
 
     def seal(self, line: bytes, now_ns: int) -> bytes:
-        """Return the plain line `line` in the form that is in force now, plain or checked."""
+        """Return the plain line `line` in the form that is in force now, plain or checked.
+
+        `now_ns` is the monotonic time at which the line is made.
+        """
         if not self.checked:
             return line
         return self._sealed(line, ASK_SAMPLE if self.state == "sampled" else b"", now_ns)
@@ -233,7 +237,8 @@ class Negotiation:
     def question(self, now_ns: int) -> bytes | None:
         """Return the next question or plain stop to send, or None if it is not due yet.
 
-        The caller calls this method instead of `seal` while the daemon asks for the check.
+        The caller calls this method instead of `seal` while the daemon asks for the check. `now_ns`
+        is the monotonic time at which the line is made.
         """
         waking = self.state == "waking"
         wait_ns = max(BLIND_PERIOD_NS, self._answer_ns) if waking else self._answer_ns
@@ -249,13 +254,14 @@ class Negotiation:
         return line
 
     def left(self, line: bytes) -> None:
-        """Record that `line`, with its line end, was written to the port."""
+        """Record that `line`, with its line end, was written to the port, to detect its echo."""
         self._echo.left(line)
 
     def settle(self, went: bool, late_ns: int = 0) -> None:
-        """Record whether the port wrote the last line.
+        """Record whether the port wrote the line that `seal` or `question` returned last.
 
-        If `went` is true, the port wrote the line `late_ns` ns after it was made.
+        `went` is true if the port wrote the line. `late_ns` is the time from making the line to
+        writing it, ns.
         """
         if self._made is not None and went:
             sequence, made_ns = self._made
@@ -333,7 +339,8 @@ class Negotiation:
     def judge(self, now_ns: int) -> None:
         """Count the last question as unanswered if its answer is overdue.
 
-        After `TRIES` unanswered questions of each kind, accept plain lines or set `trouble`.
+        After `TRIES` unanswered questions of each kind, accept plain lines if `mcu.link_check` is
+        "auto" and the board has never answered with the check. Otherwise set `trouble`.
         """
         asked_ns = self._asked.last_ns
         if self.state != "asking" or not self._open or asked_ns is None:

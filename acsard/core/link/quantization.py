@@ -38,9 +38,9 @@ ALIKE = 3.0
 the four wheels. The bound is needed because random jumps of a speed look like quantization too."""
 
 COARSE, JUMP_GAIN = 0.015, 0.06
-"""An encoder is treated as coarse if the mean jump of its wheel exceeds `COARSE`, rad per line.
-`Coarseness` defines a jump. An encoder with about 200 counts a turn reaches this value. `JUMP_GAIN`
-is the gain of the filter for the mean jump."""
+"""If the mean jump of a wheel's speed exceeds `COARSE`, rad per line, its encoder is treated as
+coarse. `Coarseness` defines a jump. An encoder with about 200 counts a turn reaches this value.
+`JUMP_GAIN` is the gain of the filter for the mean jump."""
 
 LONGEST_LINE = 0.03
 """Longest time between two lines whose speeds `Coarseness` compares, s. Over a longer time, the
@@ -91,9 +91,9 @@ class Steps:
 class Coarseness:
     """Detector of wheel speeds that jump back and forth from line to line, as with coarse encoders.
 
-    The jump of a wheel in a line is half the second difference of its speed over the last three
-    lines, times the time since the previous line. A change of the acceleration causes a jump too,
-    but only in one line.
+    Let v0, v1 and v2 be the speeds of a wheel in the last three lines, and dt the time since the
+    previous line. Then the jump of the wheel is |v0 - 2 v1 + v2| dt / 2. A change of the
+    acceleration causes a jump too, but only in one line.
     """
 
     def __init__(self) -> None:
@@ -103,10 +103,11 @@ class Coarseness:
         that was examined in the last line."""
 
     def add(self, speeds: Motors, own: float) -> bool:
-        """Process the speeds of a line, rad/s. Return whether the examined encoder is coarse.
+        """Process the speeds of a line, and return whether the examined encoder is coarse.
 
-        Each call examines one of the four wheels in turn. `own` is the time since the previous
-        line, s.
+        Each call examines the encoder of one wheel, and the wheels take turns. `speeds` are in
+        rad/s. `own` is the time since the previous line, s. Return False without an examination if
+        `own` exceeds `LONGEST_LINE`, or if all speeds of this line and the previous line are 0.
         """
         (older, before), self._rows = self._rows, (self._rows[1], speeds)
         if speeds == NOTHING == before or own > LONGEST_LINE:
@@ -138,8 +139,8 @@ class CountRecovery:
         self._coarseness = Coarseness()
         self._wheels = tuple(Steps() for _ in NOTHING)
         self._reported, self._steps = NOTHING, NOTHING
-        """Learned quantization step of each wheel, rad/s. `ALIKE` limits the steps in `_steps`, but
-        not those in `_reported`."""
+        """Quantization step of each wheel, rad/s. `_reported` are the steps that were learned from
+        the speeds. `_steps` are the same steps, limited by `ALIKE`."""
 
     @property
     def counts(self) -> tuple[int, ...]:
@@ -152,8 +153,8 @@ class CountRecovery:
     def look(self, line: Feedback) -> Feedback:
         """Return the line with the counted angle and the quantization step of each wheel added.
 
-        `counted` is None if the angles are unknown. If the angles include those of a missing line,
-        `bridged` becomes 0.
+        The field `counted` is None if the counted angles are unknown. If they include the angles of
+        a missing line before this one, the field `bridged` becomes 0.
         """
         own, speeds, counted = line.dt - line.bridged, line.speeds.as_tuple(), None
         if self._whole.angle:

@@ -26,8 +26,8 @@ Read = tuple[int, int]
 complete, ns, and the number of lines in the read."""
 
 BRIDGED_S = 1.0
-"""Longest time without lines that the odometry fills, s. After a longer time, the board may have
-been reset."""
+"""If no line came for this time, s, the odometry does not fill the gap, because the board may have
+been reset. It fills shorter gaps."""
 
 
 class Placed(Struct, frozen=True, gc=False):
@@ -46,8 +46,8 @@ class Placed(Struct, frozen=True, gc=False):
     """The part of `dt` in which lines were lost, s."""
     early: bool = False
     """Whether the line came before the clock expected it. If so, `due_ns` is the time at which the
-    line arrived, and the `dt` of the next line is not valid. The caller replaces that `dt` with the
-    difference between the `due_ns` of the two lines."""
+    line arrived, and the clock gives a wrong `dt` for the next line. The caller therefore computes
+    that `dt` as the difference between the `due_ns` of the two lines."""
 
 
 # A free-running board. A slot is one period of its clock, in which the board sends one line.
@@ -73,37 +73,36 @@ LONE = 0.7
 read one by one. Otherwise they are treated as batches of an adapter."""
 
 LATE_ALONE, LATE_BATCHED = 0.6, 1.3
-"""Largest lateness of a line, in periods of the board, with which `FreeRunningTimes` accepts a
-clock that it has found. `LATE_ALONE` is for lines that are read one by one, and `LATE_BATCHED` for
+"""`FreeRunningTimes` accepts a clock only if each line comes at most this late after its slot, in
+periods of the board. `LATE_ALONE` is for lines that are read one by one, and `LATE_BATCHED` for
 lines that an adapter batches. `HELD_NS` limits both."""
 
 HELD_NS = 25_000_000
 """Longest time for which an adapter is assumed to hold a line back, ns. An FTDI chip holds it for
-16 ms. A line that is later than this probably answers a command that was sent between two periods,
-so `FreeRunningTimes` finds no clock. It also finds none for a slow board whose lines vary by more
-than this time."""
+16 ms. If a line comes later than this, `FreeRunningTimes` finds no clock. Such a line probably
+answers a command that was sent between two periods, or comes from a slow board whose lines vary by
+more than this time."""
 
 EARLY_ALONE, ALONE = 0.55, 12
-"""`FreeRunningTimes` refuses a clock that too few reads confirm. A read confirms the clock if it
-comes at most `EARLY_ALONE` periods after its slot. The earliest read always confirms it. Besides
-that read, more than one in `ALONE` reads must confirm the clock. Otherwise the few early reads
-probably contain answers to commands that were sent between two periods, and the clock is too early
-for all other lines."""
+"""A read confirms a clock if it comes at most `EARLY_ALONE` periods after its slot. The earliest
+read always confirms the clock. `FreeRunningTimes` accepts the clock only if, besides that read,
+more than one in `ALONE` reads confirm it. If fewer do, these reads probably contain answers to
+commands that were sent between two periods, and the clock is too early for all other lines."""
 
 JUMP = 1.4
 """If two reads with a single line each are less than this number of periods apart, no line is
 missing between them."""
 
 SURE = 0.15
-"""Margin, in periods. An adapter delays a line only up to a limit. If a line exceeds this limit by
-more than one period plus the margin, a line before it is missing."""
+"""Margin on the lateness of a line, in periods. An adapter delays a line only up to a limit. If the
+lateness exceeds this limit by more than one period plus the margin, an earlier line is missing."""
 
 EARLY = 0.25
 """If a line comes before its slot by more than this number of periods, `FreeRunningTimes` gives up
 its clock as wrong."""
 
 LOSSY_READS = 0.45
-"""If more than this share of the reads in two successive windows follow missing lines, the period
+"""If missing lines precede more than this share of the reads in two successive windows, the period
 of the clock is wrong."""
 
 
@@ -146,7 +145,8 @@ class FreeRunningTimes:
         self._first, self._slot = 0.0, 0
         """The time c of slot 0, ns, and the number k of the slot of the last line."""
         self._given = 0
-        """Number of slots that were recently counted as missing lines and may be taken back."""
+        """Number of slots that recent reads counted as slots of missing lines. If that was wrong,
+        they are taken back."""
         self._lag = self._batch = self._gain = self._share = 0.0
         """`_lag` is the usual lateness x of a read, and `_batch` the usual time between two reads,
         both in slots. `_gain` is the gain g. `_share` is the share of the reads in the last window
@@ -166,11 +166,11 @@ class FreeRunningTimes:
         """Slot of the last line that the present clock has placed. None before the first one."""
 
     def read(self, at_ns: int, lines: int, drained: bool) -> int:
-        """Process a read of `lines` lines, and return how many lines before its last one are lost.
+        """Process a read of the port, and return how many lines before its last line are missing.
 
         The result is -1 if one slot too many was counted as missing in earlier reads. `at_ns` is
-        the monotonic time at which the last line of the read was complete. `drained` says whether
-        the read took all data that the kernel held.
+        the monotonic time at which the last line of the read was complete. `lines` is the number of
+        lines in the read. `drained` says whether the read took all data that the kernel held.
         """
         self._stretch = 1.0
         since, self._before = at_ns - self._before, at_ns
@@ -227,7 +227,8 @@ class FreeRunningTimes:
 
         Return -1 if the read shows that the clock is wrong, or that an earlier read counted a slot
         too many as missing. `ahead` is the lateness x of the read's last line, and `since` is the
-        time since the last read, both in slots. `drained` is as in `read`.
+        time since the last read, both in slots. `lines` is the number of lines in the read.
+        `drained` says whether the read took all data that the kernel held.
         """
         lag = min(self._lag, 0.5)
         if ahead < -0.5 + 0.6 * lag:
@@ -303,7 +304,10 @@ class FreeRunningTimes:
             yield own, LATE_BATCHED, slope
 
     def _begin(self, at_ns: int) -> None:
-        """Start a new window. `_lossy` counts its reads that follow missing lines."""
+        """Start a new window at the monotonic time `at_ns`.
+
+        `_lossy` counts the reads of the window that follow missing lines.
+        """
         self._window_ns: int = at_ns
         self._least = math.inf
         self._count: int = 0
@@ -311,7 +315,10 @@ class FreeRunningTimes:
         self._lossy: int = 0
 
     def _follow(self, at_ns: int) -> None:
-        """Correct the clock after a window by equations (2) and (3), or give it up as wrong."""
+        """Correct the clock by equations (2) and (3) of the class, or give it up as wrong.
+
+        The window that shows the error of the clock ended at the monotonic time `at_ns`.
+        """
         least, slots = self._least, self._passed
         lossy, self._share = self._share, self._lossy / self._count
         if (lossy + self._share) / 2 > LOSSY_READS or least < -EARLY or least == math.inf:
@@ -344,7 +351,8 @@ class FreeRunningTimes:
 def _slots(reads: list[Read], period: float = math.inf) -> list[int]:
     """Return the slot of each read's last line.
 
-    The first read has slot 0. If `period`, ns, is finite, missing lines have slots too.
+    The first read has slot 0. Each line of a read has a slot. If `period`, ns, is finite, the time
+    between two reads shows how many lines are missing, and they have slots too.
     """
     slots = [0]
     for (before, _), (at, lines) in pairwise(reads):
@@ -389,39 +397,40 @@ LEAST = 0.002
 least delay is forgotten after about 500 replies."""
 
 CREEP, CREEPS_FOR = 0.05, 3
-"""With each read, the least delay of the last replies rises by the share `CREEP` of the time since
-the last read, so that older replies are forgotten. In this rule, the time since the last read is
-limited to between 1 and `CREEPS_FOR` times the usual time between two commands. The upper limit is
-for a board that stalls and then answers all lines."""
+"""`PromptedTimes` keeps the least delay of the last replies. With each read of the port, this value
+rises by the share `CREEP` of the time since the last read, so that older replies are forgotten.
+That time is first limited to between 1 and `CREEPS_FOR` times the usual time between two commands.
+The upper limit is for a board that stalls and then answers all lines."""
 
 LATE = 1.25
-"""If the least delay of the last replies exceeds the long-term least delay by more than this,
-replies were lost. The unit is the usual time between two commands. A value of 1 is too low, because
-the delay may permanently rise by almost that much."""
+"""Replies were lost if the least delay of the last replies exceeds the long-term least delay by
+more than `LATE` times the usual time between two commands. A factor of 1 is too low, because the
+delay may permanently rise by almost that much."""
 
 RARE = 0.002
-"""Share of lost replies below which a late reply after a host stall does not prove a loss. After a
-host stall, two commands are written close together, so the reply to the first one is late even if
-no reply was lost."""
+"""While the share of lost replies is below this value, a late reply after a host stall does not
+prove that a reply was lost. After a host stall, two commands are written close together, so the
+reply to the first one is late even if no reply was lost."""
 
 JITTER_NS = 350_000
-"""Mean deviation of the reply delay that USB and the scheduler cause, ns."""
+"""If the mean deviation of the reply delay is at most this, ns, USB and the scheduler cause it."""
 
 THOUGHT_NS = 800_000
-"""Mean deviation of the reply delay above which the board itself varies the delay, ns. USB and the
-scheduler rarely cause as much."""
+"""If the mean deviation of the reply delay exceeds this, ns, the board itself varies the delay. USB
+and the scheduler rarely cause as much."""
 
 RISE_NS = 20_000
-"""Rise per read of the least reply delay on a batched link, ns, so that an outdated least delay is
-forgotten. A link is batched if an adapter holds replies back, so that one read contains several."""
+"""On a batched link, the least reply delay rises by this much with each read, ns, so that an
+outdated value is forgotten. A link is batched if an adapter holds replies back, so that one read
+contains several."""
 
 LOSING = 0.005
-"""Gain of the filter for the share of lost replies. At a gain of 1/20, two losses would reach
-`LOSSY`."""
+"""Gain of the filter for the share of lost replies. With a gain of 1/20 instead, two lost replies
+would be enough to reach `LOSSY`."""
 
 LOSSY = 0.03
-"""Share of lost replies above which a batched link counts as lossy, so that any line may lack its
-reply."""
+"""If more than this share of the replies is lost on a batched link, it counts as lossy. Then the
+reply to any command may be missing."""
 
 SEVERAL = 0.15
 """If more than this share of the reads of the port contain several lines, an adapter batches lines.
@@ -432,7 +441,8 @@ THINKS = 0.6
 adapter whose packets fill line by line also varies it, but only for a quarter of a second."""
 
 BATCH_NS = 2_000_000
-"""Mean deviation of the reply delay above which an adapter, not the board, is the cause, ns."""
+"""If the mean deviation of the reply delay exceeds this, ns, an adapter causes it and not the
+board."""
 
 
 class PromptedTimes:
@@ -450,9 +460,9 @@ class PromptedTimes:
     """
 
     def __init__(self, soonest_ns: int) -> None:
-        """Start before the first command.
+        """Start before the first command to the board.
 
-        `soonest_ns` is the time that a line and its reply take on the wire together, ns.
+        `soonest_ns` is the time that a command and its reply take on the wire together, ns.
         """
         self._soonest = soonest_ns
         self._left: deque[int] = deque(maxlen=MEMORY)
@@ -473,23 +483,27 @@ class PromptedTimes:
         self._first = False
         """Whether the usual delay was measured on the first reply alone."""
         self._spread = self._least = 0.0
-        """Mean deviation from the usual reply delay, and the long-term least delay, ns."""
+        """`_spread` is the mean deviation from the usual reply delay, ns. `_least` is the long-term
+        least reply delay, ns."""
         self._soon = 0.0
         """Least delay of the last replies, ns."""
         self._sent: int | None = None
         self._apart = self._missing = 0.0
-        """The usual time between two commands, ns, and the share of lost replies."""
+        """`_apart` is the usual time between two commands, ns. `_missing` is the share of lost
+        replies."""
         self._last: int | None = None
-        """Time at which the last answered command was written, ns. If the board replied to that
-        command later or sooner than usual, the time is shifted by the difference."""
+        """Time at which the last answered command was written, ns. If the board itself delayed the
+        reply more or less than usual, the time is shifted by about the difference."""
         self._passed = self._line = 0
-        """`_line` is the time at which the last answered line was written, ns. `_passed` is the
-        same for the last line that was answered or given up, whichever is newer."""
+        """Both are times at which a command was written, ns. `_line` is that of the last answered
+        command. `_passed` is that of the last command that waits for no reply any more, because it
+        was answered, skipped or given up."""
         self._lost = False
         """Whether the last read with a single reply showed that an earlier reply was lost."""
         self._given: list[int] = []
-        """Times at which the commands were written that were given up at the last read of a batched
-        link, ns, oldest first. An adapter that stalled may still deliver their replies."""
+        """The commands that were given up at the last read of a batched link, oldest first. Each is
+        the time at which it was written, ns. An adapter that stalled may still deliver their
+        replies."""
         self._at, self._alone, self._since = 0, False, 0
         self._base, self._batch, self._losses = 0.0, 2e7, 0.0
         """These values describe a batched link. `_base` is the least reply delay, ns. `_batch` is
@@ -584,7 +598,7 @@ class PromptedTimes:
         return Placed("prompts", due_ns, dt / NS_PER_S, bridged / NS_PER_S)
 
     def skip(self) -> None:
-        """Remove the command that the next reply answers, because this reply is damaged."""
+        """Forget the command that the next reply answers, because this reply is damaged."""
         if self._left:
             self._passed = self._left.popleft()
 
@@ -601,7 +615,7 @@ class PromptedTimes:
         self._delay = self._least = self._soon = float(delay_ns)
 
     def _shorten(self, line: int) -> None:
-        """Correct the usual delay if a stall had delayed the first reply, on which it was measured.
+        """Correct the usual delay if it was measured on a first reply that a stall had delayed.
 
         In that case, the delay of the second reply is much shorter than the usual delay. Without
         the correction, the usual delay would fall by only 5 % of the difference per reply. Until
@@ -617,10 +631,13 @@ class PromptedTimes:
     def _weigh(self, lines: int, since: int, cut: bool) -> None:
         """Give up the commands whose replies were lost on a batched link.
 
-        The last reply of a batch shows a loss: it comes too late for the line that it would answer
-        if no reply were lost. If many replies are lost, the first reply of the batch decides
-        instead, because the board made it after the previous batch. `lines` and `cut` are the
-        arguments of `read`. `since` is the time since the previous read, ns.
+        The last reply of a batch shows a loss: it comes too late for the command that it would
+        answer if no reply were lost. If many replies are lost, the first reply of the batch decides
+        instead, because the board made it after the previous batch. If the last reply comes too
+        soon for its command, commands that were given up before are taken back.
+
+        `lines` is the number of whole replies in the batch. `since` is the time since the previous
+        read, ns. `cut` is true if the read also contains the first part of one more reply.
         """
         left, at, began = self._left, self._at, lines + cut
         judged, soonest = lines - 1, float(self._soonest)
@@ -653,10 +670,10 @@ class PromptedTimes:
         self._delay = self._base
 
     def _given_up_too_early(self, delay: float) -> bool:
-        """Return whether the present reply answers the command that was given up last.
+        """Give up the commands whose replies were lost. Return whether one was given up too early.
 
-        Before this check, give up the commands whose replies were lost. The present reply must be
-        the only one in its read. `delay` is the usual delay, ns.
+        In that case, the present reply answers the command that was given up last. The present
+        reply must be the only one in its read. `delay` is the usual delay, ns.
         """
         left, at, wide = self._left, self._at, 4 * self._spread
         lost, self._lost = self._lost, False

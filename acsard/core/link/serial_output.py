@@ -40,18 +40,21 @@ class Port(Protocol):
     def offer(self, line: bytes, now: Instant) -> Offered:
         """Write a line immediately or drop it, and return the result.
 
-        `now` is the time at which the line was made.
+        `line` has a line end. `now` is the time of the control step that made the line.
         """
 
 
 class SerialOutput:
-    """The output of a serial port without a queue, from the opening of the port to its closing."""
+    """The output of a serial port while it is open. Each opening of the port needs a new object.
+
+    A line is written immediately or dropped. It is never queued.
+    """
 
     def __init__(self, baud_rate: int, stop: bytes, period_ns: int) -> None:
         """Start for a port that was just opened.
 
-        `stop` is the plain line that commands speed zero for all wheels. `prepare` drops any other
-        line that is older than `period_ns` ns.
+        `stop` is the plain line that commands speed zero for all wheels. `period_ns` is the age,
+        ns, above which `prepare` drops a line that is not a stop.
         """
         self._baud_rate, self._stop, self._period_ns = baud_rate, stop, period_ns
         self._still = stop.removesuffix(b"\r\n")
@@ -67,7 +70,8 @@ class SerialOutput:
         A line is dropped if the kernel still has bytes to send, or if the previous line was still
         on the wire when `line` was made. A line that is not a stop is also dropped if it is older
         than a period, which happens if the process did not run meanwhile. After the port was
-        opened, a plain stop replaces the first line.
+        opened, a plain stop replaces the first line. If the board may have received a part of a
+        line before, the bytes begin with an additional line end.
 
         Args:
             line: The line with its line end.

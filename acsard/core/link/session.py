@@ -36,7 +36,7 @@ NAMES: dict[LinkState, EventName] = {
 }
 
 LONG_GAP_NS = 1 * NS_PER_S
-"""If no line was received, or none was written, for at least this time, ns, the MCU may have been
+"""If for at least this time, ns, no line was received or no line was written, the MCU may have been
 reset meanwhile. After such a gap, every sender must send a zero before it can drive."""
 
 BLOCKED_NS = int(WATCHDOG_S * NS_PER_S)
@@ -44,11 +44,12 @@ BLOCKED_NS = int(WATCHDOG_S * NS_PER_S)
 watchdog of the MCU has stopped the motors."""
 
 FORGET_NS = 3 * NS_PER_S
-"""Time for which the link must be up after an opening of the port, ns, before the session forgets
-the fields of the status line that the board has not reported since that opening. Steps in which
-this computer was late do not count. A board reports each of its fields at least once a second.
-Until a field is forgotten, it keeps its value. So a pressed emergency stop remains latched while
-the cable is unplugged and plugged in again."""
+"""When the port was opened, another board may answer. After the link has been up for this time
+without a break, ns, the session forgets the fields of the status line that the board has not
+reported since the opening. The time does not include steps in which this computer was late. It is
+long enough, because a board reports each of its fields at least once a second. Until a field is
+forgotten, it keeps its value. So a pressed emergency stop remains latched while the cable is
+unplugged and plugged in again."""
 
 IDENTITY = b"!acsard-mcu "
 """First bytes of the line with which an MCU with acsard's firmware identifies itself after
@@ -59,7 +60,8 @@ class McuSession:
     """The exchange of lines with the MCU on one serial port.
 
     A new session with the MCU begins when the port is opened, when the MCU restarts, and when a gap
-    of at least `LONG_GAP_NS` in the lines ends. The object outlasts all of these sessions.
+    of at least `LONG_GAP_NS` in the lines ends. One object of this class handles all of these
+    sessions.
     """
 
     def __init__(
@@ -85,8 +87,8 @@ class McuSession:
         self.status_ns: int | None = None
         """Monotonic time of arrival of the last status line that is not forgotten, ns."""
         self._reported: tuple[BoardStatus, int | None] = (BoardStatus(), None)
-        """The values that `status` and `status_ns` would have if only the status lines since the
-        last opening of the port counted."""
+        """The values of `status` and `status_ns` that come only from status lines received since
+        the last opening of the port."""
         self._awaiting, self._settled_ns, self._judged_ns = True, 0, 0
         """`_awaiting` is true while fields from before the last opening of the port are not
         forgotten yet. `_settled_ns` is the time for which the link has been up, ns, without the
@@ -178,9 +180,9 @@ class McuSession:
     def line(self, now_ns: int, speeds: WheelSpeeds) -> bytes | None:
         """Return the line that commands `speeds`, plain or checked, or None if no line is due.
 
-        While the MCU does not answer, and while the daemon asks it for checked lines, every line is
-        a stop, whatever `speeds` is. The first of these stops is due immediately, because the MCU
-        may still obey the line before it.
+        If the MCU does not answer, or if the daemon is asking it for checked lines, every line is a
+        stop, whatever `speeds` is. The first of these stops is due immediately, because the MCU may
+        still obey the line before it.
         """
         line = self._next_line(now_ns, speeds)
         self._made = None if line is None else (line, now_ns)
@@ -236,9 +238,10 @@ class McuSession:
     # sessions
 
     def _settle(self, went: bool, port_open: bool, late_ns: int) -> None:
-        """Record whether the port wrote the last line.
+        """Record whether the port wrote the line that `line()` returned last.
 
-        If `went` is true, the port wrote the line `late_ns` ns after it was made.
+        `went` is true if the port wrote it. `port_open` says whether the port is open. `late_ns` is
+        the time from making the line to writing it, ns.
         """
         made = self._made
         if made is None:
@@ -316,13 +319,13 @@ class McuSession:
             self.events.append(Event(NAMES[self.link], self.words(), "warning"))
 
     def _reject(self, reason: str, line: bytes = b"", more: int = 1) -> None:
-        """Count `more` rejected lines. `line` is the last of them, b"" if it is unknown."""
+        """Count `more` lines rejected for `reason`. `line` is the last of them, b"" if unknown."""
         self.rejects[reason] += more
         before, _ = self._rejected.get(reason, (0, b""))
         self._rejected[reason] = (before + more, line)
 
     def _announce_rejects(self) -> None:
-        """Add an event for each reason for which lines were rejected.
+        """Add one event for all lines that this update has rejected for the same reason.
 
         After noise on the cable, an event for each rejected line would take too much time.
         """
@@ -436,7 +439,9 @@ class McuSession:
     ) -> Feedback:
         """Return the feedback of a good line.
 
-        `size` is the pair of `following` and `length`, the arguments of `Timeline.place`.
+        `read_at` is the time of the read of the port. `size` is the pair of `following` and
+        `length`, the arguments of `Timeline.place`. `asked_ns` is the monotonic time at which the
+        answered command was written, ns, None if unknown.
         """
         self.good_lines += 1
         before_ns, self._heard_ns = self._heard_ns, read_at.mono_ns

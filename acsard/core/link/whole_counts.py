@@ -9,13 +9,13 @@ However, n is a whole number, so T can be found from the speeds:
 1. Each possible n of the fastest wheel implies a time T = n a / speed. The search starts at the n
    whose T is nearest to the host's estimate.
 2. The search ends at the first n with which the counts of the other wheels are whole numbers too.
-3. The difference between T and the host's time is carried to the next line: if the board took a
-   sample later than the host believed, less time is left until the next sample. If n was wrong, the
-   carried time corrects this in the next line.
+3. A large part of the difference between the host's estimate and T is added to the host's estimate
+   for the next line: if the board took a sample later than the host estimated, less time is left
+   until the next sample. If n was wrong, this also corrects the error in the next line.
 
-With fine encoders, the host's time is too inaccurate to find n. Then the angle of each wheel is its
-speed times the host's time. That time includes the time carried from earlier lines, so no time is
-lost or counted twice.
+With fine encoders, the host's estimate is too inaccurate to find n. Then the angle of each wheel is
+its speed times the host's estimate, which includes the addition from the previous line. So no time
+is lost or counted twice.
 
 If the previous line is missing, there are two cases. If the board answered and its reply was lost,
 T covers only the time since that reply. If the command was lost, the board did not answer, and T
@@ -46,33 +46,37 @@ with each number of counts that is tried for a line. If it exceeds the limit, sp
 whole counts prove nothing."""
 
 EXACT = 0.3
-"""Largest accepted difference, in counts, between a whole number of counts and the number that the
-speed and the host's time give. It applies if the speeds alone prove nothing, as with fine encoders.
-It also helps to decide whether the counts of a line include those of the missing line before it."""
+"""Largest accepted difference between a whole number of counts and the number of counts that
+follows from the speed and the host's estimate of the time. It applies if the speeds alone prove
+nothing, as with fine encoders. It also helps to decide whether the counts of a line include those
+of the missing line before it."""
 
 WIDE, WIDE_S = 0.6, 0.005
-"""Largest error of the host's time between two samples: the share `WIDE` of it, plus `WIDE_S` s."""
+"""Largest assumed error of the host's estimate of the time between two samples: the estimate times
+`WIDE`, plus `WIDE_S` s."""
 
 KEPT = 0.95
-"""Largest share of the error of the host's time that is carried to the next line. If the whole
-error were carried and the two clocks differed by 0.5 %, the carried time would grow forever."""
+"""Largest share of the error of the host's estimate that is added to the estimate for the next
+line. If the whole error were added and the two clocks differed by 0.5 %, the sum of the errors
+would grow forever."""
 
 REPEATED = 0.65
-"""A line with unchanged speeds can be a repetition of the previous line only if it follows sooner
-than this share of the time over which the firmware last counted. Firmware that is asked again so
-soon has no new counts."""
+"""Firmware that is asked again very soon has no new counts, and repeats the speeds of the previous
+line. A line with unchanged speeds can be such a repetition only if the time since the previous line
+is less than `REPEATED` times the time over which the firmware last counted."""
 
 SOON, OFF = 0.45, 0.25
-"""A line with unchanged speeds is a repetition of the previous line if it follows sooner than the
-share `SOON` of the time over which the firmware last counted. If it follows later than that, but
-sooner than the share `REPEATED`, it is a repetition in two cases: its speeds are not whole counts,
-or the host's time contradicts its counts by more than `OFF` counts of the fastest wheel."""
+"""Let q be the time since the previous line, divided by the time over which the firmware last
+counted. If q is less than `SOON`, a line with unchanged speeds is a repetition of the previous
+line. If q lies between `SOON` and `REPEATED`, the line is a repetition in two cases: its speeds are
+not whole counts, or the host's estimate of the time contradicts its counts by more than `OFF`
+counts of the fastest wheel."""
 
 UNSURE, SLOW = 0.2, 0.025
-"""If the mean error of the host's time exceeds `UNSURE`, in counts of the fastest wheel, the
-nearest whole number of counts is often wrong. A random time has a mean error of 0.25. An encoder
-with 96 counts a turn reaches `UNSURE` behind a USB adapter that batches lines for 16 ms. `SLOW` is
-the gain of the filter for the mean error."""
+"""The error of the host's estimate of the time is measured in counts of the fastest wheel. If its
+mean exceeds `UNSURE`, the nearest whole number of counts is often wrong. A random time has a mean
+error of 0.25. An encoder with 96 counts a turn reaches `UNSURE` behind a USB adapter that batches
+lines for 16 ms. `SLOW` is the gain of the filter for the mean."""
 
 GAIN, DOUBTFUL = 0.1, 0.3
 """`GAIN` is the gain of the filter for the share of lines whose speeds are not whole counts. If
@@ -94,24 +98,26 @@ class WholeCounts:
     def forget(self) -> None:
         """Forget all earlier lines, because they may be those of another board."""
         self._apart = self._period = 0.0
-        """`_apart` is the time in s by which the board took the last sample earlier than the host
-        believed. `_period` is the time in s by which the firmware divided its last counts."""
+        """`_apart` is the time in s that is added to the host's estimate for the next line. It is
+        positive if the board took the last sample earlier than the host estimated. `_period` is the
+        time in s over which the firmware last counted."""
         self._run = 0
         """Number of lines with recovered counts since the last line without recovered counts."""
         self._before: Motors = (0.0, 0.0, 0.0, 0.0)
         self.covers_gap = False
         """Whether the counts of the last line include those of the missing line before it."""
         self._cover = 0.0
-        """Among the lines that follow a missing line, the filtered share of those whose counts
-        include the counts of the missing line. A line whose speeds do not show this is left out."""
+        """The lines that follow a missing line are of two kinds: their counts include those of the
+        missing line, or not. This is the filtered share of the first kind. Lines whose speeds do
+        not show the kind are left out."""
         self._doubt = self._unsure = 0.0
         """`_doubt` is the filtered share of the lines whose speeds are not whole counts. `_unsure`
-        is the filtered error of the host's time, in counts of the fastest wheel."""
+        is the filtered error of the host's estimate of the time, in counts of the fastest wheel."""
 
     def pause(self) -> None:
-        """Forget the error of the host's time, which would be carried to the next line.
+        """Forget the error of the host's estimate, so that it is not added to the next estimate.
 
-        The reason is that the last line does not show over what time the firmware counted.
+        The caller does this if the last line does not show over what time the firmware counted.
         """
         self._apart, self._run = 0.0, 0
 
@@ -127,9 +133,9 @@ class WholeCounts:
         times time. Return None if the firmware does not report whole counts. Also return None if
         the wheels turn, but no speed exceeds its rounding error.
 
-        `own` is the host's estimate of the time since the previous line, s. If the line before this
-        one is missing, `gap` is the time from the last good line to the missing line, s. Otherwise
-        `gap` is 0.
+        `speeds` are in rad/s. `own` is the host's estimate of the time since the previous line, s,
+        even if that line is missing. In that case, `gap` is the time from the last good line to the
+        missing line, s. Otherwise `gap` is 0.
         """
         self.covers_gap = False
         before, self._before = self._before, speeds
@@ -195,16 +201,20 @@ class WholeCounts:
         )
 
     def _fits(self, number: int, fastest: float, want: float) -> bool:
-        """Return whether `number` counts of a wheel with speed `fastest` fit the time `want`, s."""
+        """Return whether a wheel makes about `number` counts in the time `want`, s.
+
+        `fastest` is the speed of the wheel, rad/s. `EXACT` is the largest accepted difference.
+        """
         return abs(number - want * fastest / self.angle) <= EXACT
 
     def _number(self, speeds: Motors, fastest: float, want: float) -> tuple[int, bool | None]:
         """Return a pair: the number n of counts of the fastest wheel, and whether it is proved.
 
         n is 0 if the line does not show it. The second value is True if the speeds prove that they
-        are whole counts, False if they prove the opposite, and None if they prove neither.
-        `fastest` is the largest absolute speed, rad/s. `want` is the expected time between the two
-        samples, s: the host's estimate plus the time carried from the previous line.
+        are whole counts, False if they prove the opposite, and None if they prove neither. `speeds`
+        are those of all wheels, and `fastest` is the largest absolute speed, rad/s. `want` is the
+        expected time between the two samples, s: the host's estimate plus the addition from the
+        previous line.
         """
         count = fastest / self.angle
         exact = want * count  # counts if the host's time were right

@@ -20,7 +20,8 @@ class Attachment(Struct, frozen=True):
     """Attachment of a sample or a request."""
 
     sequence: int
-    """Number of the sample or request. Each publisher and each client counts its own from 1."""
+    """Number of the sample or request. Each publisher and each client counts its own samples or
+    requests from 1."""
     stamp_ns: int
     """Time of sending by the wall clock, ns since 1970."""
     gid: bytes

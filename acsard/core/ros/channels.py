@@ -108,8 +108,8 @@ def _parsed(text: str) -> dict[str, tuple[tuple[str, str], ...]]:
 
 
 _DECLARED = _parsed(_TEXT)
-"""The constants and fields of each message type, in order. Each is a pair of its own type and the
-text after this type."""
+"""The constants and fields of each message type, in order. Each constant or field is a pair: its
+type and the rest of its definition, such as ("float64", "x 0")."""
 
 DEFINITIONS: dict[str, tuple[Field, ...]] = {
     name: tuple((kind, rest.split()[0]) for kind, rest in declared if "=" not in rest)
@@ -165,13 +165,15 @@ class Channel(Struct, frozen=True):
     schema_name: str
     """ROS type as `pkg/msg/Name`."""
     message: type[Struct]
-    """Struct type that `encode` encodes. For `state` it is `State` in `shapes.py`."""
+    """Type of the messages that are encoded as CDR. For the key `state` it is `State` in
+    `shapes.py`."""
     qos: Qos = Qos()
 
     def topic(self, namespace: str, source: str = "") -> str:
-        """Return the fully qualified name, with its leading slash.
+        """Return the fully qualified name of the topic, with its leading slash.
 
-        `source` is the command source that replaces `<source>` in the name.
+        `namespace` is the ROS namespace of the robot. `source` is the command source that replaces
+        `<source>` in the name.
         """
         return full_name(namespace, self.name.replace(SOURCE, source))
 
@@ -213,5 +215,8 @@ CHANNELS: tuple[Channel, ...] = (*BY_KEY.values(), CMD_VEL_IN, LOG)
 
 
 def published_channels(silent: Container[str]) -> tuple[Channel, ...]:
-    """Return the channels that a robot publishes, except those with a native key in `silent`."""
+    """Return all channels, except those with a native key in `silent`.
+
+    `silent` are the native keys that the robot does not use, as `left_out` returns them.
+    """
     return tuple(channel for channel in CHANNELS if channel.native not in silent)

@@ -220,15 +220,16 @@ class SetAtomicallyReply(Struct, frozen=True):
 
 
 SETTING = ("set_parameters", "set_parameters_atomically")
-"""The services that set parameters. The class `Parameters` does not answer them, because it only
-reads."""
+"""The services that set parameters. `Parameters` does not answer them, because that class answers
+only the services that read."""
 
 
 def failure(service: str, why: str, request: bytes = b"") -> bytes:
     """Return the reply to a refused request. Without a reply, the client would wait forever.
 
-    If the request sets parameters, the reply contains the reason `why`. The replies of the other
-    services have no field for a reason, so they are empty, as in rclcpp.
+    `service` is the name of the service. If the request sets parameters, the reply contains the
+    reason `why`. The replies of the other services have no field for a reason, so they are empty,
+    as in rclcpp.
     """
     refused = SetParametersResult(False, why)
     if service in SETTING:
@@ -247,7 +248,7 @@ def failure(service: str, why: str, request: bytes = b"") -> bytes:
 
 
 class Parameters:
-    """Answers the services that only read parameters.
+    """The replies to the services that only read parameters.
 
     `tables` is the configuration in the form that `core.config.parsing.effective()` returns.
     """
@@ -293,9 +294,10 @@ class Parameters:
 
 
 def wished(payload: bytes) -> dict[str, Plain]:
-    """Return the values that the request `payload` wants to set, by the names of the parameters.
+    """Return the value that a request sets for each parameter, by the names of the parameters.
 
-    Raises `CdrError` if the request is not valid, or if it names a parameter twice.
+    `payload` is a request to set parameters, in CDR. Raises `CdrError` if the request is not valid,
+    or if it names a parameter twice.
     """
     asked = Cdr(SetRequest).decode(payload)
     wishes: dict[str, Plain] = {}
@@ -307,10 +309,12 @@ def wished(payload: bytes) -> dict[str, Plain]:
 
 
 def outcome(service: str, payload: bytes, successful: bool, reason: str) -> bytes:
-    """Return the reply to the request `payload` to set parameters, both in CDR.
+    """Return the reply to a request to set parameters.
 
-    The robot sets all parameters of a request or none, so each parameter has the same result.
-    Raises `CdrError` for a request to `set_parameters` that is not valid.
+    `service` is the name of the service. `payload` is the request, and both it and the reply are
+    CDR. `reason` says why the request was refused. The robot sets all parameters of a request or
+    none, so each parameter has the same result. Raises `CdrError` for a request to `set_parameters`
+    that is not valid.
     """
     result = SetParametersResult(successful, reason)
     if service == "set_parameters_atomically":

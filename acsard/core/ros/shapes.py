@@ -40,7 +40,7 @@ class Log(Struct, frozen=True):
 
 
 NUMBERED = re.compile(r"\d+ (x|times)\b")
-"""Matches the count at the beginning of an event's text, such as "3 x" or "3 times"."""
+"""Pattern of a count at the beginning of an event's text, such as "3 x" or "3 times"."""
 
 LEVELS: dict[str, int] = {"info": 20, "warning": 30, "error": 40}
 """The numbers of the log levels in ROS."""
@@ -56,7 +56,8 @@ def log(event: Event | LogEvent, stamp: Time) -> Log:
 def how_often(text: str, count: int) -> str:
     """Return the text to append to an event that occurred `count` times, such as " (3 times)".
 
-    Return "" for a single occurrence, and for a text that already begins with the number.
+    `text` is the text of the event. Return "" if `count` is 1, or if `text` already begins with a
+    count.
     """
     return "" if count == 1 or NUMBERED.match(text) else f" ({count} times)"
 
@@ -64,7 +65,8 @@ def how_often(text: str, count: int) -> str:
 def asked(twist: BodyTwist, arrived: Time, frame: str) -> TwistStamped:
     """Convert the command of a source to a message of the topic `cmd_vel_in/<source>`.
 
-    The header of the message contains the time of arrival `arrived` and the frame id `frame`.
+    `twist` is the command. `arrived` is the time of its arrival, and `frame` is the frame id. Both
+    become the header of the message.
     """
     return TwistStamped(
         Header(arrived, frame), Twist(Vector3(x=twist.linear), Vector3(z=twist.angular))

@@ -65,7 +65,8 @@ class Endpoint(Struct, frozen=True):
     latched: bool
     """True if a new subscriber immediately receives the last message."""
     type: str
-    """ROS type of the messages. If a key of the bridge accepts two types, it is the first one."""
+    """ROS type of the messages. A key of the bridge may accept two types. Then this is the first of
+    them."""
 
     @property
     def encoding(self) -> str:
@@ -130,7 +131,7 @@ drivers that publish with SensorDataQoS."""
 
 
 def left_out(config: Config) -> frozenset[str]:
-    """Return the native keys that a daemon with this configuration does not use.
+    """Return the native keys that a daemon with the configuration `config` does not use.
 
     The daemon does not announce them, so that ROS tools do not show them as topics.
     """
@@ -148,8 +149,9 @@ def left_out(config: Config) -> frozenset[str]:
 def ros_names(ros: RosConfig, silent: Container[str] = ()) -> tuple[RosName, ...]:
     """Return the ROS topics and services of a robot.
 
-    A topic that accepts Twist and TwistStamped appears twice, once for each type. `silent` contains
-    the native keys to leave out, as `left_out` returns them.
+    A topic that accepts Twist and TwistStamped appears twice, once for each type. `ros` is the
+    table `[ros]` of the configuration. `silent` contains the native keys to leave out, as
+    `left_out` returns them.
     """
     kinds = [kind for kind in TWISTS if ros.cmd_vel_type in ("auto", kind)]
     return (
@@ -217,14 +219,14 @@ def node_tokens(ros: RosConfig, zid: str) -> tuple[str, ...]:
 
 
 def command_keys(ros: RosConfig) -> tuple[str, ...]:
-    """Return the ROS keys on which commands arrive."""
+    """Return the ROS keys on which commands, speed limits and gyro samples arrive."""
     return tuple({e.key: None for e in endpoints(ros, "0") if e.direction == "in"})
 
 
 def claims(ros: RosConfig) -> tuple[str, ...]:
     """Return the tokens with which this daemon claims the ROS name `cmd_vel` for itself.
 
-    Two daemons with the same token would obey the same `cmd_vel`, so the second daemon does not
+    Two daemons with the same token would follow the same `cmd_vel`, so the second daemon does not
     start. ROS's own tokens cannot serve as claims, because not every daemon announces itself to
     ROS, and other ROS nodes may use the same names. So the keys of claims begin with
     `acsard/@ros/`.

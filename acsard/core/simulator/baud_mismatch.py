@@ -1,7 +1,8 @@
 """Computes the bytes that a receiver gets from a sender with another baud rate.
 
-For each byte, the wire carries a start bit, eight data bits with the lowest first, and a stop bit.
-The receiver waits for a falling edge, and then samples the wire in the middle of each of its bits.
+For each byte, the sender puts a start bit, eight data bits with the lowest first, and a stop bit on
+the wire. The receiver waits for a falling edge. Then it samples the wire ten times, in the middle
+of each bit as its own baud rate defines it.
 """
 
 from __future__ import annotations

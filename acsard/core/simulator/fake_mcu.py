@@ -30,25 +30,27 @@ RESET_NS = 2 * NS_PER_S
 
 SHORTEST_WINDOW_NS = 4 * MS
 """Shortest time over which the board computes speeds from encoder counts, ns. If less time has
-passed since the last computation, a reply repeats the speeds that it gave."""
+passed since the last computation, a reply repeats the speeds of that computation."""
 
 OUTPUT_BYTES = 255
-"""Size of the board's output buffer. The board drops a line that does not fit, as the firmware in
-`deploy/firmware` does."""
+"""Size of the board's output buffer, bytes. If a line does not fit into the buffer, the board drops
+the line, as the firmware in `deploy/firmware` does."""
 
 STATUS_NS = NS_PER_S // 10
 """Time between two status lines, ns."""
 
 EMPTY_VOLTS, CHARGED_VOLTS, RESISTANCE = 21.0, 4.2, 0.2
-"""Properties of the simulated battery, which has six cells: its voltage when empty, V, the
-additional voltage when full, V, and its internal resistance, ohm."""
+"""Properties of the simulated battery, which has six cells. `EMPTY_VOLTS` is the voltage of the
+empty battery, V. A full battery has `CHARGED_VOLTS` more. `RESISTANCE` is the internal resistance,
+ohm."""
 
 REST_AMPS, AMPS_PER_SPEED = 0.5, 0.05
-"""Battery current at rest, A, and additional current for each rad/s of each wheel, A."""
+"""`REST_AMPS` is the battery current at rest, A. `AMPS_PER_SPEED` is the additional current for
+each rad/s of each wheel, A."""
 
 START_AMPS, START_NS = 10.0, 300 * MS
-"""Additional battery current while the motors start, A, and the duration of the start, ns. This
-current lowers the battery voltage by 2 V."""
+"""`START_AMPS` is the additional battery current while the motors start, A. It lowers the battery
+voltage by 2 V. `START_NS` is the duration of the start, ns."""
 
 NEVER_NS = 2**62
 
@@ -100,17 +102,18 @@ class FakeMcu(Faults):
         self._bumpers = "." * (len(config.safety.bumpers) or 4)
         """Field `bumpers` of the status line while no bumper is pressed: one dot per bumper."""
         self._inputs: tuple[tuple[int, int, str, str], ...] = ()
-        """The faults of the inputs, each as a tuple of its begin, ns, its end, ns, the field of the
-        status line, and the value of this field. The value `silent` leaves the field out of the
-        line. If several faults of one field are on, the last one decides. For bumpers instead, each
-        bumper that any of the faults presses is reported as pressed."""
+        """The faults of the inputs that are on. Each is a tuple of four: the monotonic times at
+        which it begins and ends, ns, the field of the status line, and the value of this field. The
+        value `silent` leaves the field out of the line. If several faults of one field are on, the
+        last one decides. For bumpers instead, each bumper that any of the faults presses is
+        reported as pressed."""
         self._inputs_clock = b""
         self._battery_clock = b""
         self._charge = self._capacity = 1.0
         """State of charge of the battery, 0 to 1, and its capacity, ampere seconds."""
         self._drained_ns = self._rested_ns = now_ns
         """`_drained_ns` is the monotonic time at which the charge was last computed, ns.
-        `_rested_ns` is the monotonic time at which all set points were last zero, ns."""
+        `_rested_ns` is the last monotonic time at which all set points were zero, ns."""
         if config.sim.boot_time:
             self._schedule(self._boot_until_ns, "booted", b"")
         self._lasting = ExitStack()
@@ -285,8 +288,9 @@ class FakeMcu(Faults):
     def _handed_over(self, now_ns: int, what: str, data: bytes) -> bytes:
         """Return the bytes that the USB adapter passes on to the host at `now_ns`.
 
-        `what` is "batch" if the timer of the adapter has expired. It is "sent" if the bytes `data`
-        of the board have arrived at the adapter.
+        `what` is "batch" if the timer of the adapter has expired, and "sent" if the bytes `data` of
+        the board have arrived at the adapter. During a stall, return b"" and schedule the same call
+        for the end of the stall.
         """
         until_ns = self._stalled_until(now_ns)
         if until_ns > now_ns:
@@ -311,7 +315,11 @@ class FakeMcu(Faults):
         return self._seen
 
     def _speeds(self, now_ns: int) -> list[float]:
-        """Return the mean speeds of the motors a to d since the last computation, rad/s."""
+        """Return the mean speeds of the motors a to d since the last computation, rad/s.
+
+        If less than `SHORTEST_WINDOW_NS` has passed since then, return the speeds of that
+        computation.
+        """
         since, before = self._window
         gains = self.gains
         if self.stuck is not None:
@@ -341,7 +349,7 @@ class FakeMcu(Faults):
         return [speed if abs(speed) >= 0.005 else 0.0 for speed in seen]
 
     def _sample(self) -> tuple[int, ...]:
-        """Return the time of the last encoder reading, ms since booting, and the four counts."""
+        """Return the time of the last encoder reading, ms since boot, and the four counts."""
         read_ns, _ = self._window
         return (read_ns - self._on_ns) // MS, *(round(count) for count in self._counted)
 
@@ -430,9 +438,9 @@ class FakeMcu(Faults):
     def driver_fault(self, after_s: float, length_s: float) -> Fault:
         """Make the board report that the motor driver has a fault for a while.
 
-        The driver's fault begins `after_s` s after this method is called, and lasts `length_s` s.
-        If `length_s` is 0, it does not end. Before and after it, the board reports that the motor
-        driver is ok.
+        The driver's fault begins `after_s` s after this simulated fault is switched on, and lasts
+        `length_s` s. If `length_s` is 0, it does not end. Before and after it, the board reports
+        that the motor driver is ok.
         """
         return self._input("driver", "fault", after_s, length_s)
 

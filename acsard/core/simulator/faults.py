@@ -16,7 +16,8 @@ from acsard.core.values import NS_PER_S
 Fault = AbstractContextManager[None]
 
 USB_PACKET = 62
-"""Size of a full USB packet, bytes. An FTDI adapter sends it without waiting for its timer."""
+"""Size of a full USB packet, bytes. An FTDI adapter sends a full packet without waiting for its
+timer."""
 
 WATCHDOG_NS = 300_000_000
 """Duration of the host's silence after which the board stops the motors, ns."""
@@ -57,8 +58,8 @@ class Faults:
         self.understand: Callable[[bytes], protocol.Command | None] = protocol.whole
         self.samples = True
         self.latency_ns = 0
-        """Interval at which the USB adapter also sends a packet that is not full, ns. 0 means that
-        there is no adapter."""
+        """Interval of the USB adapter's timer, ns. When the timer expires, the adapter sends its
+        packet even if the packet is not full. 0 means that there is no adapter."""
         self.stall_every_ns = self.stall_ns = 0
         self.lose_reply = self.lose_command = self.bit_error = 0
         """Each of these faults affects every n-th line. The value is n, or 0 if the fault is
@@ -76,7 +77,7 @@ class Faults:
             self._turn(before)
 
     def _turn(self, values: dict[str, object]) -> None:
-        """Simulate the vehicle up to now with the old switches, then set the new ones."""
+        """Simulate the vehicle up to now with the old switches, then set the switches `values`."""
         self._catch_up()
         for name, value in values.items():
             setattr(self, name, value)
@@ -85,9 +86,9 @@ class Faults:
         """Simulate the vehicle up to now. `FakeMcu` implements this."""
 
     def _hit(self, what: str, every: int) -> bool:
-        """Count an event of kind `what`. Return True for every n-th event, where n is `every`.
+        """Count an event. Return True for every n-th event of the same kind, where n is `every`.
 
-        If `every` is 0, always return False.
+        `what` is the kind: "reply", "command" or "bit". If `every` is 0, always return False.
         """
         self._passed[what] += 1
         return every > 0 and self._passed[what] % every == 0
@@ -129,16 +130,19 @@ class Faults:
 
     @contextmanager
     def swapped_wheels(self, wheel: int, other: int) -> Iterator[None]:
-        """Swap the wheels of two channels (0 to 3 for a to d), both motor and encoder."""
+        """Swap the wheels of the channels `wheel` and `other` (0 to 3 for a to d).
+
+        Both the motors and the encoders are swapped.
+        """
         with self.swapped_motors(wheel, other), self.swapped_encoders(wheel, other):
             yield
 
     def swapped_motors(self, wheel: int, other: int) -> Fault:
-        """Swap the motors of two channels (0 to 3 for a to d)."""
+        """Swap the motors of the channels `wheel` and `other` (0 to 3 for a to d)."""
         return self._with(drivers=_swapped(self.drivers, wheel, other))
 
     def swapped_encoders(self, wheel: int, other: int) -> Fault:
-        """Swap the encoders of two channels (0 to 3 for a to d)."""
+        """Swap the encoders of the channels `wheel` and `other` (0 to 3 for a to d)."""
         return self._with(encoders=_swapped(self.encoders, wheel, other))
 
     @contextmanager
@@ -231,9 +235,9 @@ class Faults:
         return self._with(lose_command=every)
 
     def bit_errors(self, every: int = 7) -> Fault:
-        """Flip one bit in every n-th line of both directions, where n is `every`.
+        """Flip one bit in every n-th line, where n is `every`.
 
-        The place of the bit in the line changes each time.
+        Lines in both directions are counted together. Another bit of the line is flipped each time.
         """
         return self._with(bit_error=every)
 
@@ -242,7 +246,10 @@ class Faults:
         return self._with(latency_ns=int(latency_s * NS_PER_S))
 
     def stalls(self, every_s: float, length_s: float) -> Fault:
-        """Hold back all bytes to the host for `length_s` s at a time, once every `every_s` s."""
+        """Hold back all bytes to the host again and again.
+
+        Such a stall begins every `every_s` s and lasts `length_s` s.
+        """
         return self._with(stall_every_ns=int(every_s * NS_PER_S), stall_ns=int(length_s * NS_PER_S))
 
     def _stalled_until(self, now_ns: int) -> int:

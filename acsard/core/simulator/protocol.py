@@ -105,7 +105,8 @@ def _value(word: bytes) -> float:
 def speeds_text(speeds: tuple[float, ...], separator: str, unpadded: bool) -> bytes:
     """Return the plain part of a reply with the speeds of the motors a to d, rad/s.
 
-    `unpadded` says whether a speed below ten has only one integer digit.
+    `separator` is the text between two speeds, such as ",". `unpadded` says whether a speed below
+    ten has only one integer digit.
     """
     form = "%s%s%.2f" if unpadded else "%s%s%05.2f"
     words = [
@@ -131,7 +132,10 @@ def suffix(text: bytes, sequence: bytes, sample: Sequence[int]) -> bytes:
 
 
 def status(fields: Mapping[str, str], check: bool) -> bytes:
-    """Return the status line with `fields`, such as `{"estop": "ok"}`. `check` adds a checksum."""
+    """Return the status line with `fields`, such as `{"estop": "ok"}`.
+
+    If `check` is true, the line has a checksum.
+    """
     text = "".join(["!status", *(f" {name}={value}" for name, value in fields.items())]).encode()
     return text + (b"*%04X" % _crc(text) if check else b"") + b"\r\n"
 
@@ -139,8 +143,9 @@ def status(fields: Mapping[str, str], check: bool) -> bytes:
 def identity(counts: int, watchdog_ms: int, sample: bool) -> bytes:
     """Return the line with which the firmware identifies itself.
 
-    `counts` is the number of encoder counts per wheel revolution. `sample` says whether the
-    firmware can add the board's time and encoder counts to replies.
+    `counts` is the number of encoder counts per wheel revolution. `watchdog_ms` is the time without
+    a valid line after which the board stops the motors, ms. `sample` says whether the firmware can
+    add the board's time and encoder counts to replies.
     """
     text = f"!acsard-mcu 1 counts={counts} watchdog_ms={watchdog_ms} check=1 sample={int(sample)}"
     return text.encode() + b"\r\n"

@@ -40,8 +40,8 @@ class WatchedMcu(FakeMcu):
         self._looks = 0
         self._look_ns = now_ns + LOOK_NS
         self._history: deque[tuple[int, float]] = deque([(now_ns, 0.0)])
-        """Pairs of a monotonic time, ns, and the angle that the robot turned until then, rad. They
-        go back as far as the delayed gyro needs."""
+        """The motion that the delayed gyro still needs, oldest first. Each item is a pair of a
+        monotonic time, ns, and the angle by which the robot had turned at that time, rad."""
 
     def next_ns(self) -> int:
         """Return the monotonic time at which to call `advance()` next, ns."""

@@ -12,7 +12,10 @@ transform connects it with `odom`, so no program can mistake the true pose for o
 
 
 def true_pose(sight: Sight, wall_ns: int) -> PoseStamped:
-    """Return the true pose of base_link in the frame `sim`. `wall_ns` is the stamp, ns."""
+    """Return the true pose of base_link in the frame `sim`.
+
+    `wall_ns` is the stamp of the message, ns since 1970.
+    """
     pose = sight.pose
     where = Pose(Vector3(pose.x, pose.y), from_yaw(pose.yaw))
     return PoseStamped(Header(Time.from_ns(wall_ns), FRAME), where)
@@ -22,7 +25,7 @@ def turn_rate(sight: Sight, frame: str, deviation: float, wall_ns: int) -> Imu:
     """Return the turn rate that the gyro measured, as an Imu message without other measurements.
 
     `frame` is the frame id. `deviation` is the standard deviation of the gyro's noise, rad/s.
-    `wall_ns` is the stamp, ns since 1970.
+    `wall_ns` is the stamp of the message, ns since 1970.
     """
     unknown, variance = [-1.0] + [0.0] * 8, deviation * deviation
     known = [variance, 0.0, 0.0, 0.0, variance, 0.0, 0.0, 0.0, variance]

@@ -27,7 +27,8 @@ GRIP_S = 0.25
 """Interval at which the random grip of the wheels on the floor changes, s."""
 
 HANDS_S = 0.1
-"""Time constant with which the speed of the robot changes when a person pushes it, s."""
+"""When a person pushes the robot, the speeds of its wheels approach the speed of the push with this
+time constant, s."""
 
 
 class Vehicle:
@@ -50,9 +51,10 @@ class Vehicle:
         self.turned = 0.0
         """Angle by which the robot turned left since its start, rad. Each full turn adds 2 pi."""
         self.turn_slip = 0.0
-        """Fraction of each turn that is lost because the wheels skid, 0 to 1."""
+        """Fraction of each turn that the robot does not make because its wheels skid, 0 to 1."""
         self.load = 0.0
-        """Fraction of each set point by which the motors stay below it, 0 to 1."""
+        """Load of the motors, 0 to 1. The motors reach only the fraction 1 - `load` of each set
+        point."""
 
     def advance(self, dt: float, push: float | None = None) -> None:
         """Move the robot for `dt` s according to its set points.
@@ -94,7 +96,7 @@ class Vehicle:
         self.pose = arc(self.pose, (left + right) / 2, turn)
 
     def _grip(self) -> float:
-        """Return the fraction of a turn that is not lost because the wheels skid, 0 to 1."""
+        """Return the fraction of a turn that the robot makes although its wheels skid, 0 to 1."""
         kept = 1.0 - self.turn_slip
         if self._floor:
             kept *= 1.0 - self._floor * uniform(self._seed, int(self._time / GRIP_S))
