@@ -114,7 +114,7 @@ class _Waiting(Struct, frozen=True):
 
 
 class Queries:
-    """Answers queries with constants or the newest messages; turns service calls into `Request`s."""
+    """Answers queries with constants or the newest messages. A service call becomes a `Request`."""
 
     def __init__(self, config: Config, info: Info) -> None:
         self._config = config
