@@ -28,9 +28,10 @@ from acsard.core.config.wire_time import (
 from acsard.core.values import ROOT, WHEELS
 
 LEAST_WRAP_PERIODS = 2
-"""Control periods that a wheel at full speed must take to move its encoder count by half of the
-count's range. After half of the range, a turn in the other direction would give the same count, so
-the direction is ambiguous. With a minimum of two periods, one lost line does no harm."""
+"""Smallest number of control periods in which a wheel at full speed may move its encoder count by
+half of the count's range. After half of the range, a turn in the other direction would give the
+same count, so the direction is ambiguous. With a minimum of two periods, one lost line does no
+harm."""
 
 FEW_COUNTS, FASTEST_HZ = 200, 100.0
 """A warning says that the pose may be wrong if the encoders have fewer than `FEW_COUNTS` counts per
@@ -161,9 +162,10 @@ def _shorter_lines(mcu: McuConfig, rate: float) -> str:
 
 
 def _count_problems(config: Config) -> list[str]:
-    """Return an error line if a wheel's count may wrap within `LEAST_WRAP_PERIODS` control periods.
+    """Return an error line if forward motion of a wheel could look like backward motion.
 
-    The direction of such a wheel would be ambiguous.
+    To prevent this, `mcu.encoder_counts` must be so low that at full speed a count does not change
+    by half of its range within `LEAST_WRAP_PERIODS` control periods.
     """
     counts, fastest = config.mcu.encoder_counts, config.feedback.wheel_speed / math.tau
     lasts = LEAST_WRAP_PERIODS / config.rate_hz

@@ -191,7 +191,7 @@ def _wheels(doubt: WheelsStatus, counters: dict[str, int]) -> Row:
 def _board(config: Config, snapshot: Snapshot) -> list[Row]:
     """Return a list with the row about the emergency stop, the bumpers and the motor drivers.
 
-    The list is empty if the board sends no status lines and the configuration requires no input.
+    The list is empty if the board has sent no status line and the configuration requires no input.
     """
     safety, bumpers = config.safety, snapshot.bumpers
     required, needed = safety.estop == "required", safety.bumpers and safety.bumper != "off"

@@ -75,10 +75,10 @@ def _codec(cls: type[T]) -> Cdr[T]:
 
 
 def detect(encoding: str, payload: bytes) -> Format:
-    """Return the format of a received payload, or raise `DecodeError` if it is none of the three.
+    """Return the format of a received payload: JSON, msgpack or CDR.
 
-    `encoding` is the Zenoh Encoding of the payload. If it does not name the format, the first bytes
-    of the payload decide.
+    Raises `DecodeError` if it is none of them. `encoding` is the Zenoh Encoding of the payload. If
+    it does not name the format, the first bytes of the payload decide.
     """
     form = _FORM_OF.get(encoding.partition(";")[0])
     if form is not None:
@@ -107,7 +107,8 @@ class Decoder(Generic[T]):
     def decode(self, encoding: str, payload: bytes) -> T:
         """Return the message in a payload, or raise `DecodeError`.
 
-        `encoding` is the Zenoh Encoding of the payload, as for `detect`.
+        `encoding` is the Zenoh Encoding of the payload. If it does not name the format, the first
+        bytes of the payload decide.
         """
         return self.decode_as(detect(encoding, payload), payload)
 

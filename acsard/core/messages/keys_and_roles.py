@@ -275,8 +275,8 @@ def offered(config: Config) -> tuple[Topic, ...]:
 def published(config: Config) -> tuple[Topic, ...]:
     """Return the rows of the keys on which a daemon with this configuration publishes.
 
-    With the built-in simulator, they include the key of the gyro, because the daemon itself
-    publishes the samples of the simulated gyro.
+    With the built-in simulator and `odometry.gyro = true`, they include the key of the gyro,
+    because the daemon itself then publishes the samples of the simulated gyro.
     """
     own = config.mcu.simulated
     return tuple(t for t in offered(config) if t in PUBLISHED or (own and t.key == IMU))

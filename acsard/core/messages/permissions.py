@@ -44,10 +44,10 @@ def keys_for(role: Role, use: Use, rows: Iterable[Topic]) -> list[str]:
 
 
 def _exact(row: Topic, use: Use) -> Iterator[tuple[str, Role]]:
-    """Yield a pair for each key that a row stands for: the key, and its lowest role.
+    """Yield a pair for each key that a row stands for: the key, and a role.
 
-    The lowest role is the one from which on clients have the permission `use`. Nothing is yielded
-    if no client has it.
+    The role is the lowest one with the permission `use`. Nothing is yielded if no client has this
+    permission.
     """
     least = {"publish": row.publish, "subscribe": row.subscribe, "query": row.query}[use]
     if least == "<role>":
