@@ -89,7 +89,7 @@ class GatewayFollower:
         self._last = GatewayState(0, 0, 0)
 
     def receive(self, arrival: Arrival, counters: MutableMapping[str, int]) -> int | None:
-        """Decode the gateway's report in a sample, and add what has happened since to `counters`.
+        """Decode the gateway's report in a sample, and add what is new in it to `counters`.
 
         Returns the time at which the first of the TLS certificates expires, wall-clock ns since
         1970. Returns None if this time is unknown, or if the report is invalid and thus ignored.

@@ -108,7 +108,7 @@ class Arrival(Struct, frozen=True):
     sender: str
     """Id of the Zenoh session that set the sample's timestamp. This may be the session of the
     sender, of a router or of a bridge. The id is "" if the sample arrived without a timestamp, or
-    if the daemon's own session replaced it."""
+    if the daemon's own session replaced the timestamp."""
     via: Via = "native"
     attachment: bytes = b""
     received_ns: int | None = None

@@ -328,8 +328,8 @@ def _echo(asked: Attachment | None, wall_ns: int) -> bytes:
 def _format(query: Query) -> Format:
     """Return the encoding of the reply to a query.
 
-    If the query has the parameter `fmt`, the result is the encoding that `fmt` names. Otherwise the
-    reply to a service call has the encoding of the call's payload. All other replies are in JSON.
+    If the query has the parameter `fmt`, the result is the encoding that `fmt` names. Otherwise
+    it is the encoding of the payload if the query calls a service with a payload, else JSON.
     Raises `DecodeError` if `fmt` names no encoding.
     """
     for form in FORMATS:
