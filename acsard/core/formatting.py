@@ -25,8 +25,8 @@ def lines(text: str) -> str:
 def printable_bytes(data: bytes, most: int, last: bool = False) -> str:
     r"""Return bytes as a text of at most `most` characters, plus "…" if some bytes are left out.
 
-    The text shows the first bytes, or the last ones if `last` is true. An unprintable byte is
-    written as an escape such as `\x00`.
+    If the text is too long, it shows the first bytes, or the last bytes if `last` is true. An
+    unprintable byte is written as an escape such as `\x00`.
     """
     shown = [repr(bytes([byte]))[2:-1] for byte in (reversed(data) if last else data)]
     ends = accumulate(map(len, shown))
@@ -92,11 +92,12 @@ _ROUGH = (
     ("µs", 1e-6, 999.5e-6), ("ms", 1e-3, 0.9995), ("s", 1.0, 99.5), ("min", 60.0, 99.5 * 60),
     ("h", 3600.0, 99.5 * 3600), ("d", 86400.0, math.inf),
 )  # fmt: skip
-"""Each row holds a unit, its size in s, and the duration in s from which the next row applies."""
+"""Units for `rough`. Each row contains a unit, its size in s, and a duration in s. From this
+duration on, the unit of the next row is used."""
 
 
 def rough(seconds: float | None, finest: float = 1.0) -> str:
-    """Format a duration or an age with at least two digits, in at most 7 characters ("2.5 min").
+    """Format a duration or an age with one unit, such as "2.5 min", in at most 7 characters.
 
     None and infinity become "never". NaN, negative values and values of 1e9 s or more become "?".
     `finest` is the size of the smallest unit to use, s.

@@ -6,8 +6,8 @@ bytes in the same way as the MCU, and passes a line only if all of these conditi
 - The line has the complete format, no wheel exceeds `limits.wheel_speed`, and the checksum is
   correct if the line has one. With `link_check = "require"`, a line that moves a wheel must have a
   checksum.
-- No wheel is faster than in the last line sent, unless there is a fresh command, the link is up and
-  the mode is `driving` (rule 2 of `acsard/README.md`).
+- No wheel is faster than in the last line sent, and no wheel turns the other way, unless there is a
+  fresh command, the link is up and the mode is `driving` (rule 2 of `acsard/README.md`).
 - Without a link, all wheel speeds are zero.
 - All wheel speeds are zero if the robot has had enough time to brake to rest. This is the case if
   the last fresh command is older than the longest ramp to rest, or if a stop, a fault or a shutdown
@@ -39,9 +39,9 @@ HALTED = ("stopped", "fault", "shutdown")
 """Modes in which the robot brakes at the stop deceleration."""
 
 MARGIN_NS = 300_000_000
-"""Extra time, ns, in which the guard still passes lines that move a wheel after the computed end of
-a ramp to rest. This time equals the board's watchdog time: a board that receives no line for longer
-stops the motors by itself."""
+"""Extra time after the computed end of a ramp to rest, ns. During this time, the guard still passes
+lines that move a wheel. It equals the watchdog time of the board: a board that receives no line for
+longer stops the motors by itself."""
 
 
 class Memory(Struct, frozen=True):
@@ -53,7 +53,8 @@ class Memory(Struct, frozen=True):
     """Monotonic time, ns, of the last control step with a fresh command in mode `driving`. None
     before the first such step."""
     halted_ns: int | None = None
-    """Monotonic time at which the mode became one of `HALTED`, ns. None in any other mode."""
+    """Monotonic time at which the robot began to brake for a stop, a fault or a shutdown, ns. None
+    if the mode is not one of `HALTED`."""
     ramp_ns: int = 0
     """Duration of a ramp from full speed to rest, ns. If the limits have changed since the robot
     was last at rest, this is the longest duration under any of these limits."""
@@ -66,10 +67,10 @@ class Guard:
     """Checks each line to the board, and replaces a forbidden line with the stop line (zeros)."""
 
     def __init__(self, stop: bytes, config: Config, memory: Memory | None = None) -> None:
-        """Start with `memory`, or with an empty `Memory` if it is None.
+        """Start with the state `memory` of an earlier guard, or with an empty `Memory`.
 
         `stop` is the line that the guard sends instead of a forbidden line. It contains zeros and
-        no checksum, and an MCU obeys it in any state.
+        no checksum, and the board accepts it in any state of the link.
         """
         self._stop = stop
         memory = memory or Memory()
@@ -79,10 +80,11 @@ class Guard:
         self.use(config)
 
     def use(self, config: Config) -> None:
-        """Use `config` from now on.
+        """Use the configuration `config` from now on.
 
-        Until the robot is at rest, a ramp may take the longer of two times: the time under the old
-        limits and the time under the new ones. A moving robot may still brake by the old limits.
+        A moving robot may still brake by the old limits. So until the robot is at rest, the guard
+        allows the longer of two times for a ramp: the one by the old limits and the one by the new
+        limits.
         """
         self._require_check = config.mcu.link_check == "require"
         self._most = int(config.limits.wheel_speed * 100 + 1)
@@ -92,7 +94,7 @@ class Guard:
 
     @property
     def memory(self) -> Memory:
-        """The state with which another `Guard` can continue the checks of this one."""
+        """The state of this guard. A new `Guard` that gets it makes the same decisions."""
         return Memory(self._last, self._commanded_ns, self._halted_ns, *self._longest)
 
     def left(self, line: bytes) -> None:
@@ -182,9 +184,10 @@ class Guard:
 def _ramp_ns(config: Config, *, stop: bool) -> int:
     """Return the time that the robot needs to brake from its highest speed to rest, ns.
 
-    If `stop` is true, the stop decelerations apply. The result is the longer of the braking times
-    of the linear and the angular axis. Each axis starts at its speed limit, or at its speed with
-    all wheels at `limits.wheel_speed` if that is lower. The jerk limits do not affect braking.
+    If `stop` is true, the stop decelerations apply. The result is the longer of two braking times:
+    that of the linear and that of the angular speed. The highest speed is the limit in `[limits]`,
+    or the speed that the robot has with all wheels at `limits.wheel_speed`, whichever is lower. The
+    jerk limits do not affect braking.
     """
     limits, drive = config.limits, config.drive
     sides = drive.left_wheel_radius_multiplier + drive.right_wheel_radius_multiplier

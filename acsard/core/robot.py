@@ -64,20 +64,21 @@ from acsard.core.values import (
 )
 
 MAX_DT = 0.05
-"""One step accelerates the robot for at most this time, s, so that the speed does not jump after a
-stall of the process. If 1.5 control periods are longer than this, the bound is 1.5 periods."""
+"""Longest time between two lines for which a step accelerates the robot, s. If the process stalls
+for longer, the step ignores the rest of the time, so that the speed does not jump. If 1.5 control
+periods are longer than this constant, the limit is 1.5 periods."""
 
 UNHEARD_S = WATCHDOG_S - 0.05
-"""If no line was written to the port for this time, s, the next speeds start from rest, because the
-MCU has stopped the motors after `WATCHDOG_S`. The margin of 0.05 s allows for an MCU whose clock
-runs a little fast."""
+"""If no line was written to the port for this time, s, the next acceleration starts from rest. The
+reason is that the board stops the motors if it receives no line for `WATCHDOG_S`. The margin of
+0.05 s allows for a board whose clock runs a little fast."""
 
 REPORTS = {
     "estop": "its emergency stop",
     "bumpers": "its bumpers",
     "driver": "its motor drivers",
 }
-"""Maps each input of the board to the words that follow "wait until the board has reported"."""
+"""Words for each input of the board in the text "wait until the board has reported ..."."""
 
 HALTED = (Mode.STOPPED, Mode.FAULT, Mode.SHUTDOWN)
 """Modes in which the robot brakes at the stop deceleration."""
@@ -121,9 +122,9 @@ class Robot:
         self._choice = Choice()
         self._speeds = STILL
         self._computed = self._written = STILL
-        """Wheel speeds in two lines: `_computed` is for the last computed line, `_written` for the
-        last line that was written to the port. The wheels follow `_written`, even if the emergency
-        stop was pressed and the line of zeros could not be written yet."""
+        """Wheel speeds of two lines: `_computed` belongs to the last line that was computed, and
+        `_written` to the last line that was written to the port. The wheels still turn as in
+        `_written` if the emergency stop was pressed, but the line of zeros is not written yet."""
         self._made_of: tuple[int | None, Mode] | None = (None, self._life.mode)
         """The command and the mode for which the last line was computed. The command is represented
         by its arrival time, monotonic ns, or None without a command. After a press of the emergency
@@ -131,10 +132,10 @@ class Robot:
         self._made_ns = 0
         """Monotonic time at which the last line was computed, ns."""
         self._made = self._said = (self._limiter.state, 0)
-        """Two states of the limiter, each with its monotonic time, ns. `_made` belongs to the last
-        computed line, and `_said` to the last line written to the port. If a line was not written,
-        `_settle` sets `_made` back to `_said`. After a press of the emergency stop or a bumper, and
-        without a link, both are the state of a robot at rest."""
+        """Two pairs, each of a state of the limiter and its monotonic time, ns. `_made` belongs to
+        the last line that was computed, `_said` to the last line that was written to the port. If a
+        line was not written, `_settle` sets `_made` back to `_said`. While the link is not up, and
+        after a press of the emergency stop or a bumper, both are the state of a robot at rest."""
         self._status = ("", "", "", "")
         self._battery_level = ""
         """The level of the battery in the previous step, "" before the board's first report."""
@@ -152,15 +153,15 @@ class Robot:
         self._bumpers = Bumpers(config.safety)
         self._battery = Battery(config.battery, any(why.startswith(EMPTY) for why in causes))
         self._unreported = {name: why for why in causes if (name := _input(why))}
-        """Maps inputs of the board, as keys of `REPORTS`, to the causes of latches from before the
-        start of the daemon. A `clear` is refused until the board has reported each of these
-        inputs."""
+        """Inputs of the board that caused a latch before the daemon started, and that the board has
+        not reported since. The keys are those of `REPORTS`, and the values are the causes in words.
+        While an input is in this map, a `clear` is refused."""
         self._answered = UnansweredLines(config.mcu.reply_period)
         self._tally = EventThrottle()
         self._asked: tuple[str, str, int | None] = ("", "", None)
-        """Verb, client and arrival time of the last request. A call of `srv/stop` reaches the robot
-        as two requests: the first stops the robot, and the second leads to the reply. Because of
-        this value, only the first one is logged."""
+        """Verb, client and arrival time (monotonic, ns) of the last request. A call of `srv/stop`
+        reaches the robot as two requests: the first one stops the robot, and the second one leads
+        to the reply. With this value, the robot recognizes the second one, and does not log it."""
         self._told = CommandEvents(self._life.mode)
         self._port_trouble = ""
         self._linked_once = False
@@ -199,17 +200,22 @@ class Robot:
 
     @property
     def latches(self) -> Latches:
-        """The latches in force. They are valid even if an exception has interrupted a step."""
+        """The latches in force. The value is correct even after an exception in a step."""
         return self._life.latches
 
     @property
     def travelled(self) -> float:
-        """Distance driven since the daemon started, m, according to the odometry. Forward and
-        backward motion both add to it."""
+        """Distance driven since the daemon started, m, according to the odometry.
+
+        Forward and backward motion both add to it.
+        """
         return self._odometry.travelled
 
     def step(self, inputs: Inputs) -> Outputs:
-        """Process all inputs since the last step; return the line to send and all reports."""
+        """Process all inputs since the last step, and return the decisions of this step.
+
+        They include the line for the board, the odometry and the events to log.
+        """
         events = list(inputs.events)
         self._life.begin(inputs.now)
         if self._first_events:
@@ -338,9 +344,10 @@ class Robot:
         self._odometry.checks.wheels.forget()
 
     def _watch_inputs(self, now: Instant, events: list[Event]) -> None:
-        """React to the emergency stop, bumpers, driver fault and battery that the board reports.
+        """React to the board's reports of its emergency stop, bumpers, motor drivers and battery.
 
-        A press that began and ended since the last step still stops the robot.
+        The emergency stop or a bumper stops the robot even if it was pressed and released again
+        between two steps.
         """
         estop, bumpers, statuses = self._estop, self._bumpers, self.session.statuses
         events += estop.look(statuses, now.mono_ns)
@@ -382,10 +389,11 @@ class Robot:
         self._life.hold(*held, now.mono_ns)
 
     def _awaited_report(self) -> tuple[str, str]:
-        """Return a pair: why a latch from before the start cannot be cleared yet, and what to do.
+        """Return a pair of texts: why a latch cannot be cleared yet, and what a person must do.
 
-        The reason is the cause of the latch. It applies until the board has reported the input of
-        this cause. Both texts are "" if no latch waits for a report.
+        An input of the board may have caused a latch before the daemon started. Such a latch cannot
+        be cleared until the board has reported this input. The first text is the cause of the
+        latch. Both texts are "" if no latch waits for a report.
         """
         reported = {
             "estop": self._estop.use == "off" or bool(self._estop.state),
@@ -401,8 +409,9 @@ class Robot:
     def _keep_away(self, now_ns: int) -> None:
         """Reduce the chosen command to the part that leads away from the pressed bumpers.
 
-        If no part of the command does, each sender must send a zero again. Without this rule, the
-        robot would drive against the obstacle as soon as the bumper is released.
+        If no part of it leads away, the command is dropped, and each sender must send a zero before
+        it drives again. Without this rule, the robot would drive against the obstacle as soon as
+        the bumper is released.
         """
         twist = self._choice.twist
         if twist is None:
@@ -429,9 +438,9 @@ class Robot:
     def _plausible(self, line: Feedback, now: Instant, events: list[Event]) -> list[Feedback]:
         """Return the feedback lines that the odometry may use now, the oldest first.
 
-        An impossible `line` is rejected. If `line` covers a long time with a speed that nothing
-        else confirms, it is held back. It is returned together with the later line that confirms
-        it, or dropped if later lines contradict it.
+        An impossible `line` is rejected. A line after a long gap is kept for later if nothing else
+        confirms its speeds. It is returned together with the later line that confirms it, or
+        dropped if later lines contradict it.
         """
         why = self._sanity.impossible(line)
         if self._sanity.warning is not None:
@@ -616,7 +625,11 @@ class Robot:
     # Report.
 
     def _with_bumper(self, reason: str) -> str:
-        """Return `reason` with a note about the motion that the pressed bumpers still allow."""
+        """Return `reason` with a note that says in which direction the robot may still drive.
+
+        The pressed bumpers forbid the other directions. `reason` is the reason of the mode, in
+        words.
+        """
         match self._life.mode:
             case Mode.DRIVING:
                 return f"{reason}; {self._bumpers.note()}"
@@ -644,9 +657,9 @@ class Robot:
 
 
 def _input(why: str) -> str:
-    """Return the key in `REPORTS` of the input that caused a latch, "" if no input did.
+    """Return the input of the board that caused a latch, as a key of `REPORTS`.
 
-    `why` is the cause of the latch, in words.
+    `why` is the cause of the latch, in words. The result is "" if no input caused the latch.
     """
     if why in (PRESSED, SILENT):
         return "estop"

@@ -14,7 +14,8 @@ from itertools import islice
 from typing import NamedTuple
 
 MOST_BINS = 1500
-"""Maximum number of bins (time intervals) of a curve: two for each pixel of a picture's width."""
+"""Maximum number of bins (time intervals) of a curve. It is twice the width of a picture in
+pixels."""
 
 FIRST_WIDTH = 0.001
 """Bin width of a new curve, s. It is shorter than the interval between the robot's steps,
@@ -25,7 +26,8 @@ MOST_SPANS = 1500
 MOST_PLACES = 4000
 
 FIRST_STRIDE = 0.001
-"""Minimum distance between two kept places of a new path, m. It doubles when the path is full."""
+"""Minimum distance between consecutive kept places of a new path, m. It doubles when the path is
+full."""
 
 
 class Point(NamedTuple):
@@ -78,7 +80,11 @@ class Curve:
 
 
 def _merged(one: _Bin, other: _Bin) -> _Bin:
-    """Merge two bins. A gap between them would be too short to see, so it is dropped."""
+    """Merge two neighboring bins, of which `one` is the earlier.
+
+    A gap between the two bins would be too short to see, so it is dropped. A gap after `other`
+    stays.
+    """
     low = other.low if other.low.value < one.low.value else one.low
     high = other.high if other.high.value > one.high.value else one.high
     return _Bin(one.number, low, high, other.breaks)
@@ -118,15 +124,18 @@ class Band:
     def __init__(self, ranks: Sequence[str], most: int = MOST_SPANS) -> None:
         """Create an empty band.
 
-        `ranks` lists the kinds of state. Of two spans that are merged, the kind that comes first in
-        `ranks` is kept.
+        `ranks` lists the kinds of state from the most to the least important. If two spans are
+        merged, the result has the more important kind. At most `most` spans are kept.
         """
         self._rank = {kind: at for at, kind in enumerate(ranks)}
         self._most, self._least = most, FIRST_WIDTH
         self._spans: list[Span] = []
 
     def add(self, t: float, kind: str, words: str = "") -> None:
-        """Record that the state is `kind` from `t` s onward; "" means that there is no state."""
+        """Record that the state is `kind` from the time `t` on, s.
+
+        The kind "" means that there is no state. `words` is the reason of the state.
+        """
         spans = self._spans
         if spans:
             last = spans[-1] = spans[-1]._replace(end=max(t, spans[-1].end))
@@ -173,10 +182,10 @@ class Place(NamedTuple):
 
 
 class Track:
-    """A path that keeps only some of its places.
+    """A path that keeps only some of the places that are added to it.
 
-    Each place that was added is less than `2 * self.stride` m away from one that is kept, unless it
-    is too old.
+    A place that is not kept is less than `2 * self.stride` m away from one that is kept. Places
+    that are too old, and those before a jump, are dropped without this condition.
     """
 
     def __init__(
@@ -188,9 +197,10 @@ class Track:
     ) -> None:
         """Create an empty path.
 
-        At most `most` places are kept: when there are more, `stride` is doubled. A place that is
-        more than `lasts` s older than the newest one is dropped. The path restarts at a place that
-        is more than `jump` m away from the previous one.
+        The minimum distance between kept places is `stride` m at first. It is doubled when more
+        than `most` places would be kept. A place is dropped when it is more than `lasts` s
+        older than the newest one. All earlier places are dropped when a new place is more than
+        `jump` m away from the previous one.
         """
         self._most, self._lasts, self._jump = most, lasts, jump
         self._kept = deque[Place]()
@@ -212,7 +222,7 @@ class Track:
             self._kept = kept = self._wider(kept)
 
     def places(self) -> list[Place]:
-        """Return the kept places in order, then the newest place if it is not kept."""
+        """Return the kept places in the order of time. The newest place is always included."""
         last = self._last
         return [*self._kept, *([last] if last and last != self._kept[-1] else [])]
 

@@ -1,7 +1,7 @@
 """The value types that all modules share, in SI units and with the wheel order `WHEELS`.
 
-This module reads no clock, does no I/O and decides nothing. Types with `gc=False` are never part of
-a reference cycle.
+This module reads no clock, does no I/O and decides nothing. For speed, Python's garbage collector
+ignores the types with `gc=False`; they are never part of a reference cycle.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ class AcsardError(Exception):
 
 
 class Instant(Struct, frozen=True, gc=False):
-    """One moment, as two clocks show it.
+    """One moment, by the monotonic clock and by the wall clock, ns.
 
-    Ages and periods are computed from the monotonic clock. Stamps come from the wall clock.
+    Ages and periods are computed from `mono_ns`. The stamps of messages come from `wall_ns`.
     """
 
     mono_ns: int
@@ -95,7 +95,7 @@ class TwistVariances(Struct, frozen=True, gc=False):
 
 
 class Received(Struct, frozen=True):
-    """The bytes that one read of the serial port returned, and the time of the read."""
+    """The bytes that one read of the serial port returned, and the moment of this read."""
 
     at: Instant
     data: bytes
@@ -121,14 +121,15 @@ class Command(Struct, frozen=True):
     """Whether `twist` is zero only because the robot cannot make the requested motion, for example
     a motion along y. Such a command does not count as the zero that a sender must send first."""
     sequence: int | None = None
-    """Number that the sender gave to this command, or None. A gap in the numbers of a sender means
-    that commands were lost."""
+    """Number that the sender gave to this command; None if the sender does not number its commands.
+    A missing number means that a command was lost."""
     shared: bool = False
     """Whether several programs may have the same `sender`, because the command contains neither a
     sender id nor a GID. Then `sender` names only the Zenoh session that stamped the command, which
     may be the session of a router or a bridge, or only the key."""
     ros: bool = False
-    """Whether the command came from ROS. ROS tools do not send a zero command by themselves."""
+    """Whether the command came from ROS. Some ROS tools never send a zero. If such a tool must send
+    one, the text about the wait says so."""
     stamp_replaced: bool = False
     """Whether Zenoh replaced the stamp, because the sender's clock is ahead of the daemon's."""
     steady: bool = False
@@ -142,14 +143,17 @@ Plain = bool | int | float | str | list[float | str]
 
 
 class Request(Struct, frozen=True):
-    """A service call or a stop. `id` is the ticket of the query to answer, 0 without a query."""
+    """A service call, or a stop that was published on the bus.
+
+    `id` is the ticket of the query that the robot must answer; 0 for a stop that is no query.
+    """
 
     verb: Verb
     id: int = 0
     pose: Pose | None = None
     asked_ns: int | None = None
     """Monotonic time at which the request arrived, ns. None means the time of the control step that
-    serves the request. A `clear` needs this time, because it must not release a later stop."""
+    serves the request. A `clear` does not release a stop that came after this time."""
     by: str = ""
     """Name of the client that sent the request, as `core/incoming/commands.py` forms it."""
     settings: dict[str, Plain] = {}
@@ -167,10 +171,11 @@ class Answer(Struct, frozen=True):
 
 
 class Refusal(Struct, frozen=True):
-    """A message of a client that was refused.
+    """A client's message that was refused.
 
-    The robot counts it as `command_<reason>`, or as `commands_of_new_senders` for the reason
-    `unproven`. `source` and `sender` are "" if they are unknown.
+    `text` explains the refusal. The robot adds 1 to the counter `command_<reason>`, or to
+    `commands_of_new_senders` if the reason is `unproven`. `source` and `sender` are "" if they are
+    unknown.
     """
 
     reason: str
@@ -216,12 +221,13 @@ class Event(Struct, frozen=True):
     by: str = ""
     """Name of the client that caused the event, "" if no client did."""
     kind: str = ""
-    """A detail, such as the reason of a refusal. A log line that combines several events counts
-    them by kind."""
+    """A finer distinction than `name`, such as the reason of a refusal. A log line that combines
+    several events states the number of events of each kind."""
     count: int = 1
     """Number of occurrences that this event stands for."""
     news: bool = True
-    """False for an event that only repeats an earlier one. Its log line may be delayed."""
+    """False if the event only repeats an earlier one. The log line of such an event may be
+    delayed."""
 
 
 class Estimate(Struct, frozen=True, gc=False):
@@ -233,8 +239,8 @@ class Estimate(Struct, frozen=True, gc=False):
     covariance: PoseCovariance
     twist_variances: TwistVariances
     positions: tuple[float, float, float, float]
-    """Angle that each wheel has rolled since the daemon started, rad, in `WHEELS` order. Each full
-    revolution adds 2 pi."""
+    """Angle by which each wheel has turned since the daemon started, rad, in `WHEELS` order. The
+    angle is not wrapped: each full turn forward adds 2 pi."""
     speeds: WheelSpeeds
     asked_ns: int | None = None
     """Monotonic time at which the daemon wrote the line that the feedback answers, ns. None if the
@@ -262,12 +268,12 @@ class Wait(Struct, frozen=True):
         "senders",
     ]
     source: str = ""
-    """The source that the condition `what` is about; "" for each condition that is not listed here.
+    """The source that the condition `what` is about; "" if the condition is not in this list.
 
     - neutral: The waiting source, which must send a zero.
     - proof: The waiting source, which must show that its delays are steady.
     - late: The waiting source, whose commands arrive too late.
-    - stalled: The waiting source, which has sent no command since the daemon stood still.
+    - stalled: The waiting source, which has sent no command since the last host stall.
     - zeros: The source that controls the robot, but sends only zeros.
     - higher, equal: The source that controls the robot with a higher or an equal priority.
     """
@@ -281,13 +287,13 @@ class Wait(Struct, frozen=True):
     senders: int = 0
     """Number of senders that wait while the robot follows another sender of the same source."""
     lasts: float = 0.0
-    """How long the source has sent speeds without a zero (`neutral`) or only zeros (`zeros`), s.
-    The time is rounded down to one of a few values, so that the reason of the mode seldom changes.
-    It is 0 below the smallest of these values, and for other conditions."""
+    """Time for which the source has sent speeds without a zero (if `what` is `neutral`), or only
+    zeros (if `what` is `zeros`), s. It is rounded down to one of a few values, so that the text
+    about the wait seldom changes. It is 0 for a shorter time, and for all other conditions."""
     kept: str = ""
-    """Name of a source whose speeds have no effect, because `self.source` controls the robot and
-    sends only zeros; "" if there is no such source. If both senders belong to the same source, the
-    text is "another sender of NAME"."""
+    """Name of a source that sends speeds without effect, because `self.source` controls the robot
+    and sends only zeros. It is "another sender of NAME" if both senders belong to the source NAME,
+    and "" if no sender is kept from driving in this way."""
     ros: bool = False
     """Whether the sender that must send a zero uses ROS."""
     shared: bool = False
@@ -297,8 +303,9 @@ class Wait(Struct, frozen=True):
 class SourceStatus(Struct, frozen=True):
     """A command source.
 
-    `age_s` is the time since the last accepted command of the source. It is None if no command was
-    accepted since each sender was last required to send a zero, for example after a `clear`.
+    `age_s` is the time since the last accepted command of the source, s. Some events, such as the
+    start or a `clear`, require a zero from each sender. After such an event, the age is None until
+    the next command is accepted.
     """
 
     name: str
@@ -308,24 +315,27 @@ class SourceStatus(Struct, frozen=True):
 
 
 class WheelsStatus(Struct, frozen=True):
-    """Wheel faults, slip and slow wheels. If there are none, every field but `differ` is empty."""
+    """Wheel faults, slip and slow wheels.
+
+    If the checks find nothing wrong, all fields except `differ` are empty.
+    """
 
     text: str = ""
     """Description of the faults and the slip, "" if there are none."""
     left_out: tuple[str, ...] = ()
     """The names of the wheels that the odometry ignores."""
     slipping: tuple[str, ...] = ()
-    """Each side, `left` or `right`, whose wheels slip or slipped within the last half second."""
+    """The sides, `left` or `right`, whose wheels have slipped within the last half second."""
     differ: tuple[float, float] = (0.0, 0.0)
-    """Learned fraction by which the front wheel rolls farther than the rear wheel, for the left
-    side and for the right side. 0.01 means 1 % farther."""
+    """Learned difference between the front and the rear wheel, for the left and for the right side.
+    0.01 means that the front wheel rolls 1 % farther than the rear wheel."""
     slow: tuple[str, ...] = ()
-    """Wheels that are slower than commanded, each with its share of the expected speed, such as
-    "front_left 60%"."""
+    """A text for each wheel that is slower than commanded, such as "front_left 60%" if it reaches
+    60 % of the expected speed."""
 
 
 class RoutersStatus(Struct, frozen=True):
-    """The endpoints in `bus.connect`, by the state of the daemon's connection to each of them."""
+    """The endpoints in `bus.connect`: those that are connected, and those that are missing."""
 
     connected: tuple[str, ...] = ()
     missing: tuple[str, ...] = ()
@@ -357,8 +367,9 @@ GyroDoes = Literal[
 `disagrees`. `disagrees` means that the wheels slip."""
 
 TrackUse = Literal["shown", "uncertain", "too far off", "used"]
-"""Whether the odometry uses the effective track that it learned from a gyro, or why it does not.
-The effective track is the distance between left and right wheels that gives the true turn."""
+"""`used` if the odometry uses the effective track that it has learned from a gyro, else the reason
+why not. `shown` means that `odometry.learned_track` is false. The effective track is the
+distance between left and right wheels with which the computed turns are true."""
 
 
 class GyroStatus(Struct, frozen=True):
@@ -368,9 +379,9 @@ class GyroStatus(Struct, frozen=True):
     bias: float | None = None
     """Turn rate that the gyro reports at rest, rad/s."""
     delay: float = 0.0
-    """Delay of the gyro relative to the wheels, s."""
+    """Time by which the gyro reports a turn later than the wheels, s; negative if it is earlier."""
     track: float | None = None
-    """Learned effective track as a share of the configured one."""
+    """Learned effective track divided by the configured one."""
     track_deviation: float = 0.0
     """Relative standard deviation of `track`."""
     track_use: TrackUse = "shown"
@@ -382,9 +393,9 @@ the board no longer reports it, which counts as pressed."""
 
 
 BatteryLevel = Literal["ok", "warning", "return", "stop", "unknown"]
-"""The level of the battery by the thresholds in `[battery]`; "ok" if no threshold is set. `unknown`
-means that the board does not report the value that is compared with the thresholds (V or %), or has
-reported it only for a few seconds so far."""
+"""The level of the battery by the thresholds in `[battery]`; `ok` if no threshold is set. `unknown`
+means that the daemon cannot tell the level: the board does not report the value that the thresholds
+are for (voltage or charge), or has begun to report it only a few seconds ago."""
 
 
 class BatteryStatus(Struct, frozen=True, gc=False):
@@ -399,7 +410,8 @@ class BatteryStatus(Struct, frozen=True, gc=False):
     amps: float | None = None
     """Current, A. It is negative while the battery discharges."""
     mean: float | None = None
-    """Voltage (V) or charge (%), averaged over about 10 s, that is compared with the thresholds."""
+    """The value that is compared with the thresholds: the voltage (V) or the charge (%), averaged
+    over about 10 s."""
 
 
 class Latch(Struct, frozen=True):
@@ -407,8 +419,8 @@ class Latch(Struct, frozen=True):
 
     number: int
     """Identifies the latch, also after a restart. The number is the time at which the latch was
-    set, ms since 1970. It is larger if an earlier latch already has that number or a larger one.
-    JavaScript represents the number exactly."""
+    set, ms since 1970. If this time is not later than the number of an earlier latch, a larger
+    number is used, so that numbers always grow. JavaScript represents the number exactly."""
     at_ns: int
     """Wall-clock time at which the latch was set, ns since 1970."""
     by: str
@@ -418,8 +430,8 @@ class Latch(Struct, frozen=True):
     kept: bool = False
     """True if the latch was set before the daemon's last start."""
     earlier: tuple[Latch, ...] = ()
-    """The earlier causes of the same stop, the newest first. Each of them is a latch that a later
-    cause replaced. The field `earlier` of such a latch is empty."""
+    """The earlier causes of the same stop, the newest first. Each of them was a latch until a later
+    cause replaced it. In these latches, `earlier` is empty."""
 
     @property
     def causes(self) -> tuple[Latch, ...]:
@@ -427,12 +439,12 @@ class Latch(Struct, frozen=True):
         return (self, *self.earlier)
 
     def each(self, change: Callable[[Latch], Latch]) -> Latch:
-        """Return this latch with `change` applied to it and to each earlier cause."""
+        """Return a copy of this latch, with `change` applied to it and to each earlier cause."""
         return replace(change(self), earlier=tuple([change(cause) for cause in self.earlier]))
 
 
 class Latches(Struct, frozen=True):
-    """The latches and the lowered limits, which must survive every end of the daemon's process."""
+    """The latches and the lowered limits, which must be kept even if the process is killed."""
 
     stop: Latch | None = None
     fault: Latch | None = None
@@ -451,7 +463,7 @@ class Latches(Struct, frozen=True):
         return self.next or self.inactive
 
     def after_restart(self) -> Latches:
-        """Return these latches for the next start of the daemon, each marked as kept."""
+        """Return a copy for the next start of the daemon, in which each latch has `kept = True`."""
         stop, fault, inactive = (
             None if latch is None else latch.each(lambda cause: replace(cause, kept=True))
             for latch in (self.stop, self.fault, self.inactive)
@@ -462,9 +474,10 @@ class Latches(Struct, frozen=True):
 class Inputs(Struct, frozen=True):
     """The complete input of one control step.
 
-    If `tick` is true, the step computes the line of a control period. If `at_once` is true, the
-    step may compute an extra line for a new command or mode. `opened` is the number of times that
-    the serial port was opened: a new number means a new session with the board.
+    - tick: True if the step must compute the line of a control period.
+    - at_once: True if the step may compute an extra line for a new command or mode.
+    - opened: Number of times that the serial port was opened. If the number has grown, the step
+      begins a new session with the board.
     """
 
     now: Instant
@@ -480,9 +493,10 @@ class Inputs(Struct, frozen=True):
     refusals: tuple[Refusal, ...] = ()
     """The messages from the bus that were refused before they became a `Command`."""
     guard_trip: str = ""
-    """Why the guard replaced the last line with STOP, which latches a fault; "" if it did not."""
+    """Why the guard replaced the previous line with zeros, in words; "" if it did not. Such a
+    replacement latches a fault."""
     superseded: bool = False
-    """Whether the line of the previous step was not written to the port, and so had no effect."""
+    """True if the line of the previous step was not written to the port, so it had no effect."""
     missed: int = 0
     """Number of control periods without a step since the previous step."""
     events: tuple[Event, ...] = ()
@@ -491,8 +505,8 @@ class Inputs(Struct, frozen=True):
     shutting_down: bool = False
     """Whether the daemon is going down. The robot then ramps to zero and stays there."""
     late_ns: int = 0
-    """Time from the start of the previous step until its line was written, ns. A time below 1 ms
-    counts as 0. Longer times mean that the process has stalled."""
+    """Time from the start of the previous step until its line was written, ns. A time
+    below 1 ms is stored as 0. A longer time means that the process has stalled in between."""
 
 
 class Outputs(Struct, frozen=True):
@@ -510,23 +524,23 @@ class Outputs(Struct, frozen=True):
     estimates: tuple[Estimate, ...]
     mode: str
     reason: str
-    """Why the robot moves or does not, in words."""
+    """Why the robot moves, or why it does not move, in words."""
     link: str
     source: str
     """The source that the arbiter has selected, "" if it has selected none. The source may still
     have to send a zero, or a latch may keep the robot from driving."""
     command_ns: int | None
-    """Monotonic arrival time of the selected command, ns; None if no sender may drive."""
+    """Monotonic time at which the selected command arrived, ns; None if no command is selected."""
     status_changed: bool
     """Whether `mode`, `reason`, `link`, `source` or the battery's level changed in this step."""
     events: tuple[Event, ...] = ()
     answers: tuple[Answer, ...] = ()
     news: bool = False
-    """Whether there is a reason for an extra line: since the last computed line, the command or the
-    mode has changed, or the emergency stop or a bumper was pressed."""
+    """Whether an extra line is useful. This is true if the command or the mode has changed since
+    the last computed line, or if the emergency stop or a bumper was pressed."""
     latches: Latches = Latches()
-    """The latches in force after the step. A new object means that a latch or a lowered limit has
-    changed."""
+    """The latches and lowered limits after the step. If this is not the same object as in the
+    previous step, a latch or a lowered limit has changed."""
 
 
 class Spread(Struct, frozen=True):
@@ -539,7 +553,7 @@ class Spread(Struct, frozen=True):
 
 
 class Measured(Struct, frozen=True):
-    """Statistics of one latency of the daemon, in us."""
+    """Statistics, us, of one latency of the daemon, such as the time from a command to its line."""
 
     since_start: Spread = Spread()
     last_minute: Spread = Spread()
@@ -557,7 +571,7 @@ class Recording(Struct, frozen=True):
 
 
 class Snapshot(Struct, frozen=True):
-    """The values in the messages `state` and `diagnostics` that `Outputs` does not contain."""
+    """Values for the messages `state` and `diagnostics` that are not in `Outputs`."""
 
     pose: Pose
     measured: Twist | None  # None while the feedback is silent
@@ -567,8 +581,8 @@ class Snapshot(Struct, frozen=True):
     refused: str
     """The last command that was refused and the reason, "" before the first one."""
     refused_age_s: float | None = None
-    """Seconds since the last refused command, None before the first one. A command that is refused
-    only because its sender is new does not count."""
+    """Seconds since a command was last refused, None if none was refused yet. A command that is
+    refused only because its sender is new does not count."""
     feedback_age_s: float | None = None
     """Seconds since the last valid line of the board, None before the first one."""
     missed_last_minute: int = 0
@@ -579,23 +593,25 @@ class Snapshot(Struct, frozen=True):
     doubt: WheelsStatus = WheelsStatus()
     estop: EstopState = ""
     bumpers: tuple[bool, ...] | None = None
-    """Whether each bumper counts as pressed, in the order of the board; None if never reported."""
+    """Whether each bumper counts as pressed, in the order in the board's reports. None if the board
+    has never reported its bumpers."""
     bumper: str = ""
     """Why a bumper counts as pressed, in words; "" while none does."""
     battery: BatteryStatus | None = None
     """The battery, None if the board has never reported it."""
     board: dict[str, str] = {}
-    """The last value of each field of the board's status lines, as text, by name. `age_s` is the
-    age of the last status line, s. Empty if the board has sent no status line."""
+    """Maps the name of each field of the board's status lines to its last value, as text. The entry
+    `age_s` is the age of the last status line, s. The map is empty before the first status line."""
     check: str = "plain"
     """Whether the serial lines carry a checksum, in words, such as "plain" or "checked"."""
     encoders: tuple[int, ...] = ()
-    """Configured encoder counts per wheel revolution, in `WHEELS` order. 0 if none is configured,
-    or if the board does not compute its speeds as a whole number of counts divided by a time."""
+    """Configured encoder counts per wheel turn, in `WHEELS` order. All are 0 if no counts are
+    configured. They are also 0 if the reported speeds do not match the configured counts: each
+    speed should be an integer number of counts divided by a time."""
     sender: str = ""
     """The sender that the arbiter has selected, "" if it has selected none."""
     routers: RoutersStatus = RoutersStatus()
     recording: Recording = Recording()
     latch_file: str | None = None
-    """Why the latches would not survive a restart, in words; "" if they would. None if this daemon
-    has no latch file."""
+    """Why the latches would be lost if the daemon restarted now, in words. "" if they would be
+    kept; None if this daemon has no latch file."""

@@ -28,23 +28,24 @@ from acsard.core.config.wire_time import (
 from acsard.core.values import ROOT, WHEELS
 
 LEAST_WRAP_PERIODS = 2
-"""Shortest allowed time, in control periods, in which a wheel at full speed changes its encoder
-count by half of the count's range. After such a change the direction is ambiguous: a turn in the
-other direction gives the same count. With two periods, one lost line does no harm."""
+"""Smallest number of control periods in which a wheel at full speed may move its encoder count by
+half of the count's range. After half of the range, a turn in the other direction would give the
+same count, so the direction is ambiguous. With a minimum of two periods, one lost line does no
+harm."""
 
 FEW_COUNTS, FASTEST_HZ = 200, 100.0
-"""An encoder with fewer than `FEW_COUNTS` counts per turn gives a wrong pose if plain lines are
-sent at more than `FASTEST_HZ`. A board repeats its last speeds if it is asked again too soon, and
-the daemon cannot always tell a repeated count from a new one. With 16 to 96 counts, the simulated
-robot measured distances that were up to 20 % too short at 200 Hz and up to 29 % too long at 300
-Hz."""
+"""A warning says that the pose may be wrong if the encoders have fewer than `FEW_COUNTS` counts per
+turn and the control rate is above `FASTEST_HZ`. It is for boards that report speeds but no counts.
+Such a board repeats its last speeds if it is asked again too soon, and the daemon cannot always
+tell repeated speeds from new ones. With 16 to 96 counts, the simulated robot measured distances
+that were up to 20 % too short at 200 Hz and up to 29 % too long at 300 Hz."""
 
 MOST_VOLTS = 99.99
 """Highest voltage that a status line can express, V."""
 
 
 def warnings(config: Config) -> list[str]:
-    """Return a sentence about each setting that is allowed but has a surprising effect."""
+    """Return a list with a warning for each setting that is allowed but has a surprising effect."""
     found = []
     count = config.mcu.line_bytes
     use = wire_use(config.rate_hz, config.mcu.baud_rate, count)
@@ -126,7 +127,7 @@ def _count_warnings(config: Config) -> list[str]:
 
 
 def contradictions(config: Config) -> list[str]:
-    """Return the contradictions in a configuration, one line each."""
+    """Return an error line for each contradiction between keys of the configuration."""
     return mistakes(RULES, config)
 
 
@@ -148,9 +149,9 @@ def _wire_problems(config: Config) -> list[str]:
 
 
 def _shorter_lines(mcu: McuConfig, rate: float) -> str:
-    """Return the end of an error message that advises a setting which makes the lines shorter.
+    """Return advice for the end of an error message: which setting makes the serial lines shorter.
 
-    The result is "" if no setting makes the lines short enough for `rate`, Hz.
+    The result is "" if no setting makes them short enough for the control rate `rate`, Hz.
     """
     fixes = ((True, "mcu.encoder_counts = 0"), (False, 'mcu.link_check = "off"'))
     for check, fix in fixes:
@@ -161,7 +162,11 @@ def _shorter_lines(mcu: McuConfig, rate: float) -> str:
 
 
 def _count_problems(config: Config) -> list[str]:
-    """Find encoder counts that wrap so soon that forward motion could look like backward motion."""
+    """Return an error line if forward motion of a wheel could look like backward motion.
+
+    To prevent this, `mcu.encoder_counts` must be so low that at full speed a count does not change
+    by half of its range within `LEAST_WRAP_PERIODS` control periods.
+    """
     counts, fastest = config.mcu.encoder_counts, config.feedback.wheel_speed / math.tau
     lasts = LEAST_WRAP_PERIODS / config.rate_hz
     if fastest * counts * lasts <= FIELD / 2:
@@ -212,7 +217,12 @@ def _gyro_problems(config: Config) -> list[str]:
 
 
 def _battery_problems(config: Config) -> list[str]:
-    """Find battery thresholds in the wrong order, and levels that the battery can never leave."""
+    """Return an error line for each mistake in the battery thresholds.
+
+    A more severe level must have a lower threshold. A level ends when the value rises above its
+    threshold plus the hysteresis, so this sum must not exceed the highest value that a board can
+    report.
+    """
     battery, found = config.battery, []
     rows = [(f"battery.{level}_below", below) for level, below in battery.bounds.items()]
     for (name, below), (worse, lower) in pairwise(rows):
@@ -235,8 +245,8 @@ def _repeated(
 ) -> list[str]:
     """Return an error line for each name that repeats an earlier one.
 
-    `names` maps keys of the configuration to names. Two names count as the same if `part` returns
-    the same text for both.
+    `noun` says in the error what kind of name it is, such as "motor". `names` maps keys of the
+    configuration to names. Two names count as the same if `part` returns the same text for both.
     """
     first: dict[str, str] = {}
     found = []
@@ -273,7 +283,10 @@ def _bumper_problems(config: Config) -> list[str]:
 
 
 def _reachability_problems(config: Config) -> list[str]:
-    """Find settings with which no client at all, or no client over TLS, could reach the daemon."""
+    """Return an error line for each setting of `bus` that keeps clients from the daemon.
+
+    It would keep out either all clients, or all clients that connect over TLS.
+    """
     bus, found = config.bus, []
     if bus.mode == "client" and not bus.connect:
         found.append(
@@ -320,14 +333,17 @@ def _endpoint_problems(config: Config, key: str) -> list[str]:
 
 
 def _listen_twice_problems(config: Config) -> list[str]:
-    """Find a host and port at which the daemon or its TLS gateway would listen twice."""
+    """Return an error line for each entry of `bus.listen` that repeats a host and port."""
     listen = _endpoints(config.bus).get("listen", ())
     names = {f"bus.listen[{i}]": endpoint for i, endpoint in enumerate(listen)}
     return _repeated("host and port", names, lambda endpoint: endpoint.partition("/")[2])
 
 
 def _page_problems(config: Config) -> list[str]:
-    """Find addresses at which the page would not start, as `acsard/web/listen.py` decides."""
+    """Return an error line for each entry of `web.address` at which the page could not start.
+
+    `acsard/web/listen.py` applies the same rules when the page starts.
+    """
     addresses, found = config.web.address, []
     for address in addresses:
         where = f"web.address = {show(address)}"
@@ -369,7 +385,10 @@ def _ros_problems(config: Config) -> list[str]:
 
 
 def _endpoints(bus: BusConfig) -> dict[str, tuple[str, ...]]:
-    """Return the endpoints in use, by key. `bus.listen` is not used if `bus.mode` is "client"."""
+    """Return the endpoints in use under "listen" and "connect", as in the table `[bus]`.
+
+    The result has no "listen" if `bus.mode` is "client", because a client listens at no endpoint.
+    """
     listen = {"listen": bus.listen} if bus.mode == "peer" else {}
     return listen | {"connect": bus.connect}
 
@@ -424,5 +443,5 @@ RULES: tuple[Rule, ...] = (
     _ros_problems,
     *named_faults.RULES,
 )
-"""All rules about combinations of keys. A rule that reads an invalid key is skipped as a whole.
-Therefore each rule checks one thing and reads only a few keys."""
+"""All rules about combinations of keys. A rule that reads an invalid key is skipped, and then finds
+nothing at all. Therefore each rule checks one thing and reads only a few keys."""

@@ -25,11 +25,13 @@ WHEN: dict[When, str] = {
     "raised": "raised at any time, lowered only while the robot stands",
     "rest": "only while the robot stands",
 }
-"""When a setting may change, in words. The reasons for the restrictions are:
+"""Maps each `When` to words that say when such a setting may change.
 
-- "raised": With a lower deceleration, a robot that drives could not stop in time.
-- "rest": A lower `limits.wheel_speed` reduces the speed without a ramp. After a change in
-  `commands`, each sender must send a zero before it drives.
+- "always": The change is safe at any time.
+- "raised": The setting is a deceleration. If it were lowered while the robot drives, the robot
+  could not stop in time.
+- "rest": Lowering `limits.wheel_speed` reduces the speed without a ramp. After a change in
+  `commands`, no sender drives the robot until it has sent a zero.
 """
 
 
@@ -91,8 +93,9 @@ LIVE: dict[str, Live] = {
     "rates.diagnostics": Live("always", "how often the message diagnostics is published"),
     "log.level": Live("always", "lowest level of the events that are logged"),
 }
-"""The settings that may change while the daemon runs, by their dotted keys in `acsard.toml`. A key
-of a command source contains the name of the source, not its index; "*" stands for any name."""
+"""The settings that may change while the daemon runs, by their dotted keys in `acsard.toml`. In the
+key of a command source, "*" stands for the name of the source, as in `commands.sources.*.timeout`.
+"""
 
 SECTIONS: dict[str, type[Struct]] = {field.name: field.type for field in fields(Config)}
 
@@ -135,7 +138,10 @@ class Difference(Struct, frozen=True):
     """Value in the file."""
 
     def words(self, key: str) -> str:
-        """Return a text with the setting's key and both values."""
+        """Return a text with both values of the setting: `log.level = "info", not "debug"`.
+
+        `key` is the dotted key of the setting.
+        """
         # A command source may be in only one of the two configurations. Its keys have no value in
         # the other one.
         its, ours = ("absent" if one is None else show(one) for one in (self.its, self.ours))
@@ -143,7 +149,10 @@ class Difference(Struct, frozen=True):
 
 
 def differences(runs: Config, file: Config) -> dict[str, Difference]:
-    """Return the settings that differ between `runs`, which is in force, and `file`, by key."""
+    """Return the settings in which two configurations differ, by dotted key.
+
+    `runs` is the configuration in force. `file` is the one in the configuration file.
+    """
     its, ours = dict(flat(effective(runs))), dict(flat(effective(file)))
     return {
         key: Difference(its.get(key), ours.get(key))
@@ -153,11 +162,11 @@ def differences(runs: Config, file: Config) -> dict[str, Difference]:
 
 
 def changed(config: Config, wishes: Mapping[str, object], at_rest: bool) -> tuple[Config, str]:
-    """Return a pair: the configuration with the requested settings, and the changes in words.
+    """Return a pair: `config` with the requested settings, and a text that lists the changes.
 
-    `wishes` contains the requested values by dotted key. `at_rest` says whether the robot stands. A
-    setting that already has the requested value is neither changed nor refused. The text is "" if
-    nothing changes.
+    `wishes` contains the requested values by dotted key. `at_rest` says whether the robot stands,
+    because some settings may change only then. A setting that already has the requested value is
+    left out, even if it may not change. The text is "" if nothing changes.
 
     Raises:
         ConfigError: the change is not allowed, so no setting is changed. The error says why.
@@ -214,7 +223,10 @@ def _put(tables: dict[str, Any], path: list[str], value: object) -> None:
 
 
 def _must_stand(key: str, before: object, after: object) -> str:
-    """Return why this change must wait until the robot stands, or "" if it need not wait."""
+    """Return an error line if a setting may change only while the robot stands, else "".
+
+    `key` is the dotted key of the setting. `before` and `after` are its values.
+    """
     row = live(key)
     if row is None or row.when == "always":
         return ""

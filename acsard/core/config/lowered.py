@@ -24,7 +24,10 @@ def stays(key: str) -> bool:
 
 
 def lowered(file: LimitsConfig, now: LimitsConfig) -> dict[str, float]:
-    """Return the limits that are lower in `now` than in `file`: values in `now` by dotted key."""
+    """Return the limits that are lower now than in the configuration file.
+
+    The result contains their values in `now` by dotted key. Decelerations are left out.
+    """
     return {
         TABLE + name: getattr(now, name)
         for name in file.__struct_fields__
@@ -34,12 +37,12 @@ def lowered(file: LimitsConfig, now: LimitsConfig) -> dict[str, float]:
 
 
 def with_lowered(config: Config, kept: Mapping[str, float]) -> tuple[Config, list[Event]]:
-    """Apply the limits that were lowered before the restart to `config`, which is from the file.
+    """Return a pair: `config` with the lowered limits, and events that report what was applied.
 
-    Return a pair: the new configuration, and the events that report applied and dropped limits.
-    `kept` contains the lowered limits by dotted key. A limit is applied only if it is below the
-    value in `config`. The file may have changed since the limits were lowered. If it contradicts
-    them, they are applied one at a time, and each limit that contradicts it is dropped.
+    `config` is the content of the configuration file. `kept` contains the limits that were lowered
+    before the restart, by dotted key. A limit is applied only if it is below the value in `config`.
+    The file may have changed since, so the limits together may contradict it. They are then applied
+    one at a time: each limit that causes a contradiction is dropped, and an event says so.
     """
     limits = config.limits
     wishes: dict[str, object] = {
@@ -74,5 +77,9 @@ def _applied(config: Config, wishes: Mapping[str, object]) -> tuple[Config, list
 
 
 def _rank(name: str, value: float) -> float:
-    """Return a number to compare values of a limit: a larger number means that more is allowed."""
+    """Return a number by which two values of the limit `name` can be compared.
+
+    The larger number belongs to the value that allows more motion. For a jerk limit of 0, which
+    means "no limit", the number is infinity. Any other value is returned as it is.
+    """
     return math.inf if name.endswith("_jerk") and value == 0.0 else value

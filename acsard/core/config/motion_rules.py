@@ -14,17 +14,19 @@ from acsard.core.config.partial import Rule, mistakes
 from acsard.core.config.settings import LONGEST_REPLY_S, Config
 
 LEAST_JERK = 0.01
-"""Smallest allowed jerk limit, m/s3 or rad/s3. With less, reaching walking pace takes over 10 s."""
+"""Smallest allowed jerk limit, m/s3 or rad/s3. With a lower limit, the robot would need more than
+10 s to reach walking pace."""
 
 LONGEST_STOP_S = 2.0
-"""Longest allowed time from full speed to rest after a stop, s. No person should wait longer."""
+"""Longest time, s, that the robot may take to brake from full speed to rest when it is stopped. No
+person should have to wait longer."""
 
 LONGEST_RAMP_S = 5.0
-"""Longest allowed time from full speed to rest after the commands end, s. During this ramp, no
-sender controls the robot."""
+"""Longest time, s, that the robot may take to brake from full speed to rest when commands no longer
+arrive. During this ramp, no sender controls the robot."""
 
 HEADROOM = 1.1
-"""Factor by which a healthy wheel may exceed its commanded speed for a moment."""
+"""Ratio of the speed that a sound wheel may reach for a moment to its commanded speed."""
 
 MOST_WHEEL_SPEED = 99.99
 """Highest wheel speed that a line to the board can express, rad/s."""
@@ -93,9 +95,9 @@ def _jerk_problems(config: Config, name: str) -> list[str]:
 
 
 def _feedback_problems(config: Config, asked: float) -> list[str]:
-    """Find a `feedback.wheel_speed` that a sound wheel would exceed when it obeys a command.
+    """Return an error line if `feedback.wheel_speed` is so low that a sound wheel could exceed it.
 
-    `asked` is the highest wheel speed that the limits allow, rad/s.
+    `asked` is the highest wheel speed that a command can request within the limits, rad/s.
     """
     most = config.feedback.wheel_speed
     needed = min(_rounded_up(HEADROOM * asked), MOST_WHEEL_SPEED)
@@ -109,7 +111,10 @@ def _feedback_problems(config: Config, asked: float) -> list[str]:
 
 
 def _reply_problems(config: Config) -> list[str]:
-    """Find an `mcu.reply_period` with which a single lost line would look like a fault."""
+    """Return an error line if `mcu.reply_period` is too long.
+
+    With such a period, one lost line would look like a wheel fault.
+    """
     period, fault_s = config.mcu.reply_period, config.feedback.fault_time
     most = longest_reply(fault_s)
     if period <= most:
@@ -131,7 +136,10 @@ def longest_reply(fault_s: float) -> float:
 
 
 def _rounded_up(value: float) -> float:
-    """Return a value rounded up to three decimals, because messages suggest it as a minimum."""
+    """Return a value rounded up to three decimals.
+
+    Error messages advise to write at least this value, so it must not be rounded down.
+    """
     return math.ceil(round(value * 1000, 6)) / 1000
 
 
@@ -146,5 +154,5 @@ RULES: tuple[Rule, ...] = (
 
 
 def problems(config: Config) -> list[str]:
-    """Return the contradictions between the settings that concern motion, one line each."""
+    """Return an error line for each contradiction between the settings that concern motion."""
     return mistakes(RULES, config)

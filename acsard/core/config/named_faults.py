@@ -33,8 +33,8 @@ ARGUMENTS = {
     "bumper_pressed": "nnn", "bumpers_silent": "nn", "driver_fault": "nn",
     "battery": "nn",
 }  # fmt: skip
-"""The simulator's faults with arguments, each with the kinds of its arguments. `m` is a motor,
-written as a to d and stored as 0 to 3. `n` is a number."""
+"""Maps each fault that takes arguments to one letter for each argument: `m` for a motor and `n` for
+a number. A user writes a motor as a to d; it is stored as 0 to 3."""
 
 INPUTS = ("estop_pressed", "estop_silent", "bumper_pressed", "bumpers_silent", "driver_fault")
 """Faults whose last two arguments are the time from the start of the simulator to the beginning of
@@ -47,7 +47,8 @@ timer, so only `acsard sim --fault` offers it."""
 MOTORS = "abcd"
 
 MOST = 1e6
-"""Largest absolute value of a number in an argument, so that sums do not overflow."""
+"""Largest absolute value of a number that a fault takes as an argument. The limit prevents an
+overflow in the simulator."""
 
 SHORTEST_S = 0.001
 """Shortest duration of the fault `stalls`, s. A shorter one has no visible effect."""
@@ -109,7 +110,10 @@ def named(text: str) -> NamedFault:
 
 
 def warnings(config: Config) -> list[str]:
-    """Return a warning if the simulator has faults: a user could take them for real ones."""
+    """Return a warning if the configuration gives the simulator faults, else an empty list.
+
+    Without the warning, a user could take a simulated fault for a real one.
+    """
     faults = config.sim.faults
     if not faults or not config.mcu.simulated:
         return []

@@ -6,8 +6,8 @@ import difflib
 from collections.abc import Iterable
 
 LONGEST = 80
-"""Largest number of characters of a mistyped word that `nearest` compares with the known words. The
-limit bounds the time for a very long word."""
+"""Number of characters of a mistyped word that `nearest` compares; it ignores the rest. So even a
+very long word takes only a short time."""
 
 
 def nearest(word: str, known: Iterable[str]) -> list[str]:

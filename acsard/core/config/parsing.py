@@ -13,7 +13,8 @@ from acsard.core.config.validation import build_partly
 from acsard.core.values import AcsardError
 
 MAX_BYTES = 65536
-"""Largest size of a configuration, bytes. The reference file has about a third of this size."""
+"""Largest size of a configuration file, bytes. The `acsard.toml` in the repository has about a
+third of this size."""
 
 
 class ConfigError(AcsardError):

@@ -23,7 +23,10 @@ def view_without(config: Config, invalid: Set[str]) -> Config:
 
 
 def mistakes(rules: Iterable[Rule], config: Config) -> list[str]:
-    """Return the mistakes that the rules find. A rule that reads an invalid key is skipped."""
+    """Return the mistakes that all `rules` find in `config`, one line each.
+
+    A rule is skipped if it reads a key that has no valid value.
+    """
     found: list[str] = []
     for rule in rules:
         try:
@@ -34,7 +37,11 @@ def mistakes(rules: Iterable[Rule], config: Config) -> list[str]:
 
 
 class _View:
-    """A view of one table. `path` is its dotted name plus a dot, or "" for the whole document."""
+    """A view of one table, from which an invalid key cannot be read.
+
+    `path` is the dotted name of the table plus a dot, or "" for the whole document. `invalid`
+    contains the dotted keys whose reading raises `InvalidKeyError`.
+    """
 
     def __init__(self, table: object, path: str, invalid: Set[str]) -> None:
         self._table, self._path, self._invalid = table, path, invalid

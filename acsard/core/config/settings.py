@@ -147,8 +147,9 @@ SIMULATOR = "sim"
 """Port name that selects the built-in simulator."""
 
 LONGEST_REPLY_S = 0.25
-"""Longest allowed time between two feedback lines, s. A board that is silent for one second counts
-as restarted. With this time between lines, two lost lines in a row are not such a silence."""
+"""Largest allowed interval between two feedback lines, s. A board that is silent for one second
+counts as restarted. At this interval, even two lost lines in a row make a silence of only 0.75 s.
+"""
 
 
 class McuConfig(Struct, frozen=True):
@@ -240,7 +241,7 @@ class BatteryConfig(Struct, frozen=True):
 
     @property
     def bounds(self) -> dict[BatteryLevel, float]:
-        """Battery thresholds that are set, V or %, by level. The most severe level is the last."""
+        """Threshold, V or %, of each level that has one; the most severe level is the last."""
         found: dict[BatteryLevel, float] = {
             "warning": self.warning_below,
             "return": self.return_below,
@@ -342,12 +343,18 @@ class BusConfig(Struct, frozen=True):
 
     @property
     def plain(self) -> tuple[str, ...]:
-        """Endpoints without TLS, at which the daemon listens; empty if `mode` is "client"."""
+        """The endpoints in `listen` without TLS. The daemon listens at them.
+
+        Empty if `mode` is "client".
+        """
         return tuple(e for e in self.listen if not e.startswith(TLS)) if self._peer else ()
 
     @property
     def outside(self) -> tuple[str, ...]:
-        """Endpoints with TLS, at which the TLS gateway listens; empty if `mode` is "client"."""
+        """The endpoints in `listen` with TLS. The TLS gateway listens at them.
+
+        Empty if `mode` is "client".
+        """
         return tuple(e for e in self.listen if e.startswith(TLS)) if self._peer else ()
 
     @property
@@ -445,8 +452,11 @@ class Config(Struct, frozen=True):
 
     @property
     def rate_hz(self) -> float:
-        """Control rate, Hz. `"auto"` means the rate that uses 80 % of the serial wire, but at most
-        100 Hz."""
+        """Control rate, Hz.
+
+        For `"auto"`, it is the rate at which the lines use 80 % of the capacity of the serial wire,
+        but at most 100 Hz.
+        """
         if self.control.rate != "auto":
             return float(self.control.rate)
         mcu = self.mcu

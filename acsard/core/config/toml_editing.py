@@ -59,7 +59,11 @@ def _changed(text: str, keys: Mapping[str, object]) -> str:
 
 
 def _adjusted(array: object, value: object) -> bool:
-    """Change a list in place, so that its comments stay. Return False if that is not possible."""
+    """Change the TOML list `array` to `value` without losing its comments, and return True.
+
+    Return False if that is not possible. In this case the list may be changed in part, so the
+    caller must replace it.
+    """
     from tomlkit.items import Array
 
     if not (isinstance(array, Array) and isinstance(value, list | tuple)):
@@ -75,10 +79,11 @@ def _adjusted(array: object, value: object) -> bool:
 
 
 def _dotted(text: str, keys: Mapping[str, object]) -> tuple[str, dict[str, object]]:
-    """Insert new settings into tables that the text writes as dotted keys, like `mcu.port = ...`.
+    """Insert each new key whose table is written as dotted keys, such as `mcu.port = ...`.
 
-    tomlkit would insert a table header in the middle of the dotted keys. Return a pair: the new
-    text, and the settings that still have to be changed.
+    tomlkit cannot do this: it would insert a table header between the dotted keys. `keys` maps
+    dotted keys to the new values. Return a pair: the new text, and the entries of `keys` that the
+    caller must still put into the text.
     """
     import tomlkit
 

@@ -8,7 +8,10 @@ from acsard.core.config.validation import write
 
 
 def document(table: dict[str, object], path: str = "") -> list[str]:
-    """Return the lines of a TOML document, plain keys first. `path` is the table's dotted name."""
+    """Return the lines of a TOML document for `table`, with its nested tables after its own keys.
+
+    `path` is the dotted name of `table`, "" for the whole document.
+    """
     lines: list[str] = []
     tables: list[str] = []
     for key, value in table.items():
@@ -24,7 +27,10 @@ def document(table: dict[str, object], path: str = "") -> list[str]:
 
 
 def excerpt(keys: Mapping[str, object]) -> list[str]:
-    """Return the TOML lines of settings that are given by dotted key, with a header per table."""
+    """Return the TOML lines for some settings, with a header line for each table.
+
+    `keys` maps the dotted keys of the settings to their values.
+    """
     lines: list[str] = []
     table = ""
     for key, value in sorted(keys.items(), key=lambda item: item[0].count(".")):

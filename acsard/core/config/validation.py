@@ -19,7 +19,7 @@ _BARE_KEY = re.compile(r"[A-Za-z0-9_-]{1,80}")
 
 
 def build(cls: type[T], table: object, path: str, problems: list[str]) -> T | None:
-    """Return `table` as a struct, or None if it has a mistake.
+    """Return `table` as a struct of the type `cls`, or None if it has a mistake.
 
     `path` is the dotted name of the table, "" for the whole document. The function appends a line
     to `problems` for each mistake.
@@ -32,10 +32,12 @@ def build(cls: type[T], table: object, path: str, problems: list[str]) -> T | No
 def build_partly(
     cls: type[T], table: object, path: str, problems: list[str], invalid: set[str]
 ) -> T | None:
-    """Return `table` as a struct, with the default in place of each invalid value.
+    """Return `table` as a struct of the type `cls`, with the default in place of an invalid value.
 
-    Returns None if a required key has no valid value. The function adds the dotted key of each
-    invalid value to `invalid`. The other arguments are those of `build`.
+    Returns None if a required key has no valid value. `path` is the dotted name of the table, ""
+    for the whole document. The function appends a line to `problems` for each mistake. It adds to
+    `invalid` the dotted key of each invalid value, and the known key most similar to each unknown
+    key, because the user may have meant that key.
     """
     if not isinstance(table, Mapping):
         header = f"[[{path.partition('[')[0]}]]" if path.endswith("]") else f"[{path}]"
@@ -92,7 +94,10 @@ def _value(
 
 
 def finite(raw: object) -> bool:
-    """Return whether all numbers are finite. TOML allows inf and nan, and msgspec accepts them."""
+    """Return whether a TOML value, or each item of a list, is neither infinite nor NaN.
+
+    This check is necessary because TOML allows inf and nan, and msgspec accepts them.
+    """
     if isinstance(raw, list):
         return all(finite(item) for item in raw)
     return not isinstance(raw, float) or math.isfinite(raw)
@@ -106,7 +111,7 @@ def _unknown(key: str, value: object, path: str, near: list[str], known: list[st
 
 
 def expected(kind: inspect.Type) -> str:
-    """Return a description of the valid values of a type, with range and unit."""
+    """Return a description of the valid values of a type, such as "a number from 0 to 10 m/s"."""
     unit = ""
     if isinstance(kind, inspect.Metadata):
         unit = str((kind.extra or {}).get("unit", ""))
@@ -133,7 +138,10 @@ def expected(kind: inspect.Type) -> str:
 
 
 def _entries(least: int | None, most: int | None) -> str:
-    """Return the allowed number of entries of a list, with a space in front; "" without a limit."""
+    """Return words such as " of 1 to 4 entries" for the allowed length of a list.
+
+    They begin with a space. The result is "" if any length is allowed.
+    """
     if most is None:
         return "" if least is None else f" of {least} or more entries"
     return f" of at most {most} entries" if least is None else f" of {least} to {most} entries"
@@ -152,7 +160,7 @@ def _example(field: FieldInfo) -> str:
 
 
 def show(value: object) -> str:
-    """Return a value as TOML, cut to 80 characters."""
+    """Return a value as TOML, shortened to 80 characters if it is longer."""
     text = write(value)
     return text if len(text) <= 80 else text[:77] + "..."
 

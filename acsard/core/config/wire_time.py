@@ -28,31 +28,39 @@ FIELD = 65536
 FFFF is 0."""
 
 COMFORTABLE_USE = 0.8
-"""Largest advisable use of the wire, as a share of its capacity. If more is used, a slightly late
-line delays the next one. The other 20 % also have room for a space after each comma, which makes a
-line 36 bytes long instead of 33."""
+"""Largest advisable use of the serial wire, as a fraction of its capacity. If the lines use more,
+one line that is slightly late delays the next one. The remaining 20 % also suffice for a board that
+writes a space after each comma, so that its lines have 36 bytes instead of 33."""
 
 
 def wire_ns(count: int, baud_rate: int) -> int:
-    """Return the time that `count` bytes occupy the wire, in ns."""
+    """Return the time in ns that the serial wire needs to transmit `count` bytes."""
     return count * BITS_PER_BYTE * NS_PER_S // baud_rate
 
 
 def line_bytes(trailing_comma: bool, check: bool = False, sample: bool = False) -> int:
-    """Return the length of a command or of its reply, whichever is longer, bytes.
+    """Return the length in bytes of a command line or of its reply, whichever is longer.
 
-    Each direction has its own wire, so only the longer line limits the rate. `check` adds a
-    sequence number and a checksum. `sample` adds the sample fields.
+    Each direction has its own wire, so only the longer line limits the rate. `trailing_comma` adds
+    a comma after the last wheel speed, `check` a sequence number and a checksum. `sample` adds the
+    sample fields to the reply, and one letter to the command.
     """
     checked = PLAIN_BYTES + (CHECK_BYTES if check else 0)
     return max(checked + trailing_comma + sample, checked + (SAMPLE_BYTES if sample else 0))
 
 
 def wire_use(rate_hz: float, baud_rate: int, count: int) -> float:
-    """Return the used share of the wire's capacity. `count` is the length of a line, bytes."""
+    """Return the fraction of the wire's capacity that lines use; above 1 they do not fit.
+
+    `count` is the length of each line, bytes.
+    """
     return count * BITS_PER_BYTE * rate_hz / baud_rate
 
 
 def highest_rate(baud_rate: int, count: int, use: float = 1.0) -> int:
-    """Return the rate, Hz, at which lines of `count` bytes use the share `use` of the wire."""
+    """Return the highest rate in Hz, rounded down, at which lines fit into a part of the wire.
+
+    `count` is the length of each line, bytes. `use` is the fraction of the wire's capacity that the
+    lines may use.
+    """
     return int(use * baud_rate / (count * BITS_PER_BYTE))

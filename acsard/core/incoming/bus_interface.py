@@ -27,9 +27,9 @@ class BusInput(Struct, frozen=True):
     dropped: int = 0
     """Number of published messages that were dropped because the bus did not send them in time."""
     stuck: bool = False
-    """True only in the first `BusInput` after a send on the bus has begun to block."""
+    """True if a send on the bus has begun to block since the previous `BusInput`."""
     routers: RoutersStatus | None = None
-    """The connections to the endpoints in `bus.connect` if they have changed, else None."""
+    """State of the connections to the endpoints in `bus.connect`; None if it has not changed."""
 
 
 NOTHING = BusInput()
@@ -53,11 +53,11 @@ class Bus(Protocol):
         """Keys that the daemon publishes and that have a subscriber."""
 
     def take(self, queries: int) -> BusInput:
-        """Return the input since the last call, with at most `queries` + 1 queries.
+        """Return the input from the bus since the last call.
 
-        Service calls come first, at most `queries` of them. Then comes one slow query (ROS
-        parameters or a `set`), even if `queries` is reached. Other queries follow until `queries`
-        is reached. The remaining queries wait for the next call.
+        The argument `queries` limits the number of queries in the result. Service calls come first.
+        Then comes one slow query (ROS parameters or a `set`), even if the limit is reached already.
+        Other queries follow until the limit is reached. The rest waits for the next call.
         """
 
     def publish(self, key: str, message: Message) -> None:
@@ -79,19 +79,20 @@ _decoder = Decoder(GatewayState)
 
 
 class GatewayFollower:
-    """Counts the starts of the TLS gateway, and the checks that found all connections in use.
+    """Counts two facts about the TLS gateway since the start of the daemon, from its reports.
 
-    The gateway reports its own count of such checks, which begins at 0 after each start.
+    They are the number of its starts, and how often it found all its connections in use. The
+    gateway reports its own count of the latter, which begins at 0 after each start of the gateway.
     """
 
     def __init__(self) -> None:
         self._last = GatewayState(0, 0, 0)
 
     def receive(self, arrival: Arrival, counters: MutableMapping[str, int]) -> int | None:
-        """Add the new counts in a report to `counters`. An invalid report is ignored.
+        """Decode the gateway's report in a sample, and add what is new in it to `counters`.
 
-        Returns the earliest expiry of the TLS certificates, wall-clock ns since 1970, or None if it
-        is unknown.
+        Returns the time at which the first of the TLS certificates expires, wall-clock ns since
+        1970. Returns None if this time is unknown, or if the report is invalid and thus ignored.
         """
         try:
             report = _decoder.decode(arrival.encoding, arrival.payload)
@@ -115,7 +116,7 @@ PEER = (
 
 
 class RouterFollower:
-    """Reports changes of the connections to the endpoints in `bus.connect`."""
+    """Logs when the connection to an endpoint in `bus.connect` is made or lost."""
 
     def __init__(self) -> None:
         self.status = RoutersStatus()
@@ -123,7 +124,11 @@ class RouterFollower:
     def receive(
         self, status: RoutersStatus, counters: MutableMapping[str, int], events: list[Event]
     ) -> None:
-        """Store the present status. For each change, add to `counters` and `events`."""
+        """Store the present status, and compare it with the previous one.
+
+        Each kind of change adds an event to `events`. Each lost connection is also counted in
+        `counters`.
+        """
         before, self.status = self.status, status
         lost = [endpoint for endpoint in status.missing if endpoint not in before.missing]
         made = [endpoint for endpoint in status.connected if endpoint not in before.connected]

@@ -39,32 +39,35 @@ from acsard.core.values import NS_PER_S, REST, Command, Pose, Request, Verb, Whe
 from acsard.core.values import Twist as BodyTwist
 
 BOUND_NS = 60 * NS_PER_S
-"""Time without commands after which a sender id may be used with another certificate, ns. For
-example, a program with a fixed id may move from the robot to a laptop."""
+"""A sender id may be used with another certificate if no command with the id has arrived for this
+time, ns. For example, a program with a fixed id may move from the robot to a laptop."""
 
 MAX_BOUND = 1024
-"""Largest number of senders to remember. The sender with the oldest command is forgotten first."""
+"""Largest number of sender ids for which the daemon remembers the certificate. It first forgets the
+sender that has sent no command for the longest time."""
 
 
 class Bindings:
     """Binds each sender id to the certificate with which the daemon first saw it.
 
-    If one id comes with two certificates, it was copied by mistake, or its secret was stolen. The
-    daemon refuses the second certificate while commands with the first one keep coming. Only native
-    keys name a certificate. So the sender of a command on a ROS key is not bound. The public name
-    of such a sender never equals the public name of a native sender.
+    If one id arrives with two certificates, it was copied by mistake, or its secret was stolen. The
+    daemon then refuses the commands with the second certificate for as long as commands with the
+    first one keep arriving. Senders on ROS keys are not bound, because such keys do not contain the
+    name of a certificate. Such a sender cannot have the public name of a native sender.
     """
 
     def __init__(self) -> None:
         self._seen: dict[str, tuple[str, int]] = {}
-        """Maps each sender id to a pair: its certificate ("" on the robot itself), and the
-        monotonic time of its last command, ns. The sender id is in the form of its public name."""
+        """Maps the public name of each sender id to a pair: the certificate name of the sender, and
+        the monotonic time of its last command, ns. The certificate name is "" for a program on the
+        robot itself. The oldest command is first."""
 
     def other(self, sender: str, certificate: str, now_ns: int) -> str | None:
-        """Bind `sender` to `certificate` and return None.
+        """Bind a sender id to a certificate and return None.
 
-        If `sender` is still bound to another certificate, change nothing and return that
-        certificate.
+        If the id is still bound to another certificate, change nothing and return the name of that
+        certificate. `sender` is the public name of the id. `certificate` is a common name, or "".
+        `now_ns` is monotonic.
         """
         bound, seen_ns = self._seen.get(sender, (certificate, now_ns))
         if bound != certificate and now_ns - seen_ns <= BOUND_NS:
@@ -84,7 +87,8 @@ REPLACED_NS = NS_PER_S // 2
 """Zenoh replaces a timestamp that is ahead of the daemon's clock by more than this, ns."""
 
 Via = Literal["native"] | Transport
-"""The keys on which a sample or query arrived: acsard's own ("native"), or a ROS transport's."""
+"""The kind of key on which a sample or query arrived: "native" for acsard's own keys, otherwise the
+name of the ROS transport."""
 
 
 class Arrival(Struct, frozen=True):
@@ -99,15 +103,18 @@ class Arrival(Struct, frozen=True):
     arrived_ns: int
     """Monotonic time of arrival, ns."""
     stamp_ns: int | None
-    """Zenoh's timestamp by the wall clock, ns, if the sender or a router set it."""
+    """Zenoh's timestamp, wall-clock ns since 1970. None if neither the sender nor a router set
+    it."""
     sender: str
-    """Id of the Zenoh session that stamped the sample: the session of the sender, of a router or of
-    a bridge. It is "" if the sample has no stamp, or if the daemon's own session stamped it."""
+    """Id of the Zenoh session that set the sample's timestamp. This may be the session of the
+    sender, of a router or of a bridge. The id is "" if the sample arrived without a timestamp, or
+    if the daemon's own session replaced the timestamp."""
     via: Via = "native"
     attachment: bytes = b""
     received_ns: int | None = None
-    """Zenoh's timestamp by the wall clock, ns, if the daemon's own session set it. The session does
-    so if the sample has no timestamp, or a timestamp too far ahead of the daemon's clock."""
+    """Timestamp that the daemon's own Zenoh session set, wall-clock ns since 1970. It does so if
+    the sample has no timestamp, or one that is too far ahead of the daemon's clock. Otherwise
+    None."""
 
 
 class _TwistPayload(Struct, frozen=True, forbid_unknown_fields=True):
@@ -120,8 +127,8 @@ class _TwistPayload(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 TWIST_CDR_BYTES, STAMPED_CDR_BYTES = 52, 68
-"""Size of a Twist in CDR, and least size of a TwistStamped in CDR, bytes. If the Encoding does not
-name the type, the size of a payload shows which of the two types it is."""
+"""Exact size of a Twist in CDR, and smallest size of a TwistStamped in CDR, bytes. If the Zenoh
+Encoding does not name the type, the daemon infers the type from the size of the payload."""
 
 TWISTS = ("geometry_msgs/msg/Twist", "acsard.Twist.v1")
 STAMPED_TWISTS = ("geometry_msgs/msg/TwistStamped", "acsard.TwistStamped.v1")
@@ -244,8 +251,9 @@ class Receiver:
     ) -> Request:
         """Return the request in a service query. Raises `DecodeError` if the payload is not valid.
 
-        `ticket` is the number by which the reply names the query. `asked_ns` is the monotonic time
-        at which the query arrived, ns.
+        `verb` is the called service. `ticket` is the number of the query, which the reply repeats.
+        `encoding` is the Zenoh Encoding of `payload`. `asked_ns` is the monotonic time at which the
+        query arrived, ns.
         """
         request = Request(verb, ticket, asked_ns=asked_ns)
         if verb not in _payloads or (SERVICES[verb].optional and not payload):
@@ -267,7 +275,7 @@ class Receiver:
 
 
 class Identity(Struct, frozen=True):
-    """The sender of a sample, with the stamp and the sequence number if they are known."""
+    """The sender of a sample. The stamp and the sequence number are included if they are known."""
 
     sender: str
     """The public name of the sender. The secret id is not kept."""
@@ -279,15 +287,18 @@ class Identity(Struct, frozen=True):
     steady: bool = False
     """Whether the sender states that the clock of its stamps is never adjusted."""
     signed: str = ""
-    """Public name that is made from the sender id alone, without the certificate that `sender`
-    includes; "" if the sample has no sender id, or is not a command on a native key."""
+    """The public name in `sender`, but without the name of the TLS certificate. It is "" if the
+    sample has no sender id, or is not a command on a native key."""
 
 
 # The results are cached, because each command needs the parts of its key twice, and commands arrive
 # on only a few different keys.
 @lru_cache(64)
 def parts(key: str) -> tuple[str, str, str]:
-    """Return the kind, source and certificate of a command key: "cmd", "app", "" for `cmd/app`."""
+    """Return the kind, the source and the certificate name in a command key.
+
+    For `cmd/app` they are "cmd", "app" and "".
+    """
     kind, _, rest = key.partition("/")
     source, _, certificate = rest.partition("/")
     return kind, source, certificate
@@ -340,9 +351,9 @@ def _by_key(arrival: Arrival) -> str:
 
 
 def claimed_identity(arrival: Arrival) -> Identity:
-    """Return the identity of a sample's sender like `identify`, but never raise an error.
+    """Return the identity of a sample's sender like `identify`, but without raising an error.
 
-    Of an rmw_zenoh sample, only the field `sender` is set. It is "" if the sample has no GID.
+    For a sample from rmw_zenoh, only the field `sender` is set. It is "" if the sample has no GID.
     """
     if arrival.via == "rmw":
         gid = arrival.attachment[-GID_BYTES:]
@@ -373,10 +384,14 @@ def _twist_payload(arrival: Arrival) -> _TwistPayload:
 def caller_name(via: Via, attachment: bytes, stamped_by: str = "") -> str:
     """Return a name for the program that called a service or sent a stop, for the log.
 
-    The name is the public name of the sender id in the attachment, with the transport in brackets.
-    It is only a claim of the program, because Zenoh does not say on which connection a query
-    arrived. For a call over rmw_zenoh, the name is the GID of the client. A call through a bridge
-    is unnamed. `stamped_by` is the id of the Zenoh session that stamped the sample, or "".
+    The name depends on the transport `via`, which follows it in brackets:
+
+    - native: the public name of the sender id in `attachment`, or "unnamed". The id of the Zenoh
+      session that stamped the sample follows in the brackets, unless `stamped_by` is "".
+    - rmw_zenoh: "unnamed" with the GID of the client in brackets.
+    - bridge: "unnamed".
+
+    The name is only a claim of the program: Zenoh does not say on which connection a query arrived.
     """
     if via == "rmw":
         return f"unnamed (rmw {attachment[-GID_BYTES:].hex()})"

@@ -26,13 +26,13 @@ MAX_RATE = 50.0
 """Largest turn rate that is accepted, rad/s. No robot turns that fast."""
 
 FOLLOWED_NS = NS_PER_S // 2
-"""Silence of a gyro after which the daemon may use another one, ns."""
+"""Time without a sample of the gyro in use after which the daemon may use another gyro, ns."""
 
 OWN = "gyro of the simulator/own"
-"""The sender id with which the simulator signs the samples of its gyro."""
+"""Sender id that the built-in simulator puts on the samples of its simulated gyro."""
 
 MOST_WHO = 64
-"""Largest number of characters of a sender's name in an error message."""
+"""Number of characters after which a sender's name is cut off in an error message."""
 
 UNKNOWN = [0.0] * 9
 """Covariance to use if a sample contains none. In sensor_msgs/Imu, zeros mean "unknown"."""
@@ -55,7 +55,10 @@ class GyroFollower:
     """Decodes the samples of one gyro on the bus, and refuses those of all other gyros."""
 
     def __init__(self, own: bool = False) -> None:
-        """Start without a gyro. With `own`, accept only the gyro of the daemon's own simulator."""
+        """Start without a gyro in use.
+
+        If `own` is true, accept only the simulated gyro of the daemon's own simulator.
+        """
         self._own = own
         self._followed = public_name(OWN) if own else ""
         self._heard_ns = -FOLLOWED_NS
@@ -77,10 +80,11 @@ class GyroFollower:
         return replace(sample, anew=True) if anew else sample
 
     def _follow(self, who: str, now_ns: int) -> bool:
-        """Use the gyro of the sender `who`. Return whether another sender's gyro was used before.
+        """Use the gyro of the sender `who`. Return True if another sender's gyro was used before.
 
-        Raises `DecodeError` if the gyro in use belongs to another sender, and is not silent or is
-        the gyro of the daemon's own simulator.
+        `now_ns` is the monotonic time of arrival. Raises `DecodeError` if this gyro may not be
+        used, because the gyro of another sender still sends, or because only the gyro of the
+        daemon's own simulator is allowed.
         """
         other = who != self._followed
         if other and (self._own or now_ns - self._heard_ns < FOLLOWED_NS):

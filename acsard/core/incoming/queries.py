@@ -71,11 +71,12 @@ class Query(Struct, frozen=True):
     """A query as Zenoh delivered it."""
 
     ticket: int
-    """The number by which replies name the query."""
+    """Number of the query. Each reply to the query has the same number."""
     topic: str
-    """The row of the topic table that the query matches, by the row's key."""
+    """Key of the row in the topic table that the query matches."""
     asked: str
-    """The key expression of the query, without `acsard/<id>/` if it begins with exactly that."""
+    """The key expression of the query. If it begins with exactly `acsard/<id>/`, this prefix is
+    removed."""
     fmt: str
     """The `fmt` parameter of the query, "" if it is absent."""
     payload: bytes
@@ -105,7 +106,7 @@ class _Waiting(Struct, frozen=True):
     form: Format
     """Encoding of the reply."""
     asked: Attachment | None
-    """The attachment of a call over rmw_zenoh, which the reply repeats. None for other calls."""
+    """Attachment of a call over rmw_zenoh; the reply must contain it too. None for other calls."""
     ros: bool = False
     wish: bytes = b""
     """Payload of a ROS request to set parameters, from which the reply is built. b"" for other
@@ -113,7 +114,7 @@ class _Waiting(Struct, frozen=True):
 
 
 class Queries:
-    """Answers queries with constants and the newest messages, and passes on service calls."""
+    """Answers queries with constants or the newest messages. A service call becomes a `Request`."""
 
     def __init__(self, config: Config, info: Info) -> None:
         self._config = config
@@ -134,12 +135,12 @@ class Queries:
     def serve(
         self, query: Query, current: Current, outputs: Outputs | None
     ) -> list[Reply] | Request:
-        """Return the replies to a query, or the `Request` of a service call.
+        """Return the replies to a query. If the query calls a service, return a `Request` instead.
 
-        The list is empty if the daemon has no value for the query. `current` returns the present
-        message of a published key. `outputs` are those of the last step, or None before the first
-        step. Raises `DecodeError` for a ROS request that cannot be served. The caller then sends
-        the reply that `refused` builds.
+        The list is empty if the daemon has no value for the query. `current` is a function that
+        returns the present message of a published key. `outputs` are those of the last step, or
+        None before the first step. Raises `DecodeError` for a ROS request that cannot be served.
+        The caller then sends the reply that `refused` builds.
         """
         if query.via != "native":
             return self._ros(query, 0 if outputs is None else outputs.now.wall_ns)
@@ -156,7 +157,11 @@ class Queries:
             return [Reply(query.ticket, query.topic, words, "text/plain", ok=False)]
 
     def answered(self, answer: Answer, wall_ns: int) -> Reply | None:
-        """Return the reply with the robot's answer, or None if no service call waits for it."""
+        """Return the reply that contains the robot's answer to a service call.
+
+        The result is None if no service call waits for this answer. `wall_ns` is the time of the
+        reply.
+        """
         waiting = self._waiting.pop(answer.id, None)
         if waiting is None:
             return None
@@ -172,7 +177,11 @@ class Queries:
         return Reply(answer.id, key, payload, encoding_name(form, name), attachment=attachment)
 
     def _ros(self, query: Query, wall_ns: int) -> list[Reply] | Request:
-        """Serve a query for a std_srvs/Trigger service or a ROS parameter service."""
+        """Do the work of `serve` for a query over a ROS transport.
+
+        The query calls a std_srvs/Trigger service or a ROS parameter service. `wall_ns` is the time
+        of the reply.
+        """
         asked = unpack(query.attachment) if query.via == "rmw" else None
         by = caller_name(query.via, query.attachment)
         verb = VERBS.get(query.topic)
@@ -244,7 +253,10 @@ class Queries:
 
 
 def includes(expression: str, key: str) -> bool:
-    """Return whether a Zenoh key expression includes a key, without slow backtracking."""
+    """Return whether a Zenoh key expression includes a key.
+
+    The function does not backtrack, so no expression takes a long time.
+    """
     chunks = key.split("/")
     reached = {0}
     for part in expression.split("/"):
@@ -282,8 +294,8 @@ def _fits(pattern: str, chunk: str) -> bool:
 def refused(query: Query, why: str, wall_ns: int) -> Reply | None:
     """Return the reply that refuses a query, or None if the client could not read a reply.
 
-    A ROS client does not receive error replies of Zenoh. Therefore it gets a normal response, which
-    says that the call failed.
+    `why` is the reason, in words. `wall_ns` is the time of the reply. A ROS client does not receive
+    error replies of Zenoh. Therefore it gets a normal response, which says that the call failed.
     """
     if query.via == "native":
         return Reply(query.ticket, query.topic, why.encode(), "text/plain", ok=False)
@@ -316,7 +328,9 @@ def _echo(asked: Attachment | None, wall_ns: int) -> bytes:
 def _format(query: Query) -> Format:
     """Return the encoding of the reply to a query.
 
-    It is the one that `fmt` names, else the encoding of a service call's payload, else JSON.
+    If the query has the parameter `fmt`, the result is the encoding that `fmt` names. Otherwise
+    it is the encoding of the payload if the query calls a service with a payload, else JSON.
+    Raises `DecodeError` if `fmt` names no encoding.
     """
     for form in FORMATS:
         if query.fmt == form:
@@ -334,7 +348,10 @@ def _format(query: Query) -> Format:
 
 
 def topic_table(config: Config) -> Topics:
-    """Return the topic table with full keys, without the keys on which this daemon never sends."""
+    """Return the topic table of this daemon, with full keys.
+
+    The table leaves out the published keys on which this daemon never sends a message.
+    """
     robot, silent = config.robot.id, left_out(config)
     return Topics(
         [

@@ -6,8 +6,9 @@ A speed limit never raises a speed. The robot's `limits.linear_speed` is the low
 - the limit in the last message, converted to m/s. A message with 0.0 lifts the limit.
 
 The class `Robot` has no code for speed limits: this module sends it a `set` request with the lower
-value. When the limit is lifted, the settings without the limit apply again. Therefore, while a
-limit is in force, a client's `set` must be valid together with those settings.
+value. When the limit is lifted, this module sends the higher value again. A client may send a `set`
+while a limit is in force. Its new settings must also be valid with the higher value, so that the
+limit can be lifted later.
 """
 
 from __future__ import annotations
@@ -31,9 +32,9 @@ SETTING = "limits.linear_speed"
 """The setting that a speed limit lowers."""
 
 PAUSE_NS = NS_PER_S // 10
-"""Least time between two changes of the limit, ns. Each change builds the whole configuration, so a
-flood of messages would delay the control loop. During this time, only the newest message is
-kept."""
+"""Least time between two changes of the limit, ns. Each change builds the whole configuration
+again, so many changes would delay the control loop. If several messages arrive within this time,
+only the newest one is applied."""
 
 LIFTED = 0.0
 """Value of nav2_msgs/SpeedLimit that means "no limit", in m/s and in %."""
@@ -88,40 +89,44 @@ NONE = Limit(math.inf, "", 0)
 
 
 class SpeedLimiter:
-    """The speed limit in force, and the settings that apply without it."""
+    """Keeps the speed limit in force, and the settings that will apply when it ends."""
 
     def __init__(self, config: Config) -> None:
         """Start without a limit. `config` is the robot's present configuration."""
         self._limit = NONE
         self._waiting: Limit | None = None
-        """The newest message that has not been applied yet."""
+        """The limit of the newest message, until it is applied; None if no message waits."""
         self._changed_ns = 0
         self._robot = self._settings = config
-        """`_robot` is the robot's configuration. `_settings` is the one without the speed limit."""
+        """`_robot` is the robot's configuration, in which the speed limit has lowered the speed.
+        `_settings` is the same configuration as it would be without the speed limit."""
         self._asked: tuple[Request, float] | None = None
-        """The client's request in this step that sets the speed, and the speed it asks for, m/s.
-        None without such a request."""
+        """A pair: the client's `set` request in this step that changes the highest speed, and the
+        speed that it requests, m/s. None if this step has no such request."""
         self._held: list[Request] = []
         """The `set` requests that wait for the next control step. While a limit is in force, a step
         takes only one `set` request."""
 
     @property
     def settings(self) -> Config:
-        """The configuration without the speed limit; the same object until a setting changes."""
+        """The configuration that would be in force without the speed limit.
+
+        It stays the same object until a setting changes.
+        """
         return self._settings
 
     @property
     def lowers(self) -> bool:
-        """Whether the limit lowers the speed.
+        """True while the robot's highest speed is below the setting because of a speed limit.
 
-        After the end of the limit, this stays True until the robot has its higher setting again.
+        After the limit is lifted, this stays True until the robot has the higher value again.
         """
         lowest = min(self._limit.speed, self._robot.limits.linear_speed)
         return lowest < self._settings.limits.linear_speed
 
     @property
     def text(self) -> str:
-        """The limit in words, "" if it lowers nothing."""
+        """The limit in force with its sender, in words; "" if no limit lowers the highest speed."""
         if not self.lowers:
             return ""
         setting = self._settings.limits.linear_speed
@@ -130,7 +135,11 @@ class SpeedLimiter:
         )
 
     def receive(self, arrival: Arrival, configured: float, refusals: list[Refusal]) -> None:
-        """Store the limit of a message for the next step, or add a refusal to `refusals`."""
+        """Decode the limit in a message, and store it for the next step.
+
+        `configured` is the highest speed to which a limit in % refers, m/s. An invalid message only
+        adds an entry to `refusals`.
+        """
         try:
             self._waiting = decode_limit(arrival, configured)
         except DecodeError as error:
@@ -141,7 +150,8 @@ class SpeedLimiter:
     ) -> tuple[tuple[Request, ...], list[Answer]]:
         """Return a pair: the requests for the robot in this step, and answers to refused requests.
 
-        The argument `requests` contains the requests of the clients. Call `settle` after the step.
+        The argument `requests` contains the requests of the clients, and `now_ns` is the monotonic
+        time of the step. The caller must call `settle` after the step.
         """
         own = self._own(now_ns)
         if self._limit is NONE and not self._held:
@@ -162,9 +172,9 @@ class SpeedLimiter:
         return tuple(found), refused
 
     def _limited(self, request: Request) -> Request:
-        """Return a client's `set` request, with a speed above the limit lowered to the limit.
+        """Return a client's `set` request. A requested speed above the limit becomes the limit.
 
-        Raises `ConfigError` if the requested settings would be invalid after the end of the limit.
+        Raises `ConfigError` if the requested settings would be invalid when the limit ends.
         """
         # Whether a change must wait until the robot stands is checked by the robot itself.
         made, _ = changed(self._settings, request.settings, at_rest=True)
@@ -177,7 +187,11 @@ class SpeedLimiter:
         return replace(request, settings=request.settings | {SETTING: self._limit.speed})
 
     def _own(self, now_ns: int) -> tuple[Request, ...]:
-        """Return the request that applies the newest limit to the robot, or () if none is due."""
+        """Put the newest limit in force, and return the `set` request that tells the robot.
+
+        The result is () if no new limit waits, if the last change is too recent, or if the robot
+        already has the right value. `now_ns` is monotonic.
+        """
         if self._waiting is None or now_ns - self._changed_ns < PAUSE_NS:
             return ()
         new, self._waiting = self._waiting, None

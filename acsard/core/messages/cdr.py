@@ -106,7 +106,10 @@ class _Source:
         return layout.unpack_from(self.data, start)
 
     def count(self, least: int) -> int:
-        """Read the length of a sequence whose items take at least `least` bytes each."""
+        """Read and return the number of items in a sequence.
+
+        Each item takes at least `least` bytes. Raises `CdrError` if the payload is too short.
+        """
         (count,) = self.take("I")
         if count * least > len(self.data) - self.at:
             raise CdrError(
@@ -136,9 +139,10 @@ def _whole(code: str, value: Any) -> Any:
 
 @cache
 def _layout(order: str, codes: str, start: int) -> struct.Struct:
-    """Return the layout of numbers that begin at the position `start` modulo 8.
+    """Return the layout of neighboring numbers, each aligned to its size.
 
-    Each number is aligned to its size.
+    `order` is the byte order, "<" or ">". `codes` contains the format character of each number in
+    Python's `struct`. `start` is the position of the first number modulo 8, after the CDR header.
     """
     text, at = order, start
     for code in codes:
@@ -149,7 +153,10 @@ def _layout(order: str, codes: str, start: int) -> struct.Struct:
 
 
 def _packs(codes: str) -> tuple[Callable[..., bytes], ...]:
-    """Return the functions that pack these numbers, one for each start position modulo 8."""
+    """Return eight functions that pack neighboring numbers, one for each start position modulo 8.
+
+    `codes` contains the format character of each number in Python's `struct`.
+    """
     return tuple(_layout("<", codes, start).pack for start in range(8))
 
 
@@ -158,7 +165,10 @@ _put_count = _packs("I")
 
 @lru_cache(256)
 def _text_bytes(text: str) -> bytes:
-    """Return a string as CDR with its length. Cached: a robot sends few different strings."""
+    """Return a string in CDR: its length in bytes, its UTF-8 text and a zero byte.
+
+    The results are cached, because a robot sends few different strings.
+    """
     raw = text.encode() + b"\0"
     return struct.pack("<I", len(raw)) + raw
 
@@ -172,7 +182,7 @@ Get = Callable[[Any], Any]
 
 
 class _Numbers:
-    """Part of a message: neighboring numbers, which may belong to different nested structs."""
+    """Codec of a part of a message: neighboring numbers, also of different nested structs."""
 
     def __init__(self, run: list[tuple[str, inspect.Type]]) -> None:
         self._codes = "".join(number_code(kind) for _, kind in run)
@@ -212,7 +222,7 @@ class _Text:
 
 
 class _List:
-    """Part of a message: a sequence, or an array if `fixed` is true.
+    """Codec of a part of a message: a sequence, or an array if `fixed` is true.
 
     A sequence has up to `most` items, or any number if `most` is None. An array has `most` items.
     """
@@ -279,7 +289,10 @@ _Part = _Numbers | _Text | _List
 
 @cache
 def _compiled(cls: Any) -> tuple[tuple[_Part, ...], Build]:
-    """Return a pair: the parts of a struct type in order, and the function that builds it."""
+    """Return a pair for the struct type `cls`: its parts in order, and a function.
+
+    The parts encode and decode the values. The function builds a struct from decoded values.
+    """
     info = struct_info(cls)
     parts: list[_Part] = []
     run: list[tuple[str, inspect.Type]] = []

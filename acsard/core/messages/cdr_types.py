@@ -17,8 +17,8 @@ SIZES = {"d": 8, "f": 4, "q": 8, "Q": 8, "i": 4, "I": 4, "B": 1, "?": 1}
 """Size and alignment of a number in CDR, bytes, by its format character in Python's `struct`."""
 
 Build = Callable[[Iterator[object]], object]
-"""Function that builds a struct. Its argument is an iterator over the values of the struct's fields
-in order. In place of a nested struct, the iterator yields the values of that struct's fields."""
+"""Function that builds a struct. Its argument is an iterator over the values of the fields in
+order. A nested struct is not one value: the iterator yields the values of its fields one by one."""
 
 Limit = tuple[float, float]
 """Least and greatest value of a number."""
@@ -33,7 +33,10 @@ def struct_info(cls: Any) -> inspect.StructType:
 
 
 def leaves(info: inspect.StructType, path: str = "") -> Iterator[tuple[str, inspect.Type]]:
-    """Yield the dotted path and the type of each leaf: a field that is not a struct itself."""
+    """Yield the dotted path and the type of each leaf. A leaf is a field whose type is no struct.
+
+    `path` is put before each path; it ends with a dot, or is "".
+    """
     for field in info.fields:
         kind = plain(field.type)
         if isinstance(kind, inspect.StructType):

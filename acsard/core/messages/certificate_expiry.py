@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from acsard.core.values import NS_PER_S
 
 EXPIRY_DAYS = 30
-"""If a certificate expires in fewer days than this, `state` and `diagnostics` show a warning."""
+"""`state` and `diagnostics` show a warning if a certificate expires in fewer days than this."""
 
 DAY_NS = 86400 * NS_PER_S
 
@@ -15,9 +15,9 @@ DAY_NS = 86400 * NS_PER_S
 def expiry(ends: Mapping[str, int], now_ns: int) -> tuple[int, str]:
     """Return a pair: the level (0 ok, 1 warning, 2 error) and a text about the validity.
 
-    The text begins with "valid" only at level 0. `ends` is the expiry time of each certificate that
-    TLS needs, by the name of its owner. The robot's own certificate has the name "". The mapping is
-    empty if no expiry time is known. Times are wall-clock ns since 1970.
+    The text begins with "valid" only at level 0. `ends` maps the owner of each certificate that TLS
+    needs to the time at which it expires. The owner of the robot's own certificate is "". The
+    mapping is empty if no expiry time is known. All times are wall-clock ns since 1970.
     """
     if not ends:
         return (
@@ -36,9 +36,10 @@ def expiry(ends: Mapping[str, int], now_ns: int) -> tuple[int, str]:
 
 
 def first(ends: Mapping[str, int]) -> tuple[str, int]:
-    """Return the owner and the expiry time of the certificate that expires first.
+    """Return a pair for the certificate that expires first: its owner, and when it expires.
 
-    The time under the name "" may be the earliest expiry of all certificates, which the TLS gateway
-    reports. If another name has the same time, the result has that name, because it is the owner.
+    `ends` maps owners to expiry times, wall-clock ns since 1970. The time of the owner "" may come
+    from the TLS gateway, which reports only the earliest time of all certificates. So if another
+    owner has the same time, the certificate is the other owner's, and the result names that owner.
     """
     return min(ends.items(), key=lambda one: (one[1], one[0] == ""))

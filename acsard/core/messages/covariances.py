@@ -1,9 +1,9 @@
 """Converts the covariances of planar odometry to the 6x6 matrices of ROS messages.
 
 A matrix is row major, and its axes are x, y, z, roll, pitch and yaw. Wheels do not measure z, roll
-and pitch. The variances of these three axes are those in the configuration, limited to a range that
-RViz can draw and a filter can invert. With `odometry.covariance = "constant"`, the matrices of pose
-and twist are the configured diagonals, without this limit.
+and pitch. The variances of these three axes come from the configuration, limited to a range that
+RViz can draw and a filter can invert. With `odometry.covariance = "constant"`, both matrices
+contain only the configured diagonals, which are not limited to this range.
 """
 
 from __future__ import annotations

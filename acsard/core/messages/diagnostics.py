@@ -41,7 +41,8 @@ from acsard.core.values import (
 OK, WARN, ERROR = 0, 1, 2
 
 OF_MODE = {"stopped": WARN, "fault": ERROR}
-"""Diagnostic level of the modes in which a person must clear a latch. Other modes are OK."""
+"""Diagnostic level of the two modes that last until a person clears a latch. The level of all other
+modes is OK."""
 
 BOARD = {
     "": (OK, "no emergency-stop input"),
@@ -52,13 +53,15 @@ BOARD = {
 """Diagnostic level and text of each state of the emergency-stop input."""
 
 OF_LEVEL = {"ok": OK, "warning": WARN, "return": WARN, "stop": ERROR, "unknown": WARN}
-"""Diagnostic level for each level of the battery."""
+"""Maps each battery level, such as "return", to the diagnostic level to show for it."""
 
 REFUSED_S = 2.0
-"""Time for which `diagnostics` shows a refused command, s: two messages at the default 1 Hz."""
+"""Time for which `diagnostics` shows a refused command, s. At the default 1 Hz, this is long enough
+for two messages."""
 
 MISSED_SHARE = 0.01
-"""Fraction of the last minute's control periods that may be missed without a warning."""
+"""`diagnostics` warns if more than this fraction of the last minute's control periods was
+missed."""
 
 NO_ROUTER, NOT_YET = "a peer, not a router", "not connected yet"
 
@@ -79,7 +82,7 @@ def diagnostics(
     certificate: tuple[int, str],
     speed_limit: str = "",
 ) -> DiagnosticArray:
-    """Return the message with all rows.
+    """Return the message `diagnostics` with all rows.
 
     `certificate` is the pair of level and text that `expiry` returns. Without TLS the text is "",
     and the message has no row about the certificate. `speed_limit` describes the speed limit that
@@ -166,7 +169,11 @@ def _commands(outputs: Outputs, snapshot: Snapshot, speed_limit: str) -> Row:
 
 
 def _wheels(doubt: WheelsStatus, counters: dict[str, int]) -> Row:
-    """Return the row about wheels that are faulty, slip or turn slower than commanded."""
+    """Return the row about wheels that are faulty, slip or turn slower than commanded.
+
+    `doubt` is the result of the checks of the wheels. The row also shows those `counters` that
+    count wheel faults and uncommanded motion.
+    """
     left, right = doubt.differ
     values = {
         "left_out": ", ".join(doubt.left_out),
@@ -182,7 +189,10 @@ def _wheels(doubt: WheelsStatus, counters: dict[str, int]) -> Row:
 
 
 def _board(config: Config, snapshot: Snapshot) -> list[Row]:
-    """Return the row of the board's inputs, or [] if no input is reported or required."""
+    """Return a list with the row about the emergency stop, the bumpers and the motor drivers.
+
+    The list is empty if the board has sent no status line and the configuration requires no input.
+    """
     safety, bumpers = config.safety, snapshot.bumpers
     required, needed = safety.estop == "required", safety.bumpers and safety.bumper != "off"
     if not (snapshot.board or required or needed):
@@ -206,7 +216,10 @@ def _board(config: Config, snapshot: Snapshot) -> list[Row]:
 
 
 def _battery(config: Config, snapshot: Snapshot) -> list[Row]:
-    """Return the row of the battery, or [] if no battery is reported and no threshold is set."""
+    """Return a list with the row about the battery.
+
+    The list is empty if the board reports no battery and the configuration sets no threshold.
+    """
     status, bounds = snapshot.battery, config.battery.bounds
     if status is None:
         return [Row("battery", WARN, battery.MISSING, {})] if bounds else []

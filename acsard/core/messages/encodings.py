@@ -51,7 +51,10 @@ _AT_BYTE = re.compile(r"JSON is malformed: (.*) \(byte (\d+)\)")
 
 
 def encoding_name(form: Format, type_name: str = "") -> str:
-    """Return the Zenoh Encoding of a payload to send. It names a type unless `type_name` is ""."""
+    """Return the Zenoh Encoding of a payload to send.
+
+    `type_name` is the type of the message, which the Encoding then contains; "" leaves it out.
+    """
     return f"{_MIME[form]};acsard.{type_name}.v1" if type_name else _MIME[form]
 
 
@@ -72,7 +75,11 @@ def _codec(cls: type[T]) -> Cdr[T]:
 
 
 def detect(encoding: str, payload: bytes) -> Format:
-    """Return the encoding of a payload with this Zenoh Encoding, or raise `DecodeError`."""
+    """Return the format of a received payload: JSON, msgpack or CDR.
+
+    Raises `DecodeError` if it is none of them. `encoding` is the Zenoh Encoding of the payload. If
+    it does not name the format, the first bytes of the payload decide.
+    """
     form = _FORM_OF.get(encoding.partition(";")[0])
     if form is not None:
         return form
@@ -98,11 +105,15 @@ class Decoder(Generic[T]):
         self._text = msgspec.json.Decoder(cls)
 
     def decode(self, encoding: str, payload: bytes) -> T:
-        """Return the message in a payload with this Zenoh Encoding, or raise `DecodeError`."""
+        """Return the message in a payload, or raise `DecodeError`.
+
+        `encoding` is the Zenoh Encoding of the payload. If it does not name the format, the first
+        bytes of the payload decide.
+        """
         return self.decode_as(detect(encoding, payload), payload)
 
     def decode_as(self, form: Format, payload: bytes) -> T:
-        """Return the message in a payload in the encoding `form`, or raise `DecodeError`."""
+        """Return the message in a payload whose format is `form`, or raise `DecodeError`."""
         if form == "cdr":
             return decode_cdr(self._cls, payload)
         try:
@@ -115,7 +126,10 @@ class Decoder(Generic[T]):
 
 
 def _where(words: str, payload: bytes) -> str:
-    """Return the text of a JSON error with the line and the column in place of the byte offset."""
+    """Return a JSON error with the line and the column of the mistake in place of its byte offset.
+
+    `words` is the text of the error from msgspec, and `payload` is the JSON text.
+    """
     match = _AT_BYTE.fullmatch(words)
     if match is None:
         return words

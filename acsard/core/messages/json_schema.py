@@ -38,8 +38,8 @@ ENOUGH: dict[type, list[str]] = {
     Imu: ["angular_velocity"],
     SpeedLimit: ["speed_limit"],
 }
-"""Required fields of some received types. In all other types, each field without a default is
-required."""
+"""Fields that a received message of one of these types must have. A message of any other type must
+have all fields without a default."""
 
 Schema = dict[str, Any]
 

@@ -37,7 +37,8 @@ class Topic(Struct, frozen=True):
     """The key below the robot's id, with placeholders such as `<source>`."""
     direction: Direction
     type: str
-    """Type of the message: its name in `MESSAGES`, or a description if it has no such name."""
+    """Name of the message type in `MESSAGES`. For a type that is not in `MESSAGES`, a
+    description."""
     rate: str
     """How often the daemon publishes or accepts a message, in words; "" for a query."""
     note: str
@@ -46,8 +47,8 @@ class Topic(Struct, frozen=True):
     subscribe: Role | None = None
     """Lowest role that may subscribe to the key. None means that no client may subscribe."""
     query: Role | Literal["<role>"] | None = None
-    """Lowest role that may query the key. `<role>` means the role at the end of the queried key.
-    None means that no client may query it."""
+    """Lowest role that may query the key. None means that no client may query it. `<role>` means
+    that the last part of the queried key is the lowest role, as in `whoami/operator`."""
     local: bool = False
     """True for a key that only programs on the robot's own machine may use."""
     latched: bool = False
@@ -123,7 +124,7 @@ PLAIN_SERVICES = tuple(
 """The services that can be called without a payload."""
 
 IMU = "imu"
-"""Key on which a gyro's samples arrive, also the samples of the simulated gyro."""
+"""Key on which the samples of the gyro arrive, whether the gyro is real or simulated."""
 
 SPEED_LIMIT = "speed_limit"
 """Key on which a client, such as Nav2's speed filter, lowers the robot's highest speed."""
@@ -150,12 +151,12 @@ JSON_TREE = "json/"
 
 
 def json_key(key: str) -> str:
-    """Return the key on which the daemon also publishes the messages of `key`, as JSON."""
+    """Return the key on which the daemon publishes the same messages as on `key`, but in JSON."""
     return JSON_TREE + key
 
 
 VERBS: dict[str, Verb] = {service_key(verb): verb for verb in SERVICES}
-"""The verb of each service, by its key."""
+"""Maps the key of each service to its verb, such as `srv/stop` to "stop"."""
 
 
 def _out(
@@ -168,7 +169,11 @@ def _out(
     simulated: bool = False,
     urdf: bool = False,
 ) -> Topic:
-    """Return the row of a key on which the daemon publishes, and which every client may read."""
+    """Return the row of a key on which the daemon publishes, and which every client may read.
+
+    `kind` is the type of the messages. The other arguments are the fields of `Topic` with the same
+    names.
+    """
     return Topic(
         key, "out", kind, rate, note,
         subscribe="viewer", query="viewer", latched=latched, simulated=simulated, urdf=urdf,
@@ -247,10 +252,12 @@ TOPICS: tuple[Topic, ...] = (
 FOLLOWED: tuple[Topic, ...] = tuple(
     topic for topic in TOPICS if topic.subscribe and topic.query and "<" not in topic.key
 )
-"""The rows of keys that clients may subscribe to and query: published keys and the gyro's key."""
+"""The rows of all keys that clients may both subscribe to and query. These are the keys on which
+the daemon publishes, and the key of the gyro."""
 
 PUBLISHED: tuple[Topic, ...] = tuple(topic for topic in FOLLOWED if topic.direction == "out")
-"""The rows of keys on which the daemon publishes. A query of one returns the last message."""
+"""The rows of all keys on which the daemon publishes. A query for such a key returns the present
+message."""
 
 
 def offered(config: Config) -> tuple[Topic, ...]:
@@ -266,9 +273,10 @@ def offered(config: Config) -> tuple[Topic, ...]:
 
 
 def published(config: Config) -> tuple[Topic, ...]:
-    """Return the rows of the keys on which this daemon publishes.
+    """Return the rows of the keys on which a daemon with this configuration publishes.
 
-    With the built-in simulator, they include the key of the simulated gyro.
+    With the built-in simulator and `odometry.gyro = true`, they include the key of the gyro,
+    because the daemon itself then publishes the samples of the simulated gyro.
     """
     own = config.mcu.simulated
     return tuple(t for t in offered(config) if t in PUBLISHED or (own and t.key == IMU))
@@ -284,24 +292,29 @@ COMMANDS = ("cmd", "wheel_cmd")
 
 
 def command_key(kind: str, source: str, certificate: str = "") -> str:
-    """Return the key, below the robot's id, on which a sender puts the commands of a source.
+    """Return the key, below the robot's id, on which a sender puts its commands.
 
-    `kind` is one of `COMMANDS`. Over TLS, only the sender with the certificate of the common name
-    `certificate` may put on the key. A program on the robot's own machine uses "".
+    `kind` is one of `COMMANDS`. `source` is the name of the command source. `certificate` is the
+    common name of the certificate of a sender that connects over TLS. Only this sender may put on
+    the key. A program on the robot's own machine uses "".
     """
     return f"{kind}/{source}/{certificate}" if certificate else f"{kind}/{source}"
 
 
 def source_keys(sources: Iterable[str], certificate: str = "") -> list[str]:
-    """Return all command keys of these sources. `certificate` may be "*" for all certificates."""
+    """Return the command keys of all given sources, two for each source.
+
+    `certificate` is the common name of the senders' certificate; "*" stands for any certificate. It
+    is "" for programs on the robot's own machine.
+    """
     names = list(sources)
     return [command_key(kind, name, certificate) for kind in COMMANDS for name in names]
 
 
 def unknown(key: str) -> bool:
-    """Return True if no row of the table of keys matches `key`.
+    """Return True if no row of the table of keys matches a key below the robot's id.
 
-    Keys below `json/` and all keys of commands always count as known.
+    Keys that begin with `json/`, `cmd/` or `wheel_cmd/` always count as known.
     """
     return row_of(key) is None and not key.startswith((JSON_TREE, "cmd/", "wheel_cmd/"))
 
@@ -313,12 +326,15 @@ def key_hint(key: str) -> str:
 
 
 def by_key(key: str) -> Topic | None:
-    """Return the row whose key is exactly `key`, placeholders included, or None."""
+    """Return the row whose key is exactly `key`, such as `cmd/<source>`, or None."""
     return next((topic for topic in TOPICS if topic.key == key), None)
 
 
 def row_of(key: str) -> Topic | None:
-    """Return the row that a key below the robot's id matches: `cmd/app` matches `cmd/<source>`."""
+    """Return the row that a key below the robot's id matches, or None.
+
+    For example, `cmd/app` matches the row of `cmd/<source>`.
+    """
     return next((topic for topic in TOPICS if _pattern(topic.key).fullmatch(key)), None)
 
 

@@ -35,15 +35,20 @@ def has(role: str, least: Role) -> bool:
 def keys_for(role: Role, use: Use, rows: Iterable[Topic]) -> list[str]:
     """Return the keys of `rows` for which `role` is the lowest role with the permission `use`.
 
-    The keys of commands are left out, because they contain names from the configuration.
-    `source_keys` returns them, and `COMMAND_ROLE` is their lowest role.
+    Command keys are left out, because they contain the names of sources, which the configuration
+    defines. `source_keys` returns these keys, and `COMMAND_ROLE` is the lowest role that may use
+    them. Keys that only programs on the robot's own machine may use are left out, too.
     """
     exact = (pair for row in rows if not row.local for pair in _exact(row, use))
     return [key for key, least in exact if least == role and "<" not in key]
 
 
 def _exact(row: Topic, use: Use) -> Iterator[tuple[str, Role]]:
-    """Yield each key that a row stands for, with the lowest role that has the permission `use`."""
+    """Yield a pair for each key that a row stands for: the key, and a role.
+
+    The role is the lowest one with the permission `use`. Nothing is yielded if no client has this
+    permission.
+    """
     least = {"publish": row.publish, "subscribe": row.subscribe, "query": row.query}[use]
     if least == "<role>":
         yield from ((row.key.replace("<role>", role), role) for role in ROLES)
@@ -57,11 +62,11 @@ def _exact(row: Topic, use: Use) -> Iterator[tuple[str, Role]]:
 
 
 def least_role(key: str) -> Role:
-    """Return the lowest role that may use `key`, the part of the full key after the robot's id.
+    """Return the lowest role that may use a key. `key` is the part after the robot's id.
 
-    To use a key means to put on it if any client may do that, else to query it, else to subscribe
-    to it. For an unknown key, the result is the lowest role of all, which is only a hint. So do not
-    call this function with an unknown key to decide about permissions.
+    If clients may put on the key, the result is the lowest role that may do so. Otherwise it is the
+    lowest role that may query the key, or else subscribe to it. For an unknown key, the result is
+    "viewer", which does not mean that a viewer may use such a key.
     """
     row = row_of(key.removeprefix(JSON_TREE))
     if row is None:

@@ -18,11 +18,12 @@ from acsard.core.motion.event_throttle import together
 from acsard.core.values import NS_PER_S, Event, Instant
 
 LAST = 20
-"""Number of rows that are kept, so that a client that polls slowly seldom misses an event."""
+"""Number of rows in the message `events`. With this number, even a client that polls slowly seldom
+misses an event."""
 
 PAUSE_NS = 60 * NS_PER_S
-"""An event counts as a repetition only if the last event of the same name is at most this old, ns.
-Otherwise it gets a new row."""
+"""An event gets a new row, instead of counting as a repetition, if the previous event of the same
+name is older than this, ns."""
 
 
 class _Row(Struct, frozen=True):
@@ -31,7 +32,10 @@ class _Row(Struct, frozen=True):
 
 
 class RecentEvents:
-    """The rows of the last events, oldest first. An event that repeats moves its row to the end."""
+    """Keeps the rows of the last events, oldest first.
+
+    If an event repeats, its row moves to the end.
+    """
 
     def __init__(self) -> None:
         self._rows: deque[_Row] = deque(maxlen=LAST)

@@ -64,7 +64,10 @@ UNKNOWN_STATUS, CHARGING, DISCHARGING, NOT_CHARGING = range(4)
 
 
 class _Rate:
-    """Limits the rate of one topic. 0 Hz means no limit."""
+    """Decides when the next message of one key is due, so that a highest rate is kept.
+
+    0 Hz means that the rate is not limited.
+    """
 
     def __init__(self, hz: float) -> None:
         self._period_ns = int(NS_PER_S / hz) if hz else 0
@@ -81,15 +84,18 @@ class _Rate:
 
 
 class Report:
-    """Builds messages. It keeps only the last outputs, the last estimate and the last events."""
+    """Builds the published messages.
+
+    The only data that it keeps are the last outputs, the last estimate and the last events.
+    """
 
     def __init__(
         self, config: Config, start: Instant, certificate_ends: Mapping[str, int] | None = None
     ) -> None:
         self.certificate_ends = dict(certificate_ends or {})
-        """Expiry of each TLS certificate, wall-clock ns since 1970, by the name of its owner. The
-        robot's own certificate has the name "". If the daemon may not read the robot's own
-        certificate, the TLS gateway reports its expiry."""
+        """Maps the owner of each TLS certificate to the time at which it expires, wall-clock ns
+        since 1970. The owner of the robot's own certificate is "". If the daemon may not read this
+        certificate, its time comes from a report of the TLS gateway."""
         self.settings_differ = ""
         """Settings in force that differ from the configuration file, in words; "" if none
         differs."""
@@ -115,9 +121,10 @@ class Report:
     ) -> Iterator[tuple[str, Message]]:
         """Return an iterator over the pairs of key and message to publish after this step.
 
+        `outputs` are those of the step. `wanted` contains the keys that have a subscriber. `look`
+        is a function that returns the robot's `Snapshot`; it is called only if a message needs it.
         The messages of the feedback (`odom`, `tf`, `wheel_states`) come first, because `state`
-        takes ten times as long to build. `wanted` contains the keys that have a subscriber. `look`
-        returns the state of the robot, and is called only if a message needs it.
+        takes ten times as long to build.
         """
         self._outputs = outputs
         if outputs.events:
@@ -165,7 +172,10 @@ class Report:
                     yield key, message
 
     def current(self, key: str, look: Look) -> Message | None:
-        """Return the present value of a published key, if any. `look` is called only if needed."""
+        """Return the present message of a published key, or None if the key has none.
+
+        `look` is a function that returns the robot's `Snapshot`; it is called only if necessary.
+        """
         estimate, outputs = self._estimate, self._outputs
         match key:
             case "tf_static":
@@ -212,7 +222,11 @@ class Report:
         return String(self.description) if self.description else None
 
     def _odom(self, estimate: Estimate, live: bool = True) -> Odometry:
-        """Return the odometry. If `live` is false, the twist is zero with covariance `UNKNOWN`."""
+        """Return the message `odom` for an estimate.
+
+        `live` is false if the board no longer sends feedback. The twist is then zero, and its
+        covariance is `UNKNOWN`.
+        """
         frames, pose = self._config.odometry, estimate.pose
         of_pose = self._covariances.of_pose(estimate.covariance)
         of_twist = self._covariances.of_twist(estimate.twist_variances) if live else UNKNOWN
@@ -288,9 +302,10 @@ class Report:
         return round((first(self.certificate_ends)[1] - now.wall_ns) / DAY_NS, 2)
 
     def _battery(self, outputs: Outputs, snapshot: Snapshot) -> Battery | None:
-        """Return the message about the battery, or None if the board has never reported one.
+        """Return the message `battery`, or None if the board has never reported a battery.
 
-        Its stamp is the time of the board's last report, or of the step if the reports have ended.
+        Its stamp is the time of the board's last report. If the board no longer reports its
+        battery, the stamp is the time of the step.
         """
         battery, now = snapshot.battery, outputs.now
         if battery is None:
@@ -310,7 +325,10 @@ class Report:
         )
 
     def _certificate(self, now: Instant) -> tuple[int, str]:
-        """Return the result of `expiry` for the certificate, or (0, "") without TLS."""
+        """Return the level and the text of `expiry` for the TLS certificates at the time `now`.
+
+        Without TLS, the result is (0, "").
+        """
         if not self._config.bus.tls:
             return 0, ""
         return expiry(self.certificate_ends, now.wall_ns)
@@ -340,7 +358,7 @@ def from_yaw(yaw: float) -> Quaternion:
 
 
 def from_rpy(roll: float, pitch: float, yaw: float) -> Quaternion:
-    """Return the rotation by roll, pitch and yaw about the fixed axes x, y, z (REP-103), rad."""
+    """Return the rotation by roll, pitch and yaw, rad, about the fixed axes x, y, z (REP-103)."""
     cr, sr = math.cos(roll / 2), math.sin(roll / 2)
     cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
     cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)

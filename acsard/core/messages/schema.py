@@ -39,8 +39,8 @@ LatchNumber = Annotated[int, Meta(ge=0, lt=1 << 53)]
 """Number of a latch. It is below 2^53, so JavaScript represents it exactly."""
 
 FEW = Meta(max_length=64)
-"""Limit of 64 items for a list or a map, so that a huge message is refused quickly. No robot has
-more than 64 joints."""
+"""Constraint of a list or a map to at most 64 items, so that a huge message is refused quickly. No
+robot has more than 64 joints."""
 
 
 def one_of(values: Iterable[object]) -> Meta:
@@ -125,14 +125,20 @@ class PoseStamped(Message, frozen=True):
 
 
 class PoseWithCovariance(Message, frozen=True):
-    """A pose and its 6x6 covariance: row major; x, y, z in m; roll, pitch, yaw in rad."""
+    """A pose and its 6x6 covariance, row major.
+
+    The axes are x, y, z in m, then roll, pitch, yaw in rad.
+    """
 
     pose: Pose
     covariance: Covariance
 
 
 class TwistWithCovariance(Message, frozen=True):
-    """A twist and its 6x6 covariance: row major; linear x, y, z in m/s; angular ones in rad/s."""
+    """A twist and its 6x6 covariance, row major.
+
+    The axes are linear x, y, z in m/s, then angular x, y, z in rad/s.
+    """
 
     twist: Twist
     covariance: Covariance
@@ -182,9 +188,10 @@ class JointState(Message, frozen=True):
 
 
 class Imu(Message, frozen=True):
-    """An inertial measurement in `header.frame_id`: rad/s and m/s2, each with its 3x3 covariance.
+    """An inertial measurement in the frame `header.frame_id`.
 
-    If the first element of a covariance is -1, the quantity is not measured.
+    `angular_velocity` is in rad/s and `linear_acceleration` in m/s2. Each quantity has a 3x3
+    covariance, row major. If its first element is -1, the quantity is not measured.
     """
 
     header: Header
@@ -269,11 +276,12 @@ class SourceState(Message, frozen=True):
     age: float | None
     """Seconds since the last accepted command of the source.
 
-    It is null if no command was accepted since each sender was last required to send a zero, for
-    example since the start or a `clear`.
+    Some events, such as the start or a `clear`, require a zero from each sender. After such an
+    event, the age is null until the next command is accepted.
     """
     waits_for: str
-    """The condition that the source waits for before it drives, in words; empty if it drives."""
+    """Condition that must be met before the source drives the robot, such as "a command"; empty if
+    the source drives it."""
 
 
 class Spread(Message, frozen=True):
@@ -323,15 +331,15 @@ class RobotState(Message, frozen=True):
     latencies: dict[str, Latency] = {}
     """Latencies of the daemon by name (`daemon/latencies.py`). They are up to one second old."""
     gyro: Annotated[str, one_of(get_args(GyroDoes))] = "off"
-    """State of the gyro, which shows whether the odometry uses it."""
+    """State of the gyro. The odometry uses the gyro in the states `used` and `disagrees`."""
     encoder_counts: list[int] = []
     """Configured encoder counts per wheel turn, in the order of `wheels`.
 
-    0 means that the counts are not configured, or that the board does not compute the reported
-    speeds from whole counts.
+    All values are 0 if no counts are configured. They are also 0 if the reported speeds do not
+    match the configured counts: each speed should be an integer number of counts divided by a time.
     """
     wheel_fault: str = ""
-    """The wheel that the odometry leaves out, or the side that slips, in words; else empty."""
+    """A wheel that the odometry leaves out, or a side whose wheels slip, in words; else empty."""
     sender: str = ""
     """Public name of the selected sender of `source`; empty while no sender is selected.
 
@@ -339,23 +347,24 @@ class RobotState(Message, frozen=True):
     keep the robot from driving.
     """
     effective_track: str = ""
-    """Effective track divided by the wheel separation, in words.
+    """Ratio of the effective track to the wheel separation, in words.
 
-    The text gives the learned and the configured value, and says which one is in use. It is empty
-    until a value is learned from the gyro.
+    The text gives the configured ratio and the ratio that was learned with the gyro, and says which
+    of them is in use. It is empty until a ratio has been learned.
     """
     recording_error: str = ""
-    """Reason why nothing is recorded at present although recording is on, in words; else empty."""
+    """Why recording fails at present, in words; empty if it works or is switched off."""
     latch: LatchNumber = 0
-    """Number of the latch that keeps the robot from driving; 0 without a latch.
+    """Number of the latch that keeps the robot from driving; 0 if no latch is set.
 
-    If several latches are set, it is the number of the fault, or of the stop if there is no fault.
+    If several latches are set, it is the number of the fault. Without a fault, it is the number of
+    the stop.
     """
     latch_file_error: str = ""
-    """Reason why a stop would not survive a restart, in words.
+    """Why a latched stop would be lost if the daemon restarted now, in words.
 
-    The text is empty if a stop would survive. It is also empty if the daemon keeps no latch file,
-    as with the built-in simulator.
+    The text is empty if the stop would stay latched. It is also empty if the daemon keeps no latch
+    file, as with the built-in simulator.
     """
     feedback_age: float | None = None
     """Seconds since the last valid feedback line; null before the first one."""
@@ -365,18 +374,18 @@ class RobotState(Message, frozen=True):
     `silent` means that the board no longer reports it, which counts as pressed.
     """
     bumpers: list[bool] | None = None
-    """Whether each bumper counts as pressed, in the order of the board, 1 to 4 values.
+    """Whether each of the 1 to 4 bumpers counts as pressed, in the order in the board's reports.
 
-    Null if the board has never reported its bumpers. While it no longer reports them, each value is
-    true, because the bumpers then count as pressed.
+    Null if the board has never reported its bumpers. If it no longer reports them, all values
+    are true, because all bumpers then count as pressed.
     """
     battery: BatterySummary | None = None
     """The battery; null if the board has never reported its voltage or its charge."""
     settings_differ: str = ""
     """Settings in force that differ from the daemon's configuration file, in words; else empty.
 
-    If the daemon could not start again with that file, the text gives the reason. A speed limit
-    lowers a setting only for a time, so such a difference is not listed.
+    If the daemon could not start with the present file, the text gives the reason. A setting that
+    only a speed limit has lowered is not listed.
     """
     speed_limit: str = ""
     """The speed limit that lowers `limits.linear_speed` at present, with its sender, in words.
@@ -406,8 +415,8 @@ class GatewayState(Message, frozen=True):
     The gateway checks four times a second.
     """
     certificate_ends: Annotated[int, Meta(ge=0, lt=1 << 62)] = 0
-    """Time at which the first of the TLS certificates expires, wall-clock ns since 1970; 0 if the
-    library to read certificates is missing."""
+    """Earliest time at which one of the TLS certificates expires, wall-clock ns since 1970. It is 0
+    if the Python library that reads certificates is missing."""
 
 
 class String(Message, frozen=True):
@@ -450,9 +459,9 @@ class LogEvent(Message, frozen=True):
     by: str
     """Client that caused the event; empty if no client did."""
     count: int
-    """Number of occurrences that this row stands for.
+    """How often the event has occurred.
 
-    An event that repeats within a minute is counted in the same row.
+    If an event repeats within a minute, its row stays the same and this number grows.
     """
 
 
@@ -466,9 +475,9 @@ class Events(Message, frozen=True):
     stamp: Time
     """Time of the last event."""
     total: int
-    """Number of events since the start, with each repetition counted.
+    """Number of events since the start of the daemon. Each repetition counts as an event.
 
-    If `total` has grown by N since the last message, all new events are among the last N rows.
+    If `total` is larger by N than in the previous message, all new events are in the last N rows.
     """
     events: list[LogEvent]
 
@@ -481,7 +490,7 @@ class ServiceReply(Message, frozen=True):
 
 
 class SetPose(Message, frozen=True):
-    """Pose that base_link gets in odom: `x` and `y` in m, `yaw` in rad."""
+    """Pose to set for base_link in the frame odom: `x` and `y` in m, `yaw` in rad."""
 
     x: float
     y: float

@@ -21,7 +21,10 @@ from acsard.core.messages.state_warnings import brief, charge, warnings
 
 
 def place(x: float, y: float, yaw: float) -> list[str]:
-    """Return a pose as text with units. The argument `yaw` is in rad, the text is in degrees."""
+    """Return three texts with units for a pose, such as "yaw +90.0°".
+
+    The arguments `x` and `y` are in m, and `yaw` is in rad.
+    """
     return [
         f"x {signed(x, 3, 8)} m",
         f"y {signed(y, 3, 8)} m",
@@ -30,7 +33,10 @@ def place(x: float, y: float, yaw: float) -> list[str]:
 
 
 def speeds(linear: float | None, angular: float | None) -> list[str]:
-    """Return a twist as text with units. The arguments are in m/s and rad/s, None if unknown."""
+    """Return two texts with units for a twist, such as "forward +0.50 m/s".
+
+    `linear` is in m/s and `angular` in rad/s. None means that the speed is unknown.
+    """
     return [f"forward {signed(linear, 2, 5)} m/s", f"turn {signed(angular, 2, 5)} rad/s"]
 
 
@@ -52,7 +58,10 @@ def _state(state: RobotState) -> list[str]:
 
 
 def power(battery: BatterySummary) -> list[str]:
-    """Return voltage, current and charge of a battery as text with units, "-" if unknown."""
+    """Return the voltage, the current and the charge of a battery as three texts with units.
+
+    An unknown value is shown as "-".
+    """
     return [
         f"{signed(battery.volts, 2, 6).strip().removeprefix('+')} V",
         f"{signed(battery.amps, 2, 7).strip()} A",
@@ -81,5 +90,5 @@ SHORT: dict[type, Callable[[Any], list[str]]] = {
     PoseStamped: lambda message: _pose(message.pose),
     TwistStamped: lambda message: _twist(message.twist),
 }
-"""The message types that have a one-line form. Each maps to the function that returns the parts of
-the line."""
+"""Maps each message type that has a one-line form to a function. The function returns the parts of
+this line for a message."""

@@ -24,7 +24,7 @@ MAX_SENDER = 64
 """Largest number of characters in a sender id."""
 
 MAX_NAME = 40
-"""Largest number of characters that a public name takes from NAME in a sender id `NAME/SECRET`."""
+"""A public name contains at most this number of characters of NAME in a sender id `NAME/SECRET`."""
 
 DIGITS = 16
 """Number of hexadecimal digits of the hash in a public name. 16 digits encode 64 bits, so nobody

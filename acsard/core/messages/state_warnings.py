@@ -21,7 +21,7 @@ What = Literal[
 ]  # fmt: skip
 
 WHATS: tuple[What, ...] = get_args(What)
-"""The subjects that a warning can have, from the most to the least urgent."""
+"""All values of `StateWarning.what`, from the most to the least urgent."""
 
 WARNING = "WARNING"
 """The word before a list of warnings in a line of text."""
@@ -38,7 +38,7 @@ BATTERY = {
 
 
 class StateWarning(Struct, frozen=True):
-    """A warning about a robot. `what` is its subject."""
+    """A warning about a robot. `what` is the part of the robot that it is about."""
 
     what: What
     brief: str
