@@ -18,11 +18,7 @@ from rclpy.utilities import remove_ros_args
 
 PERIOD_S = 0.05
 PATIENCE_S = 10.0
-<<<<<<< HEAD
 """Longest wait for a subscriber, s. A bridge creates its route only when a publisher appears."""
-=======
-"""Longest time to wait for a subscriber, s. A bridge makes its route when a publisher appears."""
->>>>>>> 9b69eeb6e11311bfdc56374143bfaac6130581cf
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 ZEROS_S = 1.5
 """Duration of the zeros before the drive, s. Behind a bridge all publishers look like one sender,

@@ -23,6 +23,7 @@ KINDS = (
     ("proof", re.compile(r"\b(\w+) is new: ")),
     ("late", re.compile(r"\bcommands of (\w+) arrive .* too late\b")),
     ("priority", re.compile(r"\b(\w+) has (?:priority|the same priority)\b")),
+    ("stalled", re.compile(r"\bthe daemon (?:stood still|stalled): .* command of (\w+)")),
     ("command", re.compile(r"^(?:waiting for )?a command()\b")),
     ("", re.compile(r"^()$")),
 )
@@ -109,6 +110,7 @@ class Reasons:
     def __init__(self, run: Run) -> None:
         self.run = run
         self._ready_ns = self._looked_ns = self._calm_ns = -1
+        self._stalled_ns = -100 * NS
         self._clocks: dict[str, _Clock] = {}
         self._known_before: set[str] = set()
         """Clocks whose proof may have been over before the robot's clock stood. The daemon compares
@@ -194,7 +196,7 @@ class Reasons:
             return
         if witness.pending or witness.churned or stalled_ns > now_ns - NS:
             return
-        self._looked_ns = now_ns
+        self._looked_ns, self._stalled_ns = now_ns, stalled_ns
         # A board that greets after a reset disarms all, and then the robot becomes ready again.
         self._calm_ns = max(run.liveness.event_ns, stalled_ns, self._ready_ns)
         wishing = [
@@ -252,6 +254,9 @@ class Reasons:
             armed = heard.armed_ns > since_ns and certain
             if witness.neutral_first and not (armed and heard.own):
                 found.add("neutral")
+        if now_ns - self._stalled_ns < timeout_ns + NS:
+            # A stall prolongs the place of a sender that has not sent since.
+            found.add("stalled")
         mine = witness.priority[source]
         for other, priority in witness.priority.items():
             if other != source and priority >= mine and self._live(other, now_ns):
