@@ -107,7 +107,11 @@ def _time_of_day(words: str, text: str) -> TimeOfDay:
 
 
 def _date(words: str, text: str, now_s: float) -> tuple[int, int, int]:
-    """Return the triple (year, month, day) that `words` mean. For "yesterday" the day may be 0."""
+    """Return the triple (year, month, day) that `words` mean, for example "yesterday".
+
+    For "yesterday" the day may be 0. `text` is all that the person typed, for the error message.
+    `now_s` is the present time, s since 1970. Raises `TimeError` if `words` are not a date.
+    """
     if words in _DAYS_AGO:
         today = time.localtime(now_s)
         return today.tm_year, today.tm_mon, today.tm_mday - _DAYS_AGO[words]
