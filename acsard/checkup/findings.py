@@ -34,7 +34,7 @@ class Finding(Struct, frozen=True):
 
 
 class StoppedError(AcsardError):
-    """Ends the check early. `finding` is the reason for the operator."""
+    """Ends the check early. `finding` tells the operator the reason."""
 
     def __init__(self, finding: Finding) -> None:
         super().__init__(finding.text)
