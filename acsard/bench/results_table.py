@@ -54,7 +54,7 @@ class Result(Struct, frozen=True, omit_defaults=False):
     realtime: bool
     """True if the daemon's control task had real-time scheduling."""
     outside: dict[str, Summary | None]
-    """Summaries of the durations in `POINTS`, by name; null or absent if it was not measured."""
+    """Summaries of the durations in `POINTS`, by name. An unmeasured duration is null or absent."""
     own: dict[str, Summary]
     """Summaries of the durations in `OWN`, by name. The percentiles are accurate to 12 %."""
     commands_sent: int

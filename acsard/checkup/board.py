@@ -143,7 +143,8 @@ class Board:
         self.sent_lines = 0
         self.sent_s = 0.0
         self.lateness = Lateness()
-        """The delays of this computer, including those of a simulated board that runs on it."""
+        """The delays of this computer. If the board is simulated on this computer, they include the
+        delays of the simulation."""
         self.fled = False
         """Whether a motor runs away, or keeps turning although zeros are sent. Then the check sends
         nothing more, so that the board's watchdog can stop the motor."""

@@ -152,8 +152,8 @@ OBEYED = 0.5
 pulses."""
 
 SEEN, GRAINS = 0.02, 4
-"""Pulses can be judged if the median angle of a pulse is at least `SEEN` rad and at least `GRAINS`
-encoder steps."""
+"""The pulses show which lines arrived only if the median angle of all pulses is at least `SEEN` rad
+and at least `GRAINS` encoder steps."""
 
 
 class Ways(Struct, frozen=True):

@@ -75,8 +75,8 @@ applies. A longer stall ends the check, because the operator may have left the r
 stall may only cause a step to be repeated (see `LATE_AGAIN`)."""
 
 AGAIN, MOST = 1, 5
-"""If the board restarts, the step is repeated, up to `AGAIN` times. One more restart in the same
-step ends the check. The check also ends after `MOST` restarts in all steps together."""
+"""If the board restarts during a step, the step is repeated, up to `AGAIN` times. One more restart
+in the same step ends the check. The check also ends after `MOST` restarts in all steps together."""
 
 
 def run(

@@ -41,9 +41,9 @@ Between = tuple[float, float]
 class Run(Struct, frozen=True):
     """Behavior of the motors in a silence after the last line that turned them.
 
-    `silent_s` is the length of the silence, s. It is about 0 for an ordinary stop, in which zeros
-    follow immediately. A distance is given as the time, s, that a motor needs for it at full speed.
-    A speed is given as a fraction of full speed.
+    `silent_s` is the duration of the silence, s. It is about 0 for an ordinary stop, in which zeros
+    follow immediately. Each distance is given as the time, s, in which a motor at full speed covers
+    it. Each speed is given as a fraction of full speed.
     """
 
     silent_s: float

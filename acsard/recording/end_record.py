@@ -64,8 +64,8 @@ class EndRecord(Struct, frozen=True):
     why: str = ""
     """If `cut` is "bug", text that names the failed step and the exception; otherwise ""."""
     earliest_ns: Ns | None = None
-    """Earliest wall-clock time of a message, ns since 1970; None if it is not known. It is before
-    `wall_ns` if the clock was set back during the recording."""
+    """Earliest wall-clock time of a message, ns since 1970; None if it is not known. It is earlier
+    than `wall_ns` if the clock was set back during the recording."""
 
 
 CRASHES = frozenset({"bug", "crash"})

@@ -139,7 +139,7 @@ _NO_OUTPUTS = "," * len(OUTPUT_COLUMNS)
 
 
 def csv_rows(step: Step, outputs: Outputs) -> Iterator[str]:
-    """Yield the CSV rows of a step, without line ends."""
+    """Yield the CSV rows of a step, without line breaks."""
     now = step.inputs.now
     for sample in step.inputs.gyro:
         yield gyro_columns(sample, now) + _NO_OUTPUTS

@@ -136,7 +136,8 @@ class Batch(Struct, frozen=True, array_like=True):
     1000 if the clocks count in us."""
     rows: Annotated[tuple[Row, ...], Meta(min_length=1, max_length=MAX_ROWS)]
     checksum: int
-    """CRC-32 of all estimates (pose, twist and angles that the wheels rolled) of the batch."""
+    """CRC-32 of all estimates of the batch: the poses, the twists and the angles by which the
+    wheels turned."""
     names: int | None = None
     """CRC-32 of all `input_names` of the batch; None if an older version recorded it."""
 

@@ -1,7 +1,7 @@
 """Parses times that a person types, and finds the part of a recording between two such times.
 
-A recording may cross midnight, and the wall clock may be set during the recording. Therefore a time
-is searched in every `Stretch`, a part of the recording during which the clock was not set.
+A recording may cross midnight, and the wall clock may be adjusted during the recording. Therefore a
+time is searched in every `Stretch`, a part of the recording without an adjustment of the clock.
 """
 
 from __future__ import annotations
@@ -191,7 +191,7 @@ def date(seconds: float) -> str:
 
 
 class Stretch(NamedTuple):
-    """A part of a recording during which the wall clock was not set."""
+    """A part of a recording without an adjustment of the wall clock."""
 
     at: float
     """Start of the stretch, s after the beginning of the recording."""

@@ -37,8 +37,8 @@ Without this limit, two sources that alternate in every step would fill the time
 """
 
 POSE_NS = NS_PER_S
-"""Longest time for which the entry `continues` waits for the first pose, ns. Without a link to the
-board there is no pose."""
+"""The entry `continues` is delayed until the first pose, but at most for this time, ns. Without a
+link to the board there is no pose."""
 
 SET_NS = 5 * NS_PER_S
 """Smallest change of the wall clock that gives an entry `clock`, ns. The change is measured against
@@ -81,7 +81,7 @@ class TimelineEntry(Struct, frozen=True, omit_defaults=True):
     - `reason`: the reason of the robot's mode has changed, but the mode has not.
     - `waits`: a sender must wait while another one drives.
     - `board`: a microcontroller has named itself and its last reset.
-    - `clock`: the wall clock was set.
+    - `clock`: the wall clock was adjusted.
     - `gap`: steps are missing.
     - `end`: the daemon received the request to end.
     - `cut`: the recording has no ordinary end.
@@ -374,7 +374,7 @@ class TimelineWriter:
         self._shutting_down = step.inputs.shutting_down
 
     def _clock(self, now: Instant) -> Iterator[TimelineEntry]:
-        """Yield an entry `clock` if the wall clock was set since the last step."""
+        """Yield an entry `clock` if the wall clock was adjusted since the last step."""
         last = self._now
         if last is None:
             return
