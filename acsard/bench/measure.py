@@ -90,9 +90,10 @@ def write(config: Config, where: Path) -> Path:
 
 
 def measure(config: Config, port: str, seconds: float) -> Result:
-    """Measure a daemon for `seconds` s: first a quarter of the time without commands, then with.
+    """Run a daemon, measure it for `seconds` s, and return the figures.
 
-    `port` is the serial port; "" means the simulated board.
+    In the first quarter of this time the benchmark sends no commands. `port` is the serial port; ""
+    means the simulated board.
     """
     with TemporaryDirectory(prefix="acsard-bench-") as where:
         file = write(config, Path(where))

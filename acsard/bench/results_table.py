@@ -17,7 +17,7 @@ from acsard.terminal.output import table
 
 POINTS = {
     "command_to_wire": "benchmark calls put() -> microcontroller gets the line's first byte",
-    "feedback_to_odometry": "last byte of a feedback line sent -> benchmark gets the odometry",
+    "feedback_to_odometry": "microcontroller sends a line's last byte -> benchmark gets odometry",
     "read_to_odometry": "microcontroller samples the wheels (stamp) -> benchmark gets odometry",
 }
 """Maps each duration that the benchmark measures to the events that begin and end it."""
@@ -54,7 +54,7 @@ class Result(Struct, frozen=True, omit_defaults=False):
     realtime: bool
     """True if the daemon's control task had real-time scheduling."""
     outside: dict[str, Summary | None]
-    """Summaries of the durations in `POINTS`, by name; null or absent if it was not measured."""
+    """Summaries of the durations in `POINTS`, by name. An unmeasured duration is null or absent."""
     own: dict[str, Summary]
     """Summaries of the durations in `OWN`, by name. The percentiles are accurate to 12 %."""
     commands_sent: int
@@ -149,7 +149,7 @@ def _counts(result: Result) -> list[tuple[str, str]]:
     said = "" if r.lines_said is None else f" of {r.lines_said}"
     waiting = ""
     if r.lines_waiting_max is not None:
-        waiting = f"; at most {r.lines_waiting_max} newer lines were sent meanwhile"
+        waiting = f"; by then at most {r.lines_waiting_max} newer lines had been sent"
     start = "not measured" if r.start_up_ms is None else f"{r.start_up_ms:.0f} ms"
     rows = [
         ("commands", f"{r.commands_sent} sent{seen}"),

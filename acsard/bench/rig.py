@@ -45,7 +45,7 @@ from acsard.host.errors import Exit, ExitError, MendableError, NoAnswerError, Un
 from acsard.host.own_identity import sender_id
 
 END_S = 5.0
-"""Time limit for a process to end after it was asked to, s. A process usually needs 0.2 s."""
+"""Time limit, s, for the end of a process after the request to end. It usually takes 0.2 s."""
 
 
 def ended(who: str, code: int, said: str = "") -> MendableError:
@@ -103,8 +103,8 @@ LOOK_S = 0.5
 FAR_END = "the simulated microcontroller's process"
 
 SPACING_S = (0.02, 0.06)
-"""Range of the random time between two commands, s. It is random so that the commands do not keep
-step with the daemon's control period."""
+"""Shortest and longest random time between two commands, s. If the time were constant, all commands
+could arrive at the same phase of the daemon's control period."""
 
 
 class Rig:
@@ -278,7 +278,10 @@ class Rig:
         return self._share(began_ns, used_ns)
 
     def _neutral(self, phases: random.Random) -> None:
-        """Send zero speeds until the daemon counts one. At first it ignores a new sender."""
+        """Send zero speeds until the daemon counts a command. It first ignores a new sender.
+
+        `phases` generates the random times between the commands.
+        """
         before = self._counted()
 
         def look() -> bool | None:
@@ -286,7 +289,7 @@ class Rig:
             time.sleep(phases.uniform(*SPACING_S))
             return before is None or self._counted() != before or None
 
-        self._wait(look, "neutral command counted by the daemon")
+        self._wait(look, "zero-speed command accepted by the daemon")
         time.sleep(0.2)
 
     def _counted(self) -> int | None:

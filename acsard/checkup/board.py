@@ -80,7 +80,7 @@ def _nothing() -> None:
 
 
 LEAST_S = 0.001
-"""Shortest remaining part of its duration, s, for which `Board.drive` sends another line."""
+"""`Board.drive` sends no further line if less than this part of its duration is left, s."""
 
 BEAT_NS = int(motion.PERIOD_S * NS_PER_S)
 """Interval at which `Board.listen` measures the lateness of this computer, ns."""
@@ -107,7 +107,7 @@ class Board:
         self.longest_reply_s = longest_reply
         """Largest permitted value of mcu.reply_period, s."""
         self.armed = False
-        """Whether all motors have been seen to stand once. From then on, a motor that runs away
+        """Whether the check has seen all motors stand. Once this is true, a motor that runs away
         ends the check."""
         self.between: Callable[[], object] = _nothing
         """Callback that may raise an exception to end the check. `send` calls it before each line
@@ -118,7 +118,7 @@ class Board:
         self.comma = mcu.trailing_comma
         """Whether the lines to the board end with a comma."""
         self.latched = False
-        """Whether motor d stops only if the line of zeros has the ending that `comma` says."""
+        """Whether motor d stops only at lines of zeros with the ending that `comma` selects."""
         self.sealed = self.sampled = False
         """`sealed` says whether each line has a checksum. `sampled` says whether each line to the
         board also requests the board's clock and encoder counts."""
@@ -143,7 +143,8 @@ class Board:
         self.sent_lines = 0
         self.sent_s = 0.0
         self.lateness = Lateness()
-        """The delays of this computer, including those of a simulated board that runs on it."""
+        """The delays of this computer. If the board is simulated on this computer, they include the
+        delays of the simulation."""
         self.fled = False
         """Whether a motor runs away, or keeps turning although zeros are sent. Then the check sends
         nothing more, so that the board's watchdog can stop the motor."""
@@ -272,17 +273,20 @@ class Board:
         return True
 
     def ask(self, wait_s: float = 0.0, comma: bool | None = None) -> None:
-        """Send one line of zeros, then listen for `wait_s` s, but at least for `period_s`."""
+        """Send one line of zeros, then listen for `wait_s` s, but at least for `period_s`.
+
+        See `line()` for `comma`.
+        """
         self.send(ZERO, comma)
         self.listen(max(wait_s, self.period_s))
 
     def answers(
         self, lines: int, wait_s: float, comma: bool | None = None
     ) -> list[tuple[float, Reply]]:
-        """Send zeros `lines` times. Return a pair for each line: the delay, s, and the first reply.
+        """Send `lines` lines of zeros, and return the first reply to each line with its delay, s.
 
-        Wait `wait_s` s after each line, but at least 1.5 times `period_s`. A line without a reply
-        has no entry in the result.
+        After each line the method waits for `wait_s` s, but at least for 1.5 times `period_s`. A
+        line without a reply has no entry in the result. See `line()` for `comma`.
         """
         # Replies to earlier lines must not be taken for replies to these lines.
         self.listen(max(motion.GLANCE_S / 4, wait_s))
@@ -294,7 +298,7 @@ class Board:
         return got
 
     def drive(self, motors: Motors, seconds: float, period_s: float = 0.0) -> list[Reply]:
-        """Send these speeds, rad/s, repeatedly for `seconds`, and return the replies of that time.
+        """Send these speeds, rad/s, repeatedly for `seconds`, and return the replies received then.
 
         `period_s` is the time between two lines; 0 means `self.period_s`. Raises `StoppedError` if
         the board falls silent while `armed` is true, because a motor could then run away unnoticed.
@@ -323,7 +327,7 @@ class Board:
     # Receiving
 
     def listen(self, seconds: float) -> list[Reply]:
-        """Receive for `seconds`, and return the replies of that time.
+        """Receive data for `seconds`, and return the replies that arrived in this time.
 
         Raises `StoppedError` if a motor runs away while `armed` is true, and `RestartedError` if
         the board restarts.
@@ -419,8 +423,9 @@ class Board:
     def rest(self) -> None:
         """Send zeros until all motors stand. Raises `StoppedError` if a motor keeps turning.
 
-        In some firmware motor d obeys only lines that end with a comma, or only lines without a
-        final comma. If only the other ending stops motor d, `comma` is changed for later lines.
+        Some firmware stops motor d only at lines with a final comma, or only at lines without one.
+        If motor d stops only at lines with the other ending than `comma` says, `comma` is changed,
+        so that all later lines have the right ending.
         """
         began_s = self.now_s
         if self.settles(self.comma):
@@ -437,10 +442,10 @@ class Board:
         raise StoppedError(outcomes.find("stop: turns", motors=motors, seconds=seconds))
 
     def settles(self, comma: bool) -> bool:
-        """Send zeros until the last two replies show that every motor stands, then return True.
+        """Send zeros until every motor stands. Return False if this takes too long, else True.
 
-        `comma` says whether the lines end with a comma. Returns False if the motors do not stand
-        after `MOTOR_S`, or after `PATIENCE_S` while a motor still slows down.
+        The motors stand if the last two replies show no movement. The limit is `MOTOR_S`, or
+        `PATIENCE_S` while a motor slows down. `comma` says whether the lines end with a comma.
         """
         began_s = self.now_s
         while True:

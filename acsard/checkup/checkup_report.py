@@ -128,9 +128,9 @@ def summary(found: Report, where: str) -> str:
     counts = ", ".join(f"{verdicts.count(v)} {v}" for v in get_args(Verdict) if v in verdicts)
     if late := lateness.unjudged(found.findings):
         again = "so the check has not passed: repeat it when this computer is idle"
-        counts += f"\n{len(late)} not judged, {again}"
+        counts += f"\nfor {len(late)} of the steps there is no result, {again}"
     if found.withheld:
-        return f"\n{counts}\nnothing to write into {where}: {found.withheld}"
+        return f"\n{counts}\n{where} stays unchanged: {found.withheld}"
     if not found.toml:
         return f"\n{counts}\nacsard.toml: nothing to change"
     head = f"{where}: written" if found.written else "for acsard.toml:"

@@ -39,7 +39,10 @@ def baud(board: Board) -> Finding:
 
 
 def _knock(board: Board, seconds: float) -> bool:
-    """Send zeros until three valid replies have arrived. Return False if they take too long."""
+    """Send zeros until three valid replies have arrived, and set `board.sealed`.
+
+    Returns False if fewer than three valid replies arrive within `seconds`.
+    """
     end_s = board.now_s + seconds
     while board.now_s < end_s:
         board.zeros()
@@ -53,7 +56,10 @@ def _knock(board: Board, seconds: float) -> bool:
 
 
 def identity(board: Board) -> Finding:
-    """Ask for the board's identification. Raises `StoppedError` if only an echo comes back."""
+    """Ask for the board's identification.
+
+    Raises `StoppedError` if the question comes back as an echo, without an identification.
+    """
     board.others.clear()
     for _ in range(3):  # the question or its answer may be lost
         board.restarts.asked(board.now_s)
@@ -91,9 +97,10 @@ def _answers(board: Board, comma: bool) -> list[Reply]:
 
 
 def comma(board: Board, dead: bool) -> Finding:
-    """Return the finding about `mcu.trailing_comma`. Some firmware needs the comma for motor d.
+    """Return the finding about `mcu.trailing_comma`, according to how motor d behaved.
 
-    `dead` is True if motor d was not seen to move, or if its movement could not be measured.
+    Some firmware turns or stops motor d only at lines with a final comma. `dead` is True if motor d
+    was not seen to move, or if its movement could not be measured.
     """
     if board.comma != board.mcu.trailing_comma:
         return _comma_wrong(board, "latched" if board.latched and board.comma else "disobeyed")
@@ -121,7 +128,7 @@ def _comma_wrong(board: Board, how: str) -> Finding:
 def replies(board: Board) -> Finding:
     """Compare the form of the replies with the documented form.
 
-    The daemon also reads the other forms that this step detects.
+    The finding names the differences. The daemon can also read replies with these differences.
     """
     lines = [reply.line.partition(b"#")[0] for reply in board.replies]
     forms = {"spaces": rb", ", "unpadded": rb"[pn]\d\.", "trailing comma": rb", *\Z"}

@@ -16,12 +16,12 @@ AGREES = 0.02
 """Largest tolerated relative difference between measured counts per turn and the stated number."""
 
 ALIKE = 0.75
-"""Smallest accepted ratio between the counts per turn of the motor with the fewest and of the motor
-with the most. It is low, because a coarse encoder allows only a rough measurement."""
+"""The measured counts per turn of each motor must be at least this fraction of the largest measured
+value. The fraction is low, because a coarse encoder allows only a rough measurement."""
 
 COARSE = 0.015
-"""An encoder is coarse if the angle between two replies varies by at least this much on average,
-rad. The daemon must know the counts per turn of a coarse encoder."""
+"""An encoder is coarse if the angle by which it turns from one reply to the next varies by at least
+this much on average, rad. The daemon must know the counts per turn of a coarse encoder."""
 
 LONGEST_S = 0.05
 """Longest time between replies, s, at which jumps of the speed reveal a coarse encoder. At longer
@@ -38,8 +38,8 @@ def per_turn(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
     """Return the mean encoder counts per wheel turn of these motors.
 
     The result is the change of the counts divided by the number of turns, which follows from the
-    reported speeds. It is negative if the counts run against the speeds, and None if the motors
-    turned too little.
+    reported speeds. It is negative if the counts fall while the reported speeds are positive, and
+    None if the motors turned too little.
     """
     counts = angle = 0.0
     for step in steps(replies):

@@ -34,7 +34,7 @@ class Finding(Struct, frozen=True):
 
 
 class StoppedError(AcsardError):
-    """Ends the check early. `finding` is the reason for the operator."""
+    """Ends the check early. `finding` tells the operator the reason."""
 
     def __init__(self, finding: Finding) -> None:
         super().__init__(finding.text)
@@ -46,7 +46,7 @@ class WireLostError(AcsardError):
 
 
 def wheel_of(mcu: McuConfig, motor: int) -> tuple[str, int]:
-    """Return a pair: the wheel that a motor (0 to 3) turns by configuration, and a sign.
+    """Return the wheel that a motor (0 to 3) turns according to the configuration, and a sign.
 
     The sign is -1 if a positive speed of the motor turns the wheel backward, else 1.
     """

@@ -29,8 +29,8 @@ class Input(Struct, frozen=True):
 def finding(board: Board, operator: Operator, safety: SafetyConfig) -> Finding:
     """Let the operator press each input, and check that the board reports each press and release.
 
-    The inputs are those that the configuration requires or that the board reports. A bumper is
-    named by its configured place, or by its number on the board if no places are configured.
+    The inputs are those that the configuration requires or that the board reports. A bumper has the
+    name of its place on the robot, or its number on the board if no places are configured.
     """
     board.ask(NEWS_S)
     estop = safety.estop == "required" or (safety.estop == "auto" and 0 in board.inputs)

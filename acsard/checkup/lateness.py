@@ -36,7 +36,10 @@ class Lateness:
         self._seen: list[tuple[float, float]] = []
 
     def look(self, late_s: float, now_s: float) -> None:
-        """Record a delay of `late_s` that ends at the monotonic time `now_s`, both in s."""
+        """Record a delay of `late_s` s that ended at the monotonic time `now_s`, s.
+
+        Delays that are shorter than `LEAST_S` are ignored.
+        """
         if late_s >= LEAST_S:
             self._seen.append((now_s, late_s))
 
@@ -48,8 +51,10 @@ class Lateness:
 def spoilt(found: Unsure, late_s: float) -> bool:
     """Return whether the finding may be wrong because this computer was late.
 
-    `late_s` is the largest delay during the step, s. A delay of half of `found.margin_s` is enough,
-    because this computer may have been late both at the start and at the end of the measurement.
+    `late_s` is the largest delay of this computer during the step, s. The finding may be wrong if
+    this delay is at least half of `found.margin_s`, because this computer may have been late both
+    at the start and at the end of the measurement. Delays below `PAUSE_S` do not spoil a finding
+    with the verdict PASS, and delays below `SPOILS_S` do not spoil any other finding.
     """
     least_s = PAUSE_S if found.verdict == "PASS" else SPOILS_S
     return late_s >= max(least_s, found.margin_s / 2)
@@ -61,7 +66,7 @@ def finding(name: str, late_s: float) -> Finding:
 
 
 def judged(found: Finding) -> bool:
-    """Return whether the step was judged, and not left open because this computer was late."""
+    """Return False if the finding says that this computer was too late to judge the step."""
     return found.figure != outcomes.MANUAL[LATE].figure
 
 

@@ -34,7 +34,7 @@ LINES, LEAST_S, MOST_S = 300, 3.0, 10.0
 are `LINES` lines, enough to show a loss of 2 %, or until `MOST_S` s have passed."""
 
 SILENT = 2.0
-"""A gap between two replies is a silence only if it is this many times as long as the mean gap."""
+"""A gap between two replies counts as a silence only if it exceeds the mean gap by this factor."""
 
 
 class Count(Struct, frozen=True):
@@ -118,8 +118,9 @@ def _gaps(replies: Sequence[Reply]) -> list[float]:
 def _left_out(replies: Sequence[Reply]) -> int:
     """Return the number of missing replies of a board that sends them at regular intervals.
 
-    The number follows from the time between the first and the last reply. A single gap shows
-    nothing, because a reply that is received late makes one gap longer and the next gap shorter.
+    The number is computed from the time between the first and the last reply. A single long gap
+    does not show a lost reply, because a reply that is received late makes one gap longer and the
+    next gap shorter.
     """
     gaps = _gaps(replies)
     usual = median(gaps) if gaps else 0.0
@@ -128,7 +129,7 @@ def _left_out(replies: Sequence[Reply]) -> int:
 
 
 def _silence_s(board: Board, replies: Sequence[Reply]) -> float:
-    """Return the longest gap between replies, s, or 0 if it would not look like a lost link."""
+    """Return the longest gap between replies, s; 0 if the daemon would tolerate this gap."""
     longest = max(_gaps(replies), default=0.0)
     quiet_s = max(0.1, 4 / board.rate_hz, 3 * board.mcu.reply_period)
     return longest if longest > max(quiet_s, SILENT * board.gap_s) else 0.0
@@ -139,7 +140,8 @@ PULSE_S = 0.08
 the encoders can show the movement, and the board's watchdog does not act yet."""
 
 TOLD, PULSES_S = 8, 20.0
-"""The search for the direction of the loss ends after `TOLD` unanswered pulses or `PULSES_S` s."""
+"""To find out in which direction lines are lost, the check sends pulses until `TOLD` of them have
+had no reply, but for at most `PULSES_S` s."""
 
 SPREAD, STRIDE = 12, 5
 """The pause after pulse n is the shortest pause plus (n * `STRIDE`) % `SPREAD` line periods. If all
@@ -150,15 +152,16 @@ OBEYED = 0.5
 pulses."""
 
 SEEN, GRAINS = 0.02, 4
-"""Pulses can be judged if the median angle of a pulse is at least `SEEN` rad and at least `GRAINS`
-encoder steps."""
+"""The pulses show which lines arrived only if the median angle of all pulses is at least `SEEN` rad
+and at least `GRAINS` encoder steps."""
 
 
 class Ways(Struct, frozen=True):
     """Numbers of pulses (see `pulsed`).
 
-    `sent` counts the pulses that could be judged. `there` counts the pulses that were lost on their
-    way to the board. `back` counts the pulses that the motors obeyed although no reply arrived.
+    `sent` counts all pulses whose movement was measured. `there` counts the pulses that were lost
+    on their way to the board. `back` counts the pulses that the motors obeyed although no reply
+    arrived.
     """
 
     sent: int
@@ -226,7 +229,7 @@ def pulsed(board: Board, motors: Sequence[int]) -> Ways | None:
 
 
 def _whole(board: Board, since_s: float) -> bool:
-    """Return whether all periodic reports of the board since `since_s` have arrived."""
+    """Return whether no periodic report of the board is missing since the time `since_s`, s."""
     times = [reply.at_s for reply in motion.since(board.replies, since_s - board.gap_s)]
     return all(after - before < 1.5 * board.gap_s for before, after in pairwise(times))
 

@@ -50,11 +50,11 @@ COUNT_S = 1.0  # a reply that is older than this does not show that a motor stil
 ZERO: Motors = (0.0, 0.0, 0.0, 0.0)
 
 TREND_S = 0.5
-"""Shortest length of each of the two intervals whose mean speeds `trend` compares, s."""
+"""`trend` compares the mean speeds in two intervals, each of which has at least this length, s."""
 
 FALLS = 0.97
-"""A motor slows down if its ratio in `trend` is below this number. It speeds up if its ratio is
-above the inverse of this number."""
+"""A motor counts as slowing down if `trend` returns less than this number for it. It counts as
+speeding up if `trend` returns more than the inverse of this number."""
 
 
 class Reply(Struct, frozen=True):
@@ -103,7 +103,7 @@ def since(replies: Sequence[Reply], since_s: float, until_s: float = math.inf) -
 
 
 def mean(replies: Sequence[Reply]) -> Motors:
-    """Return each encoder's mean speed over these replies, rad/s; 0 if there are no replies."""
+    """Return the mean of each encoder's speeds in these replies, rad/s; 0 if there are none."""
     return each(lambda motor: fmean([reply.motors[motor] for reply in replies] or [0.0]))
 
 
@@ -139,9 +139,9 @@ def covered(replies: Sequence[Reply], since_s: float, per_turn: float = 0.0) -> 
 def turning(replies: Sequence[Reply], now_s: float) -> list[int]:
     """Return the numbers of the motors that may still turn at the monotonic time `now_s`, s.
 
-    A coarse encoder reports a speed of 0 in most replies, even while its motor turns. So after a
-    reply that shows that the motor has turned by some angle, the motor counts as turning for a
-    while: for the time that it would need for the same angle at the speed `STANDING`.
+    A coarse encoder reports a speed of 0 in most replies, even while its motor turns. If a reply
+    shows that the motor has turned by some angle, the motor therefore counts as turning for some
+    time. This is the time that it would need for the same angle at the speed `STANDING`.
     """
     found: set[int] = set()
     for reply, earlier in pairwise(reversed([Reply(-math.inf, ZERO, b""), *replies])):

@@ -404,8 +404,8 @@ def find(outcome: str, keys: dict[str, object] | None = None, **seen: object) ->
     Args:
         outcome: a key of `MANUAL`. The part before the colon is the name of the finding.
         keys: the configuration values that the finding suggests, by dotted key.
-        seen: the measured values. If one has the name `name`, it replaces the name of the finding.
-            If one has the name `margin_s`, it becomes the margin of an `Unsure`.
+        seen: the measured values. A value called `name` replaces the name of the finding. A value
+            called `margin_s` becomes the margin of an `Unsure`.
     """
     entry = MANUAL[outcome]
     name = str(seen.get("name", outcome.partition(":")[0]))

@@ -1,4 +1,4 @@
-"""Runs the whole check: puts the steps in order, repeats a step if needed, and ends early."""
+"""Runs the steps of the check in order, repeats a step if needed, and may end the check early."""
 
 from __future__ import annotations
 
@@ -44,7 +44,8 @@ STEPS = (
     "lost lines", "motors", "trailing comma", "wheel map", "encoder counts", "watchdog",
     "damaged lines", "inputs",
 )  # fmt: skip
-"""Names of all steps. If the check ends early, the finding `REST` lists the steps that are left."""
+"""Names of all steps. If the check ends early, the finding `REST` lists the steps without a result.
+"""
 
 SILENT: tuple[tuple[str, Callable[[Board], Finding | None]], ...] = (
     ("listening for 3 s at the configured baud rate, then at other baud rates", dialect.baud),
@@ -63,8 +64,9 @@ Tell = Callable[[Finding], None]
 Step = Callable[[], Finding | None]
 
 LATE_AGAIN, LATE_MOST = 2, 8
-"""If this computer is late, a step is repeated up to `LATE_AGAIN` times. A check has at most
-`LATE_MOST` such repetitions. Without the second limit, it could take four minutes."""
+"""If this computer was late during a step, the step is repeated, up to `LATE_AGAIN` times. A check
+has at most `LATE_MOST` such repetitions in all. Without this second limit, a check could take four
+minutes."""
 
 STALL_S, ZEROS_STALL_S = 0.5, 5.0
 """Longest stalls of this program that do not end the check, s. `ZEROS_STALL_S` applies until all
@@ -73,8 +75,8 @@ applies. A longer stall ends the check, because the operator may have left the r
 stall may only cause a step to be repeated (see `LATE_AGAIN`)."""
 
 AGAIN, MOST = 1, 5
-"""If the board restarts, the step is repeated, up to `AGAIN` times. One more restart in the same
-step ends the check. The check also ends after `MOST` restarts in all steps together."""
+"""If the board restarts during a step, the step is repeated, up to `AGAIN` times. One more restart
+in the same step ends the check. The check also ends after `MOST` restarts in all steps together."""
 
 
 def run(
@@ -136,10 +138,13 @@ def run(
 
 
 class _Watched:
-    """The operator during the steps. `look` ends the check if the operator quits or may be away."""
+    """The operator during the steps, watched by `look`.
+
+    `look` ends the check if the operator quits, or if a stall may have made the operator leave.
+    """
 
     def __init__(self, operator: Operator, board: Board, asleep_ns: Callable[[], int]) -> None:
-        """Start now, without a stall. `asleep_ns` is the argument of `run()`."""
+        """Begin to watch for stalls. `asleep_ns` is the argument of this name of `run()`."""
         self.doing, self.keys = operator.doing, operator.keys
         self._operator, self._board, self._asleep_ns = operator, board, asleep_ns
         self._ran_s = self._now_s()
@@ -197,7 +202,7 @@ class _Steps:
         right = [channel.motor for channel in channels if channel.kind in ("right", "off")]
         self._measure("", lambda: line_loss.direction(board, operator, right))
         self._take("", lambda: encoder_counts.finding(board, right))
-        together = "motors turn, then this computer sends nothing; this step may repeat"
+        together = "the motors turn, then this computer sends nothing, perhaps several times"
         self._measure(together, lambda: watchdog.finding(board, right))
         broken = "sending damaged lines; a motor that turns now is a fault"
         self._measure(broken, lambda: damage.finding(board, right))
@@ -297,7 +302,8 @@ class _Steps:
     def _await_return(self, silent_s: float) -> None:
         """If the board is silent, send zeros until it answers or has had enough time to boot.
 
-        The board is silent if it has not replied for `silent_s` s and for four times `gap_s`.
+        The board counts as silent if its last reply is older than `silent_s` s, and also older than
+        four times `gap_s`.
         """
         board = self._board
         if board.silent_s > max(silent_s, 4 * board.gap_s):

@@ -30,9 +30,9 @@ UNANSWERED = 5
 fewer such lines, the text may be a debug print of the firmware."""
 
 AHEAD_S = 2.0
-"""Largest time by which the board's clock may advance more than this computer's clock between two
-replies without a restart, s. A delayed line causes a smaller difference. A restart causes a larger
-one, because the jump of the clock back to 0 looks like a large advance modulo `CLOCK`."""
+"""Tolerance for the board's clock, s. Between two replies, this clock may advance by up to this
+much more than this computer's clock, for example because a line was delayed. A larger advance shows
+a restart, because the jump back to 0 looks like a large advance modulo `CLOCK`."""
 
 CLOCK = 65536
 """Time after which the board's clock starts again at 0, ms."""

@@ -3,10 +3,10 @@
 The watchdog must also act if the board receives only damaged lines, as with a half-broken cable.
 
 The check brings the motors to speed, sends nothing (or damaged lines) for some time, and then sends
-zeros. The time of the watchdog follows from the distance by which the motors ran on, minus the
-distance of an ordinary stop. Some firmware does not show these distances, because it replies only
-to lines and reports momentary speeds. In this case the check tries silences of different lengths,
-and sees after each silence whether the motors still turn.
+zeros. The delay after which the watchdog acts is computed from the distance by which the motors ran
+on, minus the distance of an ordinary stop. Some firmware does not show these distances, because it
+replies only to lines and reports momentary speeds. In this case the check tries silences of
+different lengths. After each silence it tests whether the motors still turn.
 """
 
 from __future__ import annotations
@@ -41,21 +41,21 @@ Between = tuple[float, float]
 class Run(Struct, frozen=True):
     """Behavior of the motors in a silence after the last line that turned them.
 
-    `silent_s` is the length of the silence, s. It is about 0 for an ordinary stop, in which zeros
-    follow immediately. A distance is given as the time, s, that a motor needs for it at full speed.
-    A speed is given as a fraction of full speed.
+    `silent_s` is the duration of the silence, s. It is about 0 for an ordinary stop, in which zeros
+    follow immediately. Each distance is given as the time, s, in which a motor at full speed covers
+    it. Each speed is given as a fraction of full speed.
     """
 
     silent_s: float
     ran_s: float
     """Largest distance by which a motor ran on until it stood, as a time at full speed, s."""
     slow_s: float
-    """Time until all motors were slower than `STOPPED`, s. It begins with the last line that turned
-    the motors. For an ordinary stop, it begins with the zeros."""
+    """Time from the last line that turned the motors until all motors were slower than `STOPPED`
+    of full speed, s. For an ordinary stop, the time begins with the zeros instead."""
     first: float
-    """Speed in the first reply after the silence, as a fraction of full speed. Firmware that
-    computes speeds from line to line reports the mean over the silence. Firmware that measures by
-    its own clock reports the momentary speed."""
+    """Speed in the first reply after the silence, as a fraction of full speed. Some firmware
+    computes the speed from the movement since the previous line, and so reports the mean speed in
+    the silence. Other firmware measures by its own clock, and reports the momentary speed."""
     second: float
     """Speed in the second reply after the silence, as a fraction of full speed. By then a quick
     motor has obeyed the first line of zeros."""
@@ -130,7 +130,10 @@ def measured(board: Board, motors: Sequence[int], stop: Run) -> Between:
 
 
 def _asked(board: Board, motors: Sequence[int], stop: Run, between: Between) -> Between:
-    """Narrow the bounds `between` by bisection, with silences of different lengths."""
+    """Return narrower bounds than `between`, found by bisection with silences of other lengths.
+
+    `stop` is the behavior of the motors in an ordinary stop.
+    """
     least_s, most_s = between
     for _ in range(8):  # each run halves the interval, unless this computer pauses
         if most_s - least_s <= max(0.03, 0.1 * most_s):
@@ -150,8 +153,8 @@ def _asked(board: Board, motors: Sequence[int], stop: Run, between: Between) -> 
 def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[bytes] = ()) -> Run:
     """Bring the motors to speed, send no valid line for `length_s` s, and stop them with zeros.
 
-    If `length_s` is 0, this is an ordinary stop. During the time `length_s`, the damaged lines in
-    `instead` are sent. Raises `StoppedError` if no motor reaches half of the commanded speed.
+    If `length_s` is 0, this is an ordinary stop. `instead` are damaged lines, which are sent during
+    the time `length_s`. Raises `StoppedError` if no motor reaches half of the commanded speed.
     """
     began_s = board.now_s
     full = run_up(board, command(motors))

@@ -87,8 +87,8 @@ class Channel(Struct, frozen=True):
 
     @property
     def error(self) -> float:
-        """Relative error of the motor's own encoder against the commanded speed. It is the larger
-        of the errors forward and backward."""
+        """Relative difference between the speed of the motor's own encoder and the commanded speed:
+        the larger of the values for forward and backward."""
         own = self.motor
         return max(abs(self.forth[own] / SPEED - 1), abs(self.back[own] / SPEED + 1))
 
@@ -119,7 +119,10 @@ def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
 
 
 def _whose(mcu: McuConfig, channel: Channel) -> str:
-    """Return the last part of the outcome's name, which says what the operator saw, or ""."""
+    """Return the end of the outcome's name that says what the operator saw, for example ", motor".
+
+    Returns "" if the outcome does not depend on that.
+    """
     wheel, sign = wheel_of(mcu, channel.motor)
     seen = channel.wheel
     match channel.kind:
@@ -170,7 +173,7 @@ LOOK_S = 0.75 * motion.MOTOR_S
 """Time over which the second measurement averages the speed, s."""
 
 LOOKS = 8
-"""`run_up` takes the mean of at most this many short measurements as the present speed."""
+"""Largest number of short measurements whose mean is the present speed in `run_up`."""
 
 ANSWERS = {
     "fr": "front_right", "fl": "front_left", "rl": "rear_left", "rr": "rear_right", "none": "",
@@ -236,7 +239,8 @@ def run_up(board: Board, motors: Motors) -> Motors:
 def _patience_s(board: Board, told: list[int]) -> float:
     """Return the longest wait for steady speeds, s.
 
-    The wait is longer while one of the motors `told` still speeds up.
+    `told` are the motors that were commanded to turn. The wait is longer while one of them still
+    speeds up.
     """
     shares = motion.trend(board.replies, board.now_s, board.gap_s)
     rises = any(shares[motor] > 1 / motion.FALLS for motor in told)
@@ -301,7 +305,10 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
     began_s = board.now_s
 
     def shown() -> Motors:
-        """Return each encoder's mean speed in the probe, less the speed due to coasting, rad/s."""
+        """Return each encoder's mean speed in the probe, rad/s.
+
+        The speed at which the motor coasted before the probe is subtracted.
+        """
         seconds = board.now_s - began_s
         ran = motion.covered(board.replies, began_s)
         sure = [max(0.0, abs(ran[m]) - abs(coasting[m]) * seconds) for m in range(4)]
@@ -346,8 +353,8 @@ def seen(board: Board, operator: Operator, channel: Channel) -> Channel:
     """
     question = (
         f"which wheel did motor {LETTERS[channel.motor]} turn: front right (fr), front left (fl), "
-        "rear left (rl) or rear right (rr)? Type none if no wheel turned, or again to see the "
-        "motor turn once more"
+        'rear left (rl) or rear right (rr)? Type "none" if no wheel turned, or "again" to see '
+        "the motor turn once more"
     )
     while (which := operator.ask(question, (*ANSWERS, "again"))) == "again":
         _both_ways(board, channel.motor)

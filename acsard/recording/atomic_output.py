@@ -33,11 +33,18 @@ def never(recording: Recording) -> bool:
 def replacing(
     new: Path, force: bool, may_replace: Callable[[Recording], bool] = never
 ) -> Iterator[Path]:
-    """Yield a temporary path to write to, and rename it to `new` when the block succeeds.
+    """Yield a temporary path to write to, and rename it to `new` after the `with` block.
 
-    Raises `FileExistsError` if `new` must not be replaced, for example because `force` is not set.
-    If `new` is a recording, `may_replace` takes it and returns whether `force` may replace it.
-    After an error `new` is unchanged and the temporary file is removed.
+    If the block fails, `new` is unchanged and the temporary file is removed.
+
+    Args:
+        new: path of the finished file or directory.
+        force: true if an existing `new` may be replaced.
+        may_replace: takes the recording that exists at `new`, and returns whether it may be
+            replaced. `force` must be true as well.
+
+    Raises:
+        FileExistsError: `new` exists and must not be replaced.
     """
     _require_free(new, force, may_replace)
     part = _near(new, "part")
@@ -60,7 +67,7 @@ def _put(part: Path, new: Path) -> None:
     """Rename `part` to `new`.
 
     No system call replaces a directory that contains files. Therefore an existing directory `new`
-    is first renamed, and is removed after `part` has its name.
+    first gets another name. It is removed after `part` has been renamed.
     """
     if not new.is_dir():
         os.replace(part, new)

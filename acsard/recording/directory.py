@@ -44,11 +44,14 @@ from acsard.recording.retention import (
 DIRECTORY_MODE = 0o750
 
 OPEN_DIRECTORY_MODE, OPEN_MODE = 0o755, 0o644
-"""Modes of the directory (0o755) and of its files (0o644) when the daemon records as a systemd
-service. The modes let every user read the files, but the parent directory lets only root enter. The
-service of the robot's web page reads the directory through a read-only mount. Group permissions
-cannot give the page access: a dynamic group has no name, and systemd 257 makes the user `nobody`
-the owner of state directories."""
+"""File modes of the directory (0o755) and of its files (0o644) if the daemon records as a systemd
+service with a dynamic user.
+
+Every user may read the files, but only root can enter the parent directory `PRIVATE`. The service
+of the robot's web page reads the files through a read-only mount. Group permissions cannot give
+this service access: a dynamic group has no name, and systemd 257 makes the user `nobody` the owner
+of state directories.
+"""
 
 PRIVATE = Path("/var/lib/private")
 """Parent of the state directories of services with a dynamic user. Only root can enter it."""
@@ -64,8 +67,9 @@ MARKER = ".left"
 ENDINGS: dict[Kind, str] = {"plain": WHOLE, "near": NEAR, "kept": KEPT}
 
 TRIM_ROUNDS = 600
-"""Number of calls of `Ring.tend`, one each second, between two searches for files that are too old.
-A file may cover an hour, so ten minutes are short enough."""
+"""Once in this number of calls, `Ring.tend` searches for files that are too old. It is called once
+a second, so there is a search every ten minutes. More searches are not needed, because a single
+file may cover an hour."""
 
 S_PER_DAY = 86400
 
@@ -110,11 +114,16 @@ def _stem(path: Path) -> str:
 
 
 def mark_cut(part: Path, kind: Kind, cut: Literal["late", "disk"]) -> None:
-    """Create a marker file for a `.part` file whose end could not be written.
+    """Create a marker file, which says why the end of a `.part` file could not be written.
 
-    Raises `OSError` if the disk does not accept the marker. Without the marker, the next
-    start would treat the `.part` file as cut off by a crash. The marker is an empty file with
-    `kind` and `cut` in its name, because even a full disk usually accepts a new name.
+    Without the marker, the next start of the daemon would assume that a crash cut off the file. The
+    marker is an empty file with `kind` and `cut` in its name, because even a full disk usually
+    accepts a new name. Raises `OSError` if the disk does not accept the marker.
+
+    Args:
+        part: the `.part` file.
+        kind: the retention class of the file.
+        cut: "late" if the disk was too slow, or "disk" if it accepted no more data.
     """
     part.with_name(f".{part.name}.{kind}.{cut}{MARKER}").touch()
 
@@ -139,11 +148,11 @@ class Run(Struct):
     numbers: set[int] = field(default_factory=set)
     """Numbers, from the file names, of the files that ended in this run of the daemon."""
     cut: dict[str, Kind] = field(default_factory=dict)
-    """Retention class of each file that a disk error cut off in this run, by the file's name. Any
+    """Maps the name of each file that a disk error cut off in this run to its retention class. Any
     other `.part` file without a marker was cut off by a crash before this run."""
     freed: int = 0
-    """Number of bytes that were deleted, since the last successful write, because the disk refused
-    to write."""
+    """Total size of the recordings that were deleted because the disk refused to write, bytes. It
+    restarts from 0 after each successful write."""
     clock: ClockWatch = field(default_factory=ClockWatch)
 
 
@@ -158,7 +167,11 @@ class Ring:
     ) -> None:
         """Lock the directory, make room in it, and finish the files that were cut off.
 
-        `refused` is true if the last write failed because the disk was full.
+        Args:
+            settings: the configuration of the recordings.
+            run: the state that an earlier `Ring` of this run of the daemon left after a disk error;
+                None if there is no earlier `Ring`.
+            refused: true if the last write failed because the disk was full.
         """
         self._directory = Path(settings.directory)
         self._bytes, self._days = int(settings.megabytes * 1e6), settings.days
@@ -239,7 +252,7 @@ class Ring:
                     self.retain(path)
 
     def _open_files(self) -> None:
-        """Let every user read the directory and all its files, even files of an older acsard."""
+        """Let every user read the directory and its files, also files of older versions."""
         for path in (self._directory, *listed(self._directory)):
             mode = OPEN_DIRECTORY_MODE if path == self._directory else OPEN_MODE
             # The file may belong to another user. Recording goes on in any case.
@@ -252,7 +265,10 @@ class Ring:
         os.close(self._lock)
 
     def begin(self, about: About) -> Writing:
-        """Create a new file, whose number is one above the largest number in the directory."""
+        """Create a new file with the metadata `about`.
+
+        The number of the file is one above the largest number in the directory.
+        """
         files = listed(self._directory)
         number = 1 + max([_number(path) or 0 for path in files], default=0)
         stamp = time.strftime(STAMP, time.gmtime(about.wall_ns // 1_000_000_000))
@@ -263,10 +279,13 @@ class Ring:
         return writing
 
     def end(self, writing: Writing, kind: Kind, cut: str = "", why: str = "") -> Path:
-        """Finish a file, rename it for its retention class `kind`, and return its new path.
+        """Finish a file, rename it, and return its new path.
 
-        `cut` is the cause that cut off the recording, a key of `CUTS`, and `why` explains this
-        cause in words. Both are "" after an ordinary end.
+        Args:
+            writing: the file.
+            kind: its retention class, which the new name shows.
+            cut: the cause that cut off the recording, a key of `CUTS`; "" if it ended normally.
+            why: an explanation of this cause in words, or "".
         """
         writing.finish(cut, why)
         path = writing.path.with_name(_stem(writing.path) + ENDINGS[kind])
@@ -298,10 +317,10 @@ class Ring:
             sync(self._directory)
 
     def tend(self, now: Instant) -> None:
-        """Delete old files every ten minutes, and whenever the disk is nearly full.
+        """Call `trim` every ten minutes, and whenever the disk is nearly full.
 
-        After a jump of the wall clock, also correct the modification times of the files of this
-        run. Call this method once a second.
+        Call this method once a second. After a jump of the wall clock, it also corrects the
+        modification times of the files that ended in this run of the daemon.
         """
         jumped_ns = self._run.clock.jump_ns(now)
         if jumped_ns:
@@ -311,7 +330,7 @@ class Ring:
             self.trim(now)
 
     def _shift_times(self, jumped_ns: int) -> None:
-        """Add a jump of the wall clock to the times of the files that ended in this run."""
+        """Add a jump of the wall clock to the modification times of this run's finished files."""
         for path in listed(self._directory):
             if _number(path) in self._run.numbers:
                 # Another process may have just removed the file.
@@ -321,12 +340,14 @@ class Ring:
                     os.utime(path, ns=(found.st_atime_ns, at_ns))
 
     def trim(self, now: Instant | None, refused: bool = False) -> None:
-        """Delete files to keep the limits on total size, on age and on free disk space.
+        """Delete recordings until the limits on total size, age and free disk space are kept.
 
         The file that is being written is never deleted. This method also sets `file_bytes`, the
-        size above which the file that is being written should end. If `now` is None, the time is
-        not known, so no file counts as too old. `refused` is true if the last write failed because
-        the disk was full.
+        size above which the file that is being written should end.
+
+        Args:
+            now: the present time; None if it is not known. Then no file counts as too old.
+            refused: true if the last write failed because the disk was full.
         """
         ended, disk = self._ended(), self._disk()
         oldest_s = -math.inf

@@ -25,8 +25,8 @@ TAIL_BYTES = 1 << 16
 typically begins 1960 bytes before the end of the file."""
 
 _NAMED = struct.pack("<I", len(END)) + END.encode()
-"""The end record's name, preceded by the length of the name. In the file, the header of the MCAP
-record comes before these bytes."""
+"""The length of the end record's name, and the name. In the file these bytes follow the header of
+the MCAP record."""
 
 _FOOTER = HEAD.pack(Opcode.FOOTER, 20)
 """Header of the MCAP footer record, whose content has 20 bytes."""
@@ -39,18 +39,18 @@ Ns = Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)]
 
 CUTS = {
     "bug": "cut: an internal error ended the daemon",
-    "crash": "cut: the daemon or the computer ended without notice",
+    "crash": "cut: the daemon or the computer stopped suddenly",
     "disk": "cut: the disk accepted no more data",
     "late": "cut: the daemon was asked to end, and the disk was too slow to write the last steps",
     "open": "cut off, or still being recorded, when `acsard recording recover` read it",
 }
-"""Maps each cause that cuts off a recording to its description. After the cause `bug`, the failing
-daemon itself still finishes the file. After any other cause, the file is finished later, when it is
+"""Maps each cause that cuts off a recording to its description. A daemon that fails with the cause
+`bug` still finishes its file. After any other cause, the file stays unfinished until it is
 recovered."""
 
 
 class EndRecord(Struct, frozen=True):
-    """The end record of a recording. A list of recordings needs no other part of each file."""
+    """The end record of a recording. A program that lists recordings reads only this record."""
 
     wall_ns: Ns
     """Wall-clock time at which the recording began, ns since 1970."""
@@ -64,8 +64,8 @@ class EndRecord(Struct, frozen=True):
     why: str = ""
     """If `cut` is "bug", text that names the failed step and the exception; otherwise ""."""
     earliest_ns: Ns | None = None
-    """Earliest wall-clock time of a message, ns since 1970; None if it is not known. It is before
-    `wall_ns` if the clock was set back during the recording."""
+    """Earliest wall-clock time of a message, ns since 1970; None if it is not known. It is earlier
+    than `wall_ns` if the clock was set back during the recording."""
 
 
 CRASHES = frozenset({"bug", "crash"})
@@ -73,10 +73,11 @@ CRASHES = frozenset({"bug", "crash"})
 
 
 def how_it_ends(cut: str, why: str = "") -> str:
-    """Describe how a recording was cut off, from the fields of its end record.
+    """Describe in words how a recording was cut off.
 
-    Returns "" if the daemon ended in the ordinary way. Returns "cut" if this version of acsard does
-    not know the cause.
+    `cut` and `why` are fields of its end record. The result is "" if `cut` is "", which means that
+    the daemon ended normally. If this version of acsard does not know the cause `cut`, the result
+    contains only the word "cut" and the text `why`.
     """
     if not cut:
         return ""
@@ -85,7 +86,7 @@ def how_it_ends(cut: str, why: str = "") -> str:
 
 
 def as_metadata(last: EndRecord) -> dict[str, str]:
-    """Return the end record as MCAP metadata, which holds strings only."""
+    """Return the end record `last` as MCAP metadata, a mapping of strings to strings."""
     fields = msgspec.to_builtins(last).items()
     return {key: str(value) for key, value in fields if value is not None}
 
@@ -119,7 +120,10 @@ def end_in(data: bytes) -> EndRecord | None:
 
 
 def _last(tail: bytes) -> dict[str, str] | None:
-    """Return the metadata of the end record in `tail`; None if the file is not finished."""
+    """Return the metadata of the end record in `tail`, the last bytes of a file.
+
+    Returns None if the file is not finished.
+    """
     footer_at = len(tail) - len(MAGIC) - 20 - HEAD.size
     if footer_at < 0 or not (tail.startswith(_FOOTER, footer_at) and tail.endswith(MAGIC)):
         return None

@@ -1,8 +1,8 @@
 """Exports a recording for other programs: as ROS messages in MCAP or a ROS bag, or as CSV.
 
-In the CSV table each feedback line and each gyro sample has its own row. The columns for `acsard
-calibrate` come first. Calibration must not use the columns `odom_...` as a measured position,
-because odometry is computed with the dimensions that calibration is to find.
+In the CSV table each feedback line and each gyro sample has its own row. The first columns are
+those that `acsard calibrate` reads. A calibration must not use the columns `odom_...` as measured
+positions, because odometry is computed with the dimensions that the calibration has to find.
 """
 
 from __future__ import annotations
@@ -70,11 +70,17 @@ def offered_qos(qos: Qos) -> str:
 
 
 def bag_metadata(file: str, topics: Sequence[BagTopic], first_ns: int, last_ns: int) -> str:
-    """Return the `metadata.yaml` that turns a directory with the MCAP file `file` into a ROS bag.
+    """Return the text of the file `metadata.yaml` of a ROS bag with one MCAP file.
 
-    Every ROS 2 release since Humble reads format version 5 with numeric QoS policies. The MCAP file
-    has the same QoS text in the metadata of each channel, where `ros2 bag play FILE` reads it.
-    `first_ns` and `last_ns` are the earliest and the latest wall-clock time of a message.
+    The text has format version 5 with numeric QoS policies, which every ROS 2 release since Humble
+    reads. Each channel of the MCAP file also contains its QoS text, because `ros2 bag play FILE`
+    reads it there.
+
+    Args:
+        file: name of the MCAP file.
+        topics: the topics in the MCAP file.
+        first_ns: earliest wall-clock time of a message, ns since 1970.
+        last_ns: latest wall-clock time of a message, ns since 1970.
     """
     count = sum(topic.count for topic in topics)
     begins = f"nanoseconds_since_epoch: {first_ns}"
@@ -133,7 +139,7 @@ _NO_OUTPUTS = "," * len(OUTPUT_COLUMNS)
 
 
 def csv_rows(step: Step, outputs: Outputs) -> Iterator[str]:
-    """Yield the CSV rows of a step, without line ends."""
+    """Yield the CSV rows of a step, without line breaks."""
     now = step.inputs.now
     for sample in step.inputs.gyro:
         yield gyro_columns(sample, now) + _NO_OUTPUTS
@@ -156,16 +162,20 @@ def measured_csv_rows(step: Step, outputs: Outputs) -> Iterator[str]:
 
 
 def wheel_columns(estimate: Estimate) -> str:
-    """Return the columns of `MEASURED` for a feedback line. The yaw rate is empty."""
+    """Return the CSV fields of a feedback line for the columns `MEASURED`.
+
+    The field of the yaw rate is empty.
+    """
     wheels = ",".join(f"{speed:.6g}" for speed in estimate.speeds.as_tuple())
     return f"{_csv_seconds(estimate.at.wall_ns)},{wheels},"
 
 
 def gyro_columns(sample: GyroSample, now: Instant) -> str:
-    """Return the columns of `MEASURED` for a gyro sample. The wheel speeds are empty.
+    """Return the CSV fields of a gyro sample for the columns `MEASURED`.
 
-    The time is the stamp of the sample. If the sample has no stamp, it is the time of arrival,
-    converted to wall-clock time with the clocks in `now`.
+    The fields of the wheel speeds are empty. The time is the stamp of the sample. If the sample has
+    no stamp, the time is its time of arrival, converted to wall-clock time with the clocks in
+    `now`.
     """
     arrived_ns = sample.at_ns + now.wall_ns - now.mono_ns
     at_ns = arrived_ns if sample.stamp_ns is None else sample.stamp_ns
@@ -179,14 +189,14 @@ def _csv_seconds(wall_ns: int) -> str:
 Kind = Literal["mcap", "csv", "rosbag2"]
 
 SUFFIX: dict[Kind, str] = {"mcap": ".ros2.mcap", "csv": ".csv", "rosbag2": ".rosbag2"}
-"""Suffix of the exported file if the user gives no name."""
+"""Maps each kind of export to the suffix of its file or directory if the user gives no name."""
 
 
 class ExportResult(Struct, frozen=True):
     count: int
     """Number of exported messages, or of exported rows of a CSV table."""
     gaps: list[Gap]
-    """Gaps of the recording that overlap the exported time span. The steps in a gap are missing."""
+    """Gaps of the recording that overlap the exported time span. The export lacks their outputs."""
 
 
 class _Writer:
@@ -201,7 +211,8 @@ class _Writer:
     def skip(self, step: Step, inside: bool) -> None:
         """Process a step whose outputs are not exported.
 
-        `inside` is true if the step is in the time span. Then its log lines are exported anyway.
+        `inside` is true if the step is in the exported time span, but could not be replayed. Its
+        log lines are then exported nevertheless.
         """
 
     def end(self, ending: str = "") -> None:
@@ -305,10 +316,13 @@ def export(
     """Replay a recording, and write its messages or its CSV table to `new`.
 
     Args:
+        recording: the recording to replay.
         new: the file to write, or the directory if `kind` is `rosbag2`.
+        kind: the format of the exported data.
         other: the configuration to replay with; None means the recorded configuration.
+        span: the part of the recording that is exported.
         progress: called every `PROGRESS_STEPS` steps.
-        force: overwrite `new`, as far as `atomic_output.replacing` allows it.
+        force: true if an existing `new` may be overwritten. A recording is never overwritten.
 
     Raises:
         RecordingError: nothing was recorded in `span`, or the recording cannot be replayed.
@@ -354,7 +368,7 @@ def _write_steps(
     began_ns, over = recording.about.mono_ns, False
 
     def is_inside(step: Step) -> bool:
-        """Return whether a step is in the span. End the output at the first step after the span."""
+        """Return whether a step is in `span`. The first step after `span` ends the output."""
         nonlocal over
         seconds = (step.inputs.now.mono_ns - began_ns) / NS_PER_S
         if seconds > span.end and not over:
@@ -389,7 +403,8 @@ def _gaps(run: RecordedRun, span: Span, about: About) -> list[Gap]:
 def measured(recording: Recording) -> bytes:
     """Return the CSV table that `acsard calibrate` reads.
 
-    Raises `RecordingError` if the recording has no gyro samples.
+    The table ends at the first gap of the recording. Raises `RecordingError` if the table has no
+    gyro samples.
     """
     run = RecordedRun(recording)
     lines, has_gyro = [MEASURED_CSV_HEADER], False

@@ -148,7 +148,7 @@ class EndRecordBuilder:
                 self._starts = self._starts or unfinished(data).number == 0
 
     def event(self, event: TimelineEntry) -> None:
-        """Add an event to the summary if it is one of `INCIDENT_WORDS`."""
+        """Add an event to the summary if its name is a key of `INCIDENT_WORDS`."""
         if event.name in INCIDENT_WORDS:
             self._incidents.append(event)
 
@@ -267,13 +267,13 @@ class Writing:
             self.end_chunk()
 
     def event(self, event: TimelineEntry) -> None:
-        """Add an event as a message of `events`, and to the summary in the end record."""
+        """Add a message to the channel `events`, and the event to the end record's summary."""
         wall_ns = int(event.seconds * NS_PER_S)
         self.add("events", wall_ns, msgspec.json.encode(event))
         self._end_builder.event(event)
 
     def flush(self) -> None:
-        """Write all added messages to the file in readable form, and sync it to the disk."""
+        """Write all added messages to the file, and sync it, so that they can be read."""
         if self._chunk is not None and self._chunk.has_unwritten:
             self._put(self._chunk.take())
         self._sync()
@@ -307,7 +307,10 @@ class Writing:
         self._index.chunk()
 
     def finish(self, cut: str = "", why: str = "") -> None:
-        """Write the end of the file and close it. `cut` and `why` are fields of `EndRecord`."""
+        """Write the end of the file and close it.
+
+        `cut` and `why` become the fields of these names in the end record.
+        """
         self.end_chunk()
         for record in self._about:
             self._write(record)

@@ -42,7 +42,7 @@ def no_progress(wall_ns: int) -> None:
 INCOMPLETE_STATE_ERRORS = (
     AttributeError, TypeError, ValueError, LookupError, ArithmeticError, RecursionError
 )  # fmt: skip
-"""Exceptions that the robot's code raises if its recorded state lacks parts that it expects."""
+"""Exceptions that a `Robot` may raise if it was rebuilt from a recorded state that lacks parts."""
 
 
 class Gap(Struct):
@@ -57,7 +57,7 @@ class Gap(Struct):
     end_ns: int
     """Monotonic time of the first replayed step after the gap, or of the recording's end, ns."""
     unreadable: int = 0
-    """Number of steps that cannot be read. It follows from the numbers of the steps around them."""
+    """Number of steps that cannot be read, computed from the numbers of the steps around them."""
     skipped: int = 0
     """Number of readable steps that are not replayed, because the next recorded robot state comes
     later."""
@@ -108,7 +108,8 @@ def _items(
 ) -> Iterator[list[Step] | Checkpoint]:
     """Yield the readable batches of steps and the checkpoints, in the order of the file.
 
-    If `copies` is not None, it receives each batch and each message of the channel `events`.
+    If `copies` is not None, each batch and each message of the channel `events` is passed to it
+    first.
     """
     for topic, _, data in recording.messages():
         if topic == "events" and copies is not None:
@@ -126,8 +127,8 @@ def _items(
 
 
 MAX_STATE_BYTES = 8
-"""Limit on the size of the robot states that are decoded after gaps, in bytes for each byte of the
-file. `MAX_BYTES` are allowed in addition. A genuine file stays below this limit. Without the limit,
+"""Limit on the robot states that are decoded after gaps. Their total size may be `MAX_BYTES` plus
+this many bytes for each byte of the file. A genuine file stays below this limit. Without the limit,
 the replay of a forged file of 5 kB took 4 s."""
 
 
@@ -148,11 +149,11 @@ class _Source:
 
     @contextmanager
     def state_errors(self) -> Iterator[None]:
-        """Convert errors in the `with` block that an incomplete robot state causes.
+        """Raise `RecordingError` if the robot fails in the `with` block due to its recorded state.
 
-        Such an error becomes a `RecordingError`. Use this context around every use of the robot,
-        because a forged recorded state may lack any part. If the robot is not from the file, an
-        error in the block is a defect and is raised unchanged.
+        A forged state may lack any part, so every use of the robot must be in such a block. If the
+        robot was not rebuilt from a recorded state, an error in the block is a defect in the code,
+        and is raised unchanged.
         """
         try:
             yield
@@ -175,9 +176,10 @@ class _Source:
     ) -> State | None:
         """Decode the robot in `saved` if it was saved just before the step `number`.
 
-        Return None if `saved` belongs to another step, if this version cannot read the robot, or if
-        the decoded states exceed `MAX_STATE_BYTES`. `tried` takes the configuration of the decoded
-        robot, and returns the configuration that replaces it.
+        Returns None if `saved` is None or belongs to another step, if this version cannot read the
+        robot, or if the total size of the decoded states exceeds the limit (`MAX_STATE_BYTES`).
+        `tried` takes the configuration of the decoded robot, and returns the configuration that
+        replaces it. If `tried` is None, the robot keeps its configuration.
         """
         if saved is None or saved.number != number:
             return None
@@ -296,9 +298,10 @@ class RecordedRun(_Source):
 def _with_changes(other: Config, recorded: Config, present: Config) -> Config:
     """Return `other` with the settings that clients changed while the recorded robot ran.
 
-    These are the settings in which `present` differs from `recorded`. If `other` does not permit
-    their values, return `other` unchanged, because a robot with the configuration `other` would
-    have refused the changes.
+    `recorded` is the configuration at the beginning of the recording, and `present` is the later
+    configuration that includes the changes. If the changed values are not permitted together with
+    `other`, the result is `other` itself, because a robot with the configuration `other` would have
+    refused the changes.
     """
     before = dict(flat(effective(recorded)))
     changes = {k: v for k, v in flat(effective(present)) if before.get(k) != v}
@@ -332,8 +335,8 @@ def replay_file(
 def _failed_step(recording: Recording, robot: Robot, last: int | None) -> str:
     """Replay the step in which the daemon failed, and return the text for `failed_step`.
 
-    `robot` is the robot after the step with the number `last`. The failed step is replayed only if
-    it has the number `last` + 1.
+    `last` is the number of the last replayed step, or None if there was none, and `robot` is the
+    robot after that step. The failed step is replayed only if it has the number `last` + 1.
     """
     if recording.unfinished is None:
         return ""
@@ -367,7 +370,7 @@ class DisplayReplay(_Source):
         """Notes for the user about how this replay may differ from the recorded drive."""
         self.config = config_of(recording)
         self._in_gap = False
-        """True from a missing step to the next robot state in the file."""
+        """True after a missing step, until the replay resumes with a robot state from the file."""
         try:
             _, self._state = _first_state(recording)
             with self.state_errors():
@@ -377,8 +380,8 @@ class DisplayReplay(_Source):
         except RecordingError as error:
             self._state, self.replay = None, Replay(self.config)
             self.notes.append(
-                "the replay begins with a robot that has just started, which may differ from the "
-                f"recorded robot, because the recorded state cannot be used: {error}"
+                "the recorded state of the robot cannot be used, so the replay begins with a robot "
+                f"that has just started, and may differ from the recorded drive: {error}"
             )
 
     def steps(self) -> Iterator[tuple[Step, Outputs, Robot]]:
@@ -477,7 +480,8 @@ class EventCopies:
     def end(self) -> None:
         """Compare the events of the last batch with their copies, and check the end record.
 
-        If the file is complete, the summary in its end record must agree with the events.
+        The end record is checked only if the file is finished and undamaged: its summary must agree
+        with the events.
         """
         recording = self._recording
         self._compare(last=True)
@@ -494,9 +498,11 @@ class EventCopies:
     def _compare(self, last: bool, follows: bool = True) -> None:
         """Compare the events of the most recent batch with their copies.
 
-        Nothing is compared if steps or copies may be missing because of damage. `last` is true if
-        no batch follows; copies may then be missing because the file was cut off. `follows` is true
-        if no step is missing between this batch and the next one.
+        Nothing is compared if steps or copies may be missing because of damage.
+
+        Args:
+            last: true if no batch follows. Copies may then be missing because the file was cut off.
+            follows: true if no step is missing between this batch and the next one.
         """
         recording = self._recording
         if recording.damaged > self._damaged or not follows:

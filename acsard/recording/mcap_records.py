@@ -39,7 +39,7 @@ PARAMETERS = ZstdCompressionParameters.from_level(
 """Parameters of zstd for chunks of 256 KiB. With them the compressor needs 3 MB of memory."""
 
 LAST_BLOCK = b"\x01\0\0"
-"""An empty zstd block with the mark of a last block. It completes a chunk that was cut off."""
+"""An empty zstd block that is marked as the last one. It completes a chunk that was cut off."""
 
 MAX_CHUNK_BYTES = 1 << 23
 """Largest uncompressed chunk that is read, bytes. Recorders write up to 1 MiB plus one message."""
@@ -48,8 +48,9 @@ MAX_MESSAGE_BYTES = 1 << 22
 """Largest message that is read, bytes. One second of steps and 20 commands take 16 000 bytes."""
 
 _HEAD = struct.Struct("<BQQQQII4sQ")
-"""Header of a chunk record: opcode, length, first and last time, size and CRC-32 of the
-uncompressed data, length of the name of the compression, this name, compressed size."""
+"""Header of a chunk record. The fields are: opcode, length of the record, earliest and latest time
+of a message, size of the uncompressed data, its CRC-32, length of the compression's name, this
+name, and size of the compressed data."""
 
 _AFTER_LENGTH = _HEAD.size - 9
 """Number of bytes in a chunk's header after the length field. The value of that field includes
@@ -59,13 +60,14 @@ _NAME_AT = 37
 """Offset of `ZSTD` from the beginning of a chunk's header, bytes."""
 
 ZSTD = struct.pack("<I4s", 4, b"zstd")
-"""Length and name of the compression. Every chunk's header contains these bytes."""
+"""The length of the compression's name, and the name. Every chunk's header contains these bytes."""
 
 _ENDLESS = (1 << 63) - 1
 """Value of the length field in the header of a growing chunk. No file is that long."""
 
 _MESSAGE = struct.Struct("<BQHIQQ")
-"""Header of a message record: opcode, length, channel, sequence number, and the time twice."""
+"""Header of a message record: opcode, length, channel, sequence number, time of the log entry, and
+time of publication. A recording uses the sequence number for a checksum, and has equal times."""
 
 MAX_DATA_BYTES = MAX_MESSAGE_BYTES - _MESSAGE.size
 
@@ -82,8 +84,8 @@ _BLOCK_BYTES = 1 << 17
 """Largest size of a zstd block, compressed or uncompressed, bytes."""
 
 _BLOCK_EFFORT = 1 << 10
-"""Number of unpacked bytes that each block counts as, in addition to its own. Even an empty block
-takes about as long as 1 KiB of data."""
+"""Work for each zstd block in addition to the work for its data, in unpacked bytes. Even an empty
+block takes about as long as 1 KiB of data."""
 
 _REPEATED = 1
 """Type of a zstd block that holds a single byte and says how often to repeat this byte."""
@@ -160,7 +162,8 @@ class ReadChunk(NamedTuple):
     begin: int
     """Offset of the chunk's header in the file."""
     end: int
-    """Offset in the file after the last block that ends with a complete message."""
+    """Offset in the file at which the readable part ends. The last block of the readable part ends
+    with a complete message."""
     messages: list[Message]
     complete: bool
     effort: int = 0
@@ -182,7 +185,7 @@ class ReadChunk(NamedTuple):
 
 
 def chunk_places(data: bytes, begin: int) -> Iterator[int]:
-    """Yield each offset in the file, not smaller than `begin`, at which a chunk may begin."""
+    """Yield each offset, `begin` or later, at which a chunk may begin. `data` is the whole file."""
     at = data.find(ZSTD, begin + _NAME_AT)
     while at >= 0:
         yield at - _NAME_AT
@@ -190,7 +193,7 @@ def chunk_places(data: bytes, begin: int) -> Iterator[int]:
 
 
 def read_chunk(data: bytes, begin: int) -> ReadChunk | None:
-    """Read the chunk whose header begins at the offset `begin`; return None without a chunk."""
+    """Read the chunk whose header begins at the offset `begin`; return None if there is none."""
     at = begin + _HEAD.size
     named = data.startswith(ZSTD, begin + _NAME_AT)
     if at > len(data) or not (named or data[begin] == Opcode.CHUNK):
@@ -248,8 +251,8 @@ def _blocks(data: bytes, at: int) -> Iterator[tuple[int, bytes, bool]]:
 def _messages(data: bytearray) -> tuple[list[Message], int, int]:
     """Decode the complete messages at the beginning of `data`.
 
-    Returns a triple: the messages, their total size in bytes, and the number of bytes that the next
-    message needs. The last number exceeds `MAX_MESSAGE_BYTES` if the next message is damaged.
+    Returns a triple: the messages, their total size in bytes, and the size of the next message in
+    bytes as far as it is known. This size exceeds `MAX_MESSAGE_BYTES` if that message is damaged.
     """
     messages: list[Message] = []
     at = 0
@@ -277,10 +280,10 @@ DAMAGE = (
 MAGIC = b"\x89MCAP0\r\n"
 
 MAX_EFFORT = 256
-"""Limit on the work of unpacking damaged chunks, in unpacked bytes for each byte of the file.
+"""Limit on the work for damaged chunks, in unpacked bytes for each byte of the file.
 
-Each byte of a chunk in the test recordings unpacks to 5 to 13 bytes. Damaged chunks may need more
-work, because a damaged chunk is read up to three times, and a damaged block counts as 128 KiB.
+In the test recordings, each byte of a chunk unpacks to 5 to 13 bytes. The limit is larger, because
+a damaged chunk is read up to three times, and a damaged block counts as 128 KiB.
 """
 
 HEAD = struct.Struct("<BQ")
@@ -405,11 +408,11 @@ class _Chunks:
 
     @property
     def spent(self) -> bool:
-        """True if the work for incomplete chunks exceeds its limit, so that `later()` gives up."""
+        """True if the work for incomplete chunks exceeds its limit. `later()` then stops."""
         return self._effort < 0
 
     def read(self, begin: int) -> ReadChunk | None:
-        """Read the chunk that begins at the offset `begin`; return None without a chunk there.
+        """Read the chunk that begins at the offset `begin`; return None if there is none.
 
         The work for an incomplete or empty chunk counts towards the limit.
         """

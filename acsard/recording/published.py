@@ -28,7 +28,8 @@ MEASURED = frozenset({"acsard: control loop", "acsard: certificate"})
 
 
 ROUNDED_NS = 1000
-"""Upper bound of the rounding error of `TimelineEntry.seconds`, ns. Two steps are never closer."""
+"""Upper bound of the rounding error of `TimelineEntry.seconds`, ns. The times of two steps always
+differ by more."""
 
 
 class Published(NamedTuple):
@@ -46,9 +47,10 @@ class Publisher:
     """Rebuilds the messages of a replayed robot, step by step."""
 
     def __init__(self, robot: Robot, started_ns: int) -> None:
-        """Prepare for the first step.
+        """Prepare to rebuild the messages of `robot`, before its first step is replayed.
 
-        Messages that never change have the stamp `started_ns`, the daemon's start in ns since 1970.
+        `started_ns` is the time of the daemon's start, ns since 1970. It becomes the stamp of the
+        messages that never change.
         """
         self.robot = robot
         """The robot that replays the steps. If the replay resumes with another robot, the caller

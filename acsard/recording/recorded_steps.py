@@ -114,8 +114,8 @@ class RecordedOutputs(Struct, frozen=True):
     """One pose for each feedback line that odometry accepted."""
     events: tuple[Event, ...] = ()
     checksum: int | None = None
-    """CRC-32 of all exact poses, twists and angles that the wheels rolled in the batch. Only the
-    last step of a batch has this checksum; it is None in the other steps."""
+    """CRC-32 of the exact poses, twists and wheel rotations in the whole batch. Only the last
+    step of a batch has this checksum; it is None in the other steps."""
     names: int | None = None
     """CRC-32 of all `input_names()` of the batch; None in a file of an older version. Only the last
     step of a batch has this checksum; it is None in the other steps."""
@@ -165,8 +165,8 @@ def unfinished(data: bytes) -> Unfinished:
 def checksum(estimates: Sequence[Estimate], before: int) -> int:
     """Extend the CRC-32 `before` by the estimates of a step, and return the new CRC-32.
 
-    The CRC-32 covers all bits of the poses, twists and angles that the wheels rolled. `before` is 0
-    for the first step of a batch.
+    The CRC-32 covers all bits of the poses, the twists and the angles by which the wheels turned.
+    `before` is 0 for the first step of a batch.
     """
     for e in estimates:
         pose, twist = e.pose, e.twist

@@ -26,15 +26,15 @@ MAX_QUEUED_STEPS = 4096
 """Largest number of queued steps. At 400 steps a second, the queue is full after 10 s."""
 
 SLOW_NS = 3 * NS_PER_S
-"""If a sync takes longer than this time, ns, the log reports that the disk hangs."""
+"""Duration of a sync, ns, above which the log reports that the disk hangs."""
 
 SLOW = "the disk has accepted no data for 3 s"
 
 PAUSE_NS = NS_PER_S // 4
-"""Longest time between two steps that counts as a wait for the disk, ns.
+"""Largest part of the time between two steps that counts as a wait for the disk, ns.
 
-A longer time counts only up to this limit. The process must have been stopped for the rest of the
-time, so the disk is not the cause of it.
+If two steps are further apart, the whole process was stopped for the rest of the time. The disk is
+not the cause of that.
 """
 
 FLUSH_S = 0.98
@@ -147,7 +147,8 @@ class Recorder:
                 missing = many(self._lost - self._lost_before, "step is", "steps are")
                 self._report(
                     Event(
-                        "recording", f"the disk keeps up again; {missing} missing in the recording"
+                        "recording",
+                        f"the disk is fast enough again; {missing} missing in the recording",
                     )
                 )
             self._waited_ns = 0

@@ -1,7 +1,7 @@
 """Finishes a recording that was cut off: as a copy, or in place if the disk has no room for a copy.
 
-Recovery deletes no readable data. A file is only renamed if this version cannot read it, or if the
-disk has no room even for the end record of the file.
+Recovery deletes no readable data. If this version cannot read a file, or if the disk has no room
+even for its end record, the file is renamed and its content stays unchanged.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ A larger file has more than a header and one second of steps, so it is never del
 def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
     """Make the finished file `whole` from the recording `part`, which was cut off.
 
-    A small file without readable data is deleted. A file that cannot be read is only renamed.
-    Returns a message for the log, or "" if there is nothing to report. Raises `OSError` if the disk
-    refuses to read or write.
+    A small file without any data is deleted. Any other file that this version cannot read is
+    renamed, and its content stays unchanged. Returns a message for the log, or "" if there is
+    nothing to report. Raises `OSError` if the disk refuses to read or write.
 
     Args:
         part: the file that was cut off; it is removed or renamed.
@@ -69,8 +69,8 @@ def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
     except RecordingError as error:
         part.rename(whole)
         return (
-            "acsard cannot finish a recording that was cut off, and only renamed its file to "
-            f"{whole.name}: {error}"
+            "acsard cannot finish a recording that was cut off; its file now has the name "
+            f"{whole.name}, and its content is unchanged: {error}"
         )
     # The file time must be the time of the recording's end, not of its recovery.
     os.utime(whole, ns=(before.st_atime_ns, before.st_mtime_ns))
@@ -91,7 +91,10 @@ def _has_chunks(part: Path) -> bool:
 
 
 def _copy(recording: Recording, part: Path, whole: Path, cut: str) -> bool:
-    """Write a copy without the damaged places; return False if the disk is full."""
+    """Write the readable data of `recording` to `whole`, and then delete `part`.
+
+    `cut` says why the recording was cut off, a key of `CUTS`. Returns False if the disk is full.
+    """
     written = part.with_name(f".{part.name}.new")
     written.unlink(missing_ok=True)
     try:
@@ -106,12 +109,14 @@ def _copy(recording: Recording, part: Path, whole: Path, cut: str) -> bool:
 
 
 def _finish_in_place(recording: Recording, part: Path, cut: str) -> bool:
-    """Write the end of the file directly after its last readable data, over any incomplete data.
+    """Write the missing end of the file `part` directly after its last readable data.
 
-    Also replace each `GROWING_HEAD` by the true header of its chunk. Returns False if the disk has
-    no room; the file is then unchanged. No readable data is removed to gain room, because some
-    disks do not gain room in this way. If an earlier recovery wrote the end before a power cut
-    interrupted it, only the headers are written.
+    The end overwrites incomplete data. Each `GROWING_HEAD` is replaced by the true header of its
+    chunk. If an earlier recovery was interrupted after it had written the end, only the headers are
+    written. `cut` says why the recording was cut off, a key of `CUTS`.
+
+    Returns False if the disk has no room for the end. The file is then unchanged. Readable data is
+    not removed to make room, because on some disks this does not help.
     """
     builder = EndRecordBuilder(recording.about)
     for topic, wall_ns, data in recording.messages():
@@ -142,8 +147,13 @@ def _finish_in_place(recording: Recording, part: Path, cut: str) -> bool:
 def _writes(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], int]:
     """Return a pair: the writes that finish a file, and the size of the finished file in bytes.
 
-    Each write is a pair (offset, data). `before` is the present content of the file. The first
-    write is the end of the file, because it is the only write for which the disk may have no room.
+    Each write is a pair (offset, data). The first write is the end of the file, unless an earlier
+    recovery wrote it. It comes first because the disk may have no room for it. The other writes
+    replace headers of chunks.
+
+    Args:
+        before: the present content of the file.
+        last: the end record of the finished file.
     """
     heads: list[tuple[int, bytes]] = []
     chunk, index = None, Index()
@@ -174,7 +184,7 @@ def _writes(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], in
 
 
 def _put(stream: FileIO, at: int, data: bytes) -> None:
-    """Write `data` at the offset `at` and sync it. After an error, a part of it may be written."""
+    """Write `data` at the offset `at` and sync it. An error may leave only a part of it written."""
     stream.seek(at)
     while data:
         data = data[stream.write(data) :]
@@ -182,10 +192,11 @@ def _put(stream: FileIO, at: int, data: bytes) -> None:
 
 
 def _end(last: EndRecord, index: Index, at: int) -> bytes:
-    """Return the bytes that end an MCAP file, which the caller writes at the offset `at`.
+    """Return the bytes from the end record `last` to the end of an MCAP file.
 
-    The summary section does not repeat the schema and the channels, because the disk may be nearly
-    full. It has the statistics, because some readers treat a file without statistics as empty.
+    The caller writes these bytes at the offset `at`. Their summary section comes from `index`. It
+    does not repeat the schema and the channels, because the disk may be nearly full. It has the
+    statistics, because some readers treat a file without statistics as empty.
     """
     record = Metadata(END, as_metadata(last))
     data = encoded(record)

@@ -18,7 +18,7 @@ HUNDREDTHS = 100.0
 """Divisor that converts the wheel speeds in a line to rad/s."""
 
 LINE_SETTINGS = ("limits.", "drive.", "mcu.wheels.")
-"""Prefixes of the settings that change the line which a given command leads to."""
+"""Prefixes of the names of the settings that affect the speeds in the lines to the board."""
 
 MAX_KEYS = 8
 """Largest number of changed settings that a line of text names."""
@@ -61,7 +61,7 @@ def explain_verdict(other: bool) -> str:
 
 
 def describe_gaps(gaps: Sequence[Gap], how: str) -> str:
-    """Return a sentence with the number of seconds and steps in the gaps, or "" without a gap.
+    """Return a sentence with the seconds and steps in the gaps, or "" if there are no gaps.
 
     The sentence begins with `how`, for example "not compared".
     """
@@ -152,9 +152,9 @@ def explain_settings(
         )
         if first is not None and first.number < fault.number:
             rows.append(
-                "  the recorded wheels obeyed the recorded commands, not the commands of this "
-                "replay, so a robot with this configuration might not have had that fault. Only "
-                "the part of the replay before the fault is reliable"
+                "  the wheel speeds in the recording are the response to the recorded lines, not "
+                "to the lines of this replay. So a robot with this configuration might not have "
+                "had that fault, and only the part of the replay before the fault is reliable"
             )
     return rows
 

@@ -51,7 +51,8 @@ JUMP_NS = 60 * NS_PER_S
 measured against the monotonic clock, between two calls of `ClockWatch.jump_ns()`."""
 
 STEADY_NS = 600 * NS_PER_S
-"""After this time without a jump, ns, the wall clock is trusted to tell the age of a recording."""
+"""Time without a jump of the wall clock, ns, after which this clock may decide that a recording is
+too old."""
 
 
 class Disk(NamedTuple):
@@ -105,13 +106,13 @@ def to_delete(
 ) -> set[str]:
     """Return the names of the recordings that must be deleted so that one more file fits.
 
-    `ended` must be sorted by `Ended.number`. `freed` is None if the disk accepts data. Otherwise
-    the disk refuses to write, although it may report free space. `freed` is then the number of
-    bytes that were deleted since the disk began to refuse:
+    `ended` must be sorted by `Ended.number`. If the disk accepts data, `freed` is None. If it
+    refuses to write, even though it may report free space, `freed` is the number of bytes that were
+    deleted since its first refusal. The refusal has these consequences:
 
-    - 0: delete at least one recording, even a protected one.
-    - below `LEAST_BYTES`: delete at least one more recording, but no protected one for this reason.
-    - `LEAST_BYTES` or more: the refusal is no longer a reason to delete a recording.
+    - `freed` is 0: at least one recording is deleted, even if all of them are protected.
+    - `freed` is less than `LEAST_BYTES`: at least one more unprotected recording is deleted.
+    - `freed` is `LEAST_BYTES` or more: no recording is deleted because of the refusal.
     """
     protected = _protected(ended)
     plain = [file for file in ended if file.name not in protected]
@@ -137,7 +138,8 @@ def to_delete(
 def _protected(ended: Sequence[Ended]) -> set[str]:
     """Return the names of the protected recordings.
 
-    These are the `KEPT_FILES` newest `kept` recordings, and the `near` recordings around them.
+    These are the `KEPT_FILES` newest `kept` recordings, and the `near` recordings in their groups
+    (see `_groups`).
     """
     kept = {file.name for file in [file for file in ended if file.kind == "kept"][-KEPT_FILES:]}
     return {

@@ -91,9 +91,10 @@ class Read(NamedTuple):
     """One read from the serial port. Its times are in units of `Batch.unit`."""
 
     age: int
-    """Time from the read to the step that processes the bytes."""
+    """Time from the read to the step that processes the bytes, in units of `Batch.unit`."""
     offset: int
-    """Offset of the wall clock from the monotonic clock at the read, minus `Batch.offset_ns`."""
+    """Offset of the wall clock from the monotonic clock at the read, minus `Batch.offset_ns`, in
+    units of `Batch.unit`."""
     data: bytes
 
 
@@ -106,10 +107,11 @@ class Row(Struct, frozen=True, array_like=True):
     shutting_down: bool
     superseded: bool
     now: int
-    """Monotonic time of the step, minus that of the most recent earlier row with a `tick`. If no
-    earlier row of the batch has a `tick`, it is minus `Batch.mono_ns`."""
+    """Monotonic time of the step, in units of `Batch.unit`. It is counted from the most recent
+    earlier row whose `tick` is true, or from `Batch.mono_ns` if the batch has no such row."""
     offset: int
-    """Offset of the wall clock from the monotonic clock, minus `Batch.offset_ns`."""
+    """Offset of the wall clock from the monotonic clock at the step, minus `Batch.offset_ns`, in
+    units of `Batch.unit`."""
     reads: tuple[Read, ...]
     line: bytes | None
     sent: bytes | bool
@@ -130,11 +132,12 @@ class Batch(Struct, frozen=True, array_like=True):
     offset_ns: int
     """Offset of the wall clock from the monotonic clock at the first step, ns."""
     unit: Annotated[int, Meta(ge=1)]
-    """Unit of the times in `rows`, ns: their greatest common divisor. It is at least 1000 if the
-    clocks count in us."""
+    """Unit of the times in `rows`, ns: the greatest common divisor of these times. It is at least
+    1000 if the clocks count in us."""
     rows: Annotated[tuple[Row, ...], Meta(min_length=1, max_length=MAX_ROWS)]
     checksum: int
-    """CRC-32 of all estimates (pose, twist and angles that the wheels rolled) of the batch."""
+    """CRC-32 of all estimates of the batch: the poses, the twists and the angles by which the
+    wheels turned."""
     names: int | None = None
     """CRC-32 of all `input_names` of the batch; None if an older version recorded it."""
 
@@ -317,7 +320,8 @@ def _sent(row: Row) -> bytes | None:
 def _instant(batch: Batch, mono_ns: int, offset: int) -> Instant:
     """Return the instant with the monotonic time `mono_ns`.
 
-    `offset` is a field of `Row` or `Read`. Raises `ValueError` if a time is out of range.
+    `offset` is the field of this name of a `Row` or a `Read` in `batch`. Raises `ValueError` if a
+    time is out of range.
     """
     ahead_ns = batch.offset_ns + offset * batch.unit
     if abs(mono_ns) >= 2 * MAX_TIME_NS or abs(ahead_ns) >= MAX_OFFSET_NS:

@@ -2,7 +2,7 @@
 
 The daemon splits the recording of one run into several files. The last step of one file and the
 first step of the next file have consecutive numbers. Such files are read as one `Series`, so that a
-drive or a replay goes on from file to file.
+drive or a replay can continue from one file to the next.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from acsard.recording.file import Recording, Topic
 from acsard.recording.time_span import Contents, Span, clock, part_between, read_contents
 
 MARGIN_S = 60.0
-"""Tolerance for the times in an end record, s.
+"""Tolerance for the times in an end record, and for the time between two files of a series, s.
 
-The end record gives the time at which the last message begins. If the disk is slow, this message
-may hold many seconds of steps. Therefore a file is also read if the times in its end record are
-outside the searched range, but by no more than `MARGIN_S`. In a series, the time from the last step
-of a file to the first step of the next file is also less than `MARGIN_S`.
+The end record contains the time at which the last message begins. If the disk is slow, this message
+may hold many seconds of steps. Therefore a file is read even if the times in its end record miss
+the searched range by up to `MARGIN_S`. In a series, the first step of a file comes less than
+`MARGIN_S` after the last step of the previous file.
 """
 
 GAP_S = 2.0
@@ -68,7 +68,10 @@ class Series(Recording):
 
 
 class Found(NamedTuple):
-    """A recording with steps in the searched range of time. `part` is its part in that range."""
+    """A recording with steps in the searched range of time.
+
+    `part` is the part of the recording that lies in this range.
+    """
 
     recording: Recording
     part: Span
@@ -166,10 +169,10 @@ def _groups(files: Sequence[Path], chosen: dict[int, Contents]) -> list[list[int
 
 
 def _earlier(files: Sequence[Path], number: int, contents: Contents) -> list[int]:
-    """Return the indices of the files with the earlier part of a drive, oldest first.
+    """Return the indices of the files that contain the earlier part of a drive, oldest first.
 
-    It is the drive during which the file with the index `number` begins. The list is empty if that
-    file does not begin during a drive.
+    The robot is on this drive when the file with the index `number` begins. `contents` are the
+    contents of that file. The list is empty if the file does not begin during a drive.
     """
     found: list[int] = []
     while number > 0 and contents.first.recorded.status[0] == "driving":

@@ -38,7 +38,7 @@ OTHER_PARTS: dict[tuple[str, str], type] = {
     ("collections", "Counter"): Counter,
     ("collections", "deque"): deque,
 }
-"""Other classes that may be parts of a robot, each by the names of its module and of the class."""
+"""Other classes that may be parts of a robot. Each key is the pair (module name, class name)."""
 
 PROTOCOL = 5
 """Version of the pickle format that `unpickling.py` reads."""
@@ -226,7 +226,7 @@ def _same(now: Any, begun: Any) -> bool:
 
 
 def _names(item: object) -> list[str]:
-    """Return the names of the attributes that the object itself stores, without its class's."""
+    """Return the names of the attributes that the object stores, without class attributes."""
     slots = [name for kind in type(item).__mro__ for name in getattr(kind, "__slots__", ())]
     names = [*getattr(item, "__dict__", ()), *slots]
     return [name for name in names if hasattr(item, name)]

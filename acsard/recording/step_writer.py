@@ -51,7 +51,8 @@ INCIDENTS = frozenset({
     "fault", "stop", "emergency_stop", "bumper_pressed", "battery_stop", "link_down", "link_stale",
     "port_lost",
 })  # fmt: skip
-"""Names of the events that count as incidents. All files within a minute of one are retained."""
+"""Names of the events that count as incidents. All files within a minute of an incident are
+retained."""
 
 
 class Bug(NamedTuple):
@@ -149,9 +150,10 @@ class StepWriter:
             self._request_state()
 
     def mark_cut(self, cut: Literal["late", "disk"]) -> None:
-        """Mark the unfinished file with the cause `cut`, so that its end does not count as a crash.
+        """Create a marker file, which says that no crash cut off the unfinished file.
 
-        Another thread may call this method while `write` waits for the disk.
+        `cut` is "late" if the disk was too slow, or "disk" if it accepted no more data. Another
+        thread may call this method while `write` waits for the disk.
         """
         writing = self._writing
         if writing is not None:
@@ -187,7 +189,8 @@ class StepWriter:
     def _goes_on(self, ring: Ring, start: Start) -> bool:
         """Return whether the steps after `start` may follow in the current file.
 
-        They may not if steps are missing before `start`, or if the file is long enough.
+        They may not if steps are missing before `start`, or if the current file has reached its
+        largest duration or size.
         """
         return start.number == self._number and not self._is_long_enough(ring)
 

@@ -1,7 +1,7 @@
 """Parses times that a person types, and finds the part of a recording between two such times.
 
-A recording may cross midnight, and the wall clock may be set during the recording. Therefore a time
-is searched in every `Stretch`, a part of the recording during which the clock was not set.
+A recording may cross midnight, and the wall clock may be adjusted during the recording. Therefore a
+time is searched in every `Stretch`, a part of the recording without an adjustment of the clock.
 """
 
 from __future__ import annotations
@@ -107,7 +107,11 @@ def _time_of_day(words: str, text: str) -> TimeOfDay:
 
 
 def _date(words: str, text: str, now_s: float) -> tuple[int, int, int]:
-    """Return the triple (year, month, day) that `words` mean. For "yesterday" the day may be 0."""
+    """Return the triple (year, month, day) that `words` mean, for example "yesterday".
+
+    For "yesterday" the day may be 0. `text` is all that the person typed, for the error message.
+    `now_s` is the present time, s since 1970. Raises `TimeError` if `words` are not a date.
+    """
     if words in _DAYS_AGO:
         today = time.localtime(now_s)
         return today.tm_year, today.tm_mon, today.tm_mday - _DAYS_AGO[words]
@@ -187,7 +191,7 @@ def date(seconds: float) -> str:
 
 
 class Stretch(NamedTuple):
-    """A part of a recording during which the wall clock was not set."""
+    """A part of a recording without an adjustment of the wall clock."""
 
     at: float
     """Start of the stretch, s after the beginning of the recording."""

@@ -37,8 +37,8 @@ Without this limit, two sources that alternate in every step would fill the time
 """
 
 POSE_NS = NS_PER_S
-"""Longest time for which the entry `continues` waits for the first pose, ns. Without a link to the
-board there is no pose."""
+"""The entry `continues` is delayed until the first pose, but at most for this time, ns. Without a
+link to the board there is no pose."""
 
 SET_NS = 5 * NS_PER_S
 """Smallest change of the wall clock that gives an entry `clock`, ns. The change is measured against
@@ -47,7 +47,7 @@ the monotonic clock."""
 WAITS_NS = NS_PER_S
 """Time for which a sender must send speeds without effect before it gets an entry `waits`, ns.
 
-When an operator changes from one sender to another, both may send for a shorter time.
+While an operator changes from one sender to another, both may send, but for less than this time.
 """
 
 SILENT_NS = NS_PER_S
@@ -81,7 +81,7 @@ class TimelineEntry(Struct, frozen=True, omit_defaults=True):
     - `reason`: the reason of the robot's mode has changed, but the mode has not.
     - `waits`: a sender must wait while another one drives.
     - `board`: a microcontroller has named itself and its last reset.
-    - `clock`: the wall clock was set.
+    - `clock`: the wall clock was adjusted.
     - `gap`: steps are missing.
     - `end`: the daemon received the request to end.
     - `cut`: the recording has no ordinary end.
@@ -180,7 +180,8 @@ class BoardIdentity:
 
     def __init__(self) -> None:
         self._data = b""
-        """The last received bytes, if they may be the beginning of the board's line."""
+        """The last received bytes if they may be the beginning of the line with the board's name,
+        otherwise empty."""
         self._reported_ns = -REASON_NS
 
     def step(self, step: Step) -> Iterator[TimelineEntry]:
@@ -204,8 +205,8 @@ class BoardIdentity:
             self._reported_ns = now.mono_ns
             words = printable_bytes(found[1], MAX_IDENTITY_BYTES)
             text = (
-                "the microcontroller sent its name, which it sends after a start and when it is "
-                f"asked: {words}"
+                "the microcontroller sent its name, as it does after a restart and after a "
+                f"request: {words}"
             )
             yield TimelineEntry(now.wall_ns / 1e9, "board", text)
 
@@ -341,8 +342,8 @@ class TimelineWriter:
             x, y, yaw = [value / MICRO for value in self._pose]
             at = f"at x {x:.2f} m, y {y:.2f} m, yaw {math.degrees(yaw):.1f} deg"
         text = (
-            "this recording continues an earlier one; when this one begins, the robot is: "
-            f"{does}, link {link}, {at}"
+            "this recording continues an earlier one; at the start of this recording, the robot "
+            f"is: {does}, link {link}, {at}"
         )
         yield TimelineEntry(first.inputs.now.wall_ns / 1e9, "continues", text, by=source)
 
@@ -373,7 +374,7 @@ class TimelineWriter:
         self._shutting_down = step.inputs.shutting_down
 
     def _clock(self, now: Instant) -> Iterator[TimelineEntry]:
-        """Yield an entry `clock` if the wall clock was set since the last step."""
+        """Yield an entry `clock` if the wall clock was adjusted since the last step."""
         last = self._now
         if last is None:
             return
@@ -385,7 +386,7 @@ class TimelineWriter:
         slept = ", or the computer was suspended" if ahead_ns > 0 else ""
         text = (
             f"the clock of the daemon's computer was set {way} by "
-            f"{lasting(abs(ahead_ns) / NS_PER_S)}{slept}: the earlier entries have times of the "
+            f"{lasting(abs(ahead_ns) / NS_PER_S)}{slept}: the earlier entries show times of the "
             "clock before this change"
         )
         yield TimelineEntry(now.wall_ns / 1e9, "clock", text, "warning")
@@ -446,8 +447,8 @@ INCIDENT_WORDS = {
     "wheel_fault": "wheel fault",
     "link_up": "",
 }
-"""Words for the events that a summary counts, by the event's name. The event `link_up` is not
-counted: it only shows where one loss of the link ends."""
+"""Maps the name of each event that a summary uses to the words with which the summary counts it.
+The event `link_up` has no words, because it only shows where a loss of the link ends."""
 
 
 SERIOUS = re.compile(r"(^|, )\d+ (emergency stop|bumper hit|battery stop|stop|fault)s?\b")

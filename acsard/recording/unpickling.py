@@ -40,8 +40,8 @@ MAX_PARTS = 1 << 19
 """Largest number of values in a robot. A value that occurs several times counts each time."""
 
 MAX_COPIED = 4 * MAX_PARTS
-"""Largest number of values that constructors and settings of attributes may copy in total. Without
-this limit, a few bytes could copy a large part again and again."""
+"""Largest number of values that may be copied in total when objects are constructed and when
+attributes are set. Without this limit, a few bytes could copy a large part again and again."""
 
 MAX_KEY = 2**61 - 1
 """The absolute value of an integer that is used as a key must be below this bound.
@@ -101,7 +101,7 @@ def unpickle(data: bytes, find: FindClass) -> object:
         for count, (opcode, argument, place) in enumerate(pickletools.genops(data)):
             if count >= MAX_OPCODES:
                 raise ValueError(
-                    "the robot state consists of more instructions than that of any real robot: "
+                    "the robot state has more instructions than the state of any real robot: "
                     "the file is damaged or forged"
                 )
             machine.do(opcode.name, argument)
@@ -150,8 +150,8 @@ class _Entry:
             )
         if self.size > MAX_PARTS:
             raise ValueError(
-                "the robot state has more values than that of any real robot: the file is damaged "
-                "or forged"
+                "the robot state has more values than the state of any real robot: the file is "
+                "damaged or forged"
             )
 
 
@@ -236,7 +236,7 @@ class _Machine:
         self._copied += entry.size
         if self._copied > MAX_COPIED:
             raise ValueError(
-                "the robot state copies more values than that of any real robot: the file is "
+                "the robot state copies more values than the state of any real robot: the file is "
                 "damaged or forged"
             )
 

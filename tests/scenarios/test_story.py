@@ -342,14 +342,14 @@ def first_run(host: Host) -> None:
         "the disk has room again",
         r"^recording: the daemon records to .* again; \d+ steps are missing, at most \d\.0 s "
         r"\(.*No space left on device\)",
-        r"^continues: this recording continues an earlier one; when this one begins, the robot is: "
-        r"driving, link up, .* \(by nav\)",
+        r"^continues: this recording continues an earlier one; at the start of this recording, the "
+        r"robot is: driving, link up, .* \(by nav\)",
     )
     host.hold(NAV, "nav", 0.5, 4.0)
     host.note(
         "crash while driving",
         r"^drive: was driving, \d\.\d\d m in \d\.\d s so far, .* \(by nav\)",
-        "^cut: the daemon or the computer ended without notice",
+        "^cut: the daemon or the computer stopped suddenly",
     )
     host.crash()
 

@@ -40,7 +40,8 @@ def test_the_end_says_how_many_were_not_judged_and_what_to_do() -> None:
     told = summary(report("sim", [RATE, *late], {}, "", ""), "acsard.toml").splitlines()
     assert told[1:3] == [
         "1 PASS, 2 WARN",
-        "2 not judged, so the check has not passed: repeat it when this computer is idle",
+        "for 2 of the steps there is no result, so the check has not passed: repeat it when this "
+        "computer is idle",
     ]
 
 

@@ -283,7 +283,7 @@ def test_what_a_kill_has_cut_says_so_once_it_is_whole(
         part.unlink()
         (tmp_path / part.stem).write_bytes(data)
     Ring(RecordConfig(str(tmp_path))).close()
-    told = "cut: the daemon or the computer ended without notice"
+    told = "cut: the daemon or the computer stopped suddenly"
     _, out, _ = log(tmp_path)
     assert (told in out) is cut
     _, out, err = log(tmp_path, "show")

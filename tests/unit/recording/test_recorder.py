@@ -148,7 +148,7 @@ def test_if_the_queue_is_full_steps_are_lost_and_counted_and_the_loop_never_wait
     told = [event.text for event in bench.said if event.text != works]
     assert told == [
         "the disk is too slow, so steps are missing in the recording",
-        f"the disk keeps up again; {missing} steps are missing in the recording",
+        f"the disk is fast enough again; {missing} steps are missing in the recording",
     ]
     numbers = [step.number for path in (before, after) for step in steps(Recording(path))]
     assert len(numbers) == bench.world.steps - missing
@@ -193,7 +193,7 @@ def test_a_disk_that_hangs_is_reported_after_three_seconds_and_so_is_its_return(
     bench.world.run(0.1)
     assert bench.recorder.status.trouble == ""
     assert bench.said[1:] == [
-        Event("recording", "the disk keeps up again; no steps are missing in the recording")
+        Event("recording", "the disk is fast enough again; no steps are missing in the recording")
     ]
 
 

@@ -203,7 +203,7 @@ def test_a_short_file_with_a_bad_sector_at_its_beginning_stays_and_is_reported(
     bad[begin : begin + 512] = bytes(512)
     assert len(bad) < NOTHING_BYTES
     part.write_bytes(bad)
-    assert "renamed its file to a.mcap" in recover(part, whole, "crash", room)
+    assert "its file now has the name a.mcap" in recover(part, whole, "crash", room)
     assert whole.read_bytes() == bad
     assert not part.exists()
 
@@ -305,7 +305,7 @@ def test_a_recovery_in_place_holds_one_chunk_in_memory_and_not_the_unpacked_file
 
 def test_an_empty_file_is_removed_and_an_unreadable_file_is_reported(tmp_path: Path) -> None:
     part, whole = tmp_path / "a.part", tmp_path / "a.mcap"
-    for content, told in ((b"", ""), (b"\x89MC", "it has no beginning")):
+    for content, told in ((b"", ""), (b"\x89MC", "its beginning is missing")):
         part.write_bytes(content)
         said = recover(part, whole, "crash", room=True)
         assert told in said

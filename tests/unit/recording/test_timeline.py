@@ -63,8 +63,9 @@ def test_a_recording_that_continues_another_begins_with_what_the_robot_does() ->
     assert entry.seconds == steps[0].inputs.now.wall_ns / 1e9
     assert entry.by == "app"
     assert entry.text == (
-        "this recording continues an earlier one; when this one begins, the robot is: driving, "
-        f"link up, at x {x / 1e6:.2f} m, y {y / 1e6:.2f} m, yaw {math.degrees(yaw / 1e6):.1f} deg"
+        "this recording continues an earlier one; at the start of this recording, the robot is: "
+        f"driving, link up, at x {x / 1e6:.2f} m, y {y / 1e6:.2f} m, "
+        f"yaw {math.degrees(yaw / 1e6):.1f} deg"
     )
     assert "continues" not in [other.name for other in others]
     assert "continues" not in [entry.name for entry in story(tape)]
@@ -79,7 +80,7 @@ def test_without_a_link_a_recording_that_continues_another_begins_without_a_pose
     ]
     (entry,) = [entry for entry in [*entries, *writer.end()] if entry.name == "continues"]
     assert entry is entries[0]
-    assert "continues an earlier one; when this one begins, the robot is: waiting (" in entry.text
+    assert "; at the start of this recording, the robot is: waiting (" in entry.text
     assert entry.text.endswith(", the pose of the robot is not known")
 
 

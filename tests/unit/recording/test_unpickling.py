@@ -97,7 +97,7 @@ def test_nesting_is_limited_in_depth_and_doubling_in_size() -> None:
         unpickle(nested(MAX_DEPTH + 1), part_class)
     most = MAX_PARTS.bit_length() - 2
     unpickle(whole(doubled(most)), part_class)
-    with pytest.raises(ValueError, match="than that of any real robot"):
+    with pytest.raises(ValueError, match="than the state of any real robot"):
         unpickle(whole(doubled(most + 1)), part_class)
 
 
