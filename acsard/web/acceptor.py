@@ -1,11 +1,11 @@
-"""Accepts TCP connections, and limits them before they cost memory.
+"""Accepts TCP connections, and refuses those beyond the limits before they use much memory.
 
 A connection goes through these states:
 
 1. silent: no byte has arrived yet. The connection costs only a file descriptor and a place in
    `Sockets`, because TLS starts with the first byte.
-2. waiting: the TLS handshake may not start yet, because too many handshakes are running or because
-   the client's network has started too many.
+2. waiting: the TLS handshake may not start yet, because too many handshakes are running, or because
+   the client's network has started handshakes too often.
 3. starting: the TLS handshake is running.
 4. open: aiohttp reads the connection's requests.
 """
@@ -40,7 +40,7 @@ HANDSHAKE_S, HANDSHAKES_AT_ONCE = 3.0, 32
 HURRIED_S = 0.3
 """Minimum age, s, of a running TLS handshake that may be aborted to make room for a waiting one.
 This happens only while `HANDSHAKES_AT_ONCE` handshakes run. Without this rule, clients that stop
-sending during their handshakes would delay a phone by `HANDSHAKE_S`."""
+sending during their handshakes would delay the handshake of a phone by up to `HANDSHAKE_S`."""
 
 REQUEST_S = 10.0
 """Time limit, s, from accepting a connection to the end of the headers of its first request."""
@@ -50,10 +50,12 @@ UNREAD_S = 5.0
 receive window closed."""
 
 READ_BYTES = 16384
-"""Read buffer of each TLS connection, bytes: one TLS record. asyncio's default is 256 KiB."""
+"""Size of the read buffer of each TLS connection, bytes. The buffer holds one TLS record. asyncio's
+default is 256 KiB."""
 
 PAUSE_S = 0.05
-"""Pause, s, in accepting connections after the process has run out of file descriptors."""
+"""Time, s, for which the server accepts no connections after the process has run out of file
+descriptors."""
 
 Factory = Callable[[], "Reader"]
 
@@ -168,7 +170,7 @@ class Acceptor:
     # The connections call the methods below.
 
     def crowded(self, one: _Connection) -> None:
-        """Cut a connection that has no place or whose request headers are too long.
+        """Cut a connection for which there is no room, or whose request headers are too long.
 
         The refusal is counted under the reason `crowded`.
         """
@@ -194,9 +196,9 @@ class Acceptor:
             self._waiting.pop(one.network, None)
 
     def started(self, one: _Connection) -> None:
-        """Record that a TLS handshake has succeeded or failed, and start a waiting one if possible.
+        """Record that the TLS handshake of the connection `one` has succeeded or failed.
 
-        The handshake is that of the connection `one`.
+        If another handshake is waiting and the limits allow it, start that handshake.
         """
         self._starting.pop(one, None)
         if self._again is None:
@@ -227,9 +229,9 @@ class Acceptor:
     def _has_room(self, now: float) -> bool:
         """Return whether a TLS handshake may start at the time `now`.
 
-        If `HANDSHAKES_AT_ONCE` handshakes run, try to make room: cut the oldest handshake of the
-        network that has the most, unless this handshake is younger than `HURRIED_S`. `now` is in s
-        on the event loop's clock.
+        If `HANDSHAKES_AT_ONCE` handshakes run, try to make room. The network with the most running
+        handshakes loses the oldest of them, unless it is younger than `HURRIED_S`. `now` is in s on
+        the event loop's clock.
         """
         if len(self._starting) < HANDSHAKES_AT_ONCE:
             return True
@@ -266,7 +268,7 @@ class _Connection(asyncio.Protocol):
         self._task: asyncio.Task[None] | None = None
         self._transport: asyncio.BaseTransport | None = None
         self._head = 0
-        """Number of bytes of the next request's head (request line and headers) received so far."""
+        """Number of received bytes of the next request's head (request line and headers)."""
         self._body: StreamReader | None = None
         self._inner: Reader | None = None
 
@@ -304,7 +306,7 @@ class _Connection(asyncio.Protocol):
             self._acceptor.wait(self)
 
     def start(self) -> None:
-        """Start the TLS handshake, or for plain HTTP open the connection."""
+        """Start the TLS handshake. For plain HTTP, open the connection immediately."""
         self._task = self._loop.create_task(self._open())
 
     async def _open(self) -> None:
@@ -344,7 +346,11 @@ class _Connection(asyncio.Protocol):
                 self._socket.shutdown(socket.SHUT_RDWR)
 
     def spoke(self, body: StreamReader) -> None:
-        """Record that the head of a request has arrived, which ends its limits of size and time."""
+        """Record that the head of a request (request line and headers) has arrived.
+
+        The time limit `REQUEST_S` ends, and the size of the next head is counted from 0. `body` is
+        the stream from which the body of this request is read.
+        """
         self._head, self._body = 0, body
         self._cancel_timer()
 
@@ -414,7 +420,7 @@ class Reader(RequestHandler):
     def reads_head(self) -> bool:
         """Whether the next received bytes belong to the head of a request.
 
-        False on a WebSocket, and while received requests wait for their turn.
+        False on a WebSocket, and while received requests wait to be handled.
         """
         return not self._upgraded and not self._messages
 
