@@ -27,7 +27,7 @@ WAIT_S = 1.0
 send it (see `SENDS`)."""
 
 CONNECT_S, SILENT_S = 3.0, 3.0
-"""Time limits for the connection to the camera's server, and for the next byte from it, s."""
+"""Time limits, s: for connecting to the camera's server, and for each wait for data from it."""
 
 MAX_PICTURE, MAX_HEAD = 1_000_000, 4096
 """Maximum size of a picture and of its header lines, bytes. A full HD picture has a few hundred
@@ -63,7 +63,7 @@ class Parts:
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> bytes | None:
-        """Add received bytes; return the newest picture that is now complete, or None.
+        """Add received bytes; return the newest picture that they complete, or None.
 
         Raises `ValueError` if a picture or its header lines are too long.
         """
@@ -109,9 +109,10 @@ class Camera:
         self._reading: asyncio.Task[None] | None = None
 
     async def after(self, number: int) -> Picture | None:
-        """Return the newest picture as soon as its number is not `number`.
+        """Wait for a picture that is newer than the one with this number, and return it.
 
-        Return None if no such picture arrives within `WAIT_S`. Raises `TroubleError` if there is no
+        `number` is 0 if the client has no picture. Return None if no newer picture arrives within
+        `WAIT_S`. Raises `TroubleError` if there is no
         camera or its stream cannot be read.
         """
         if not self._url:
@@ -144,7 +145,7 @@ class Camera:
                     await self._sent.wait()
         except TimeoutError:
             text = f"{SENDS_OF_TOKEN} pictures with this token, or {SENDS} in total, are being sent"
-            raise TroubleError(503, f"{text}: ask again when one has arrived") from None
+            raise TroubleError(503, f"{text}: ask again when one of them has arrived") from None
         try:
             yield
         finally:

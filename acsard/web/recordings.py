@@ -39,7 +39,8 @@ LISTED_NS = NS_PER_S // 4
 NICE = 19
 
 DRAW_S = 600.0
-"""Time limit for drawing a report, s. A full recording of one to four hours takes minutes."""
+"""Time limit for drawing a report, s. To draw the report of a full recording (one to four hours)
+takes minutes."""
 
 ALONE_NS = 60 * NS_PER_S
 """Time, ns, after which the drawing of a report is cancelled if no client asks for its progress."""
@@ -51,7 +52,7 @@ BYTES = 32 << 20
 """Maximum size of a report, bytes; a typical one has 5 to 8 MB."""
 
 MEMORY = 256 << 20
-"""Limit of the data memory of the child process that draws a report, bytes."""
+"""Maximum data memory of the child process that draws a report, bytes."""
 
 TOO_LONG = (
     f"the drawing takes longer than {DRAW_S / 60:.0f} min here: fetch the recording, and draw its "
@@ -244,7 +245,10 @@ class Reports:
     """
 
     def __init__(self, command: Sequence[str] = ()) -> None:
-        """Set the command that draws a report. The default is `acsard recording report`."""
+        """Set the command that draws a report; the path of the recording is added at its end.
+
+        If `command` is empty, it is `acsard recording report --supervised`.
+        """
         self._command = command or acsard("recording", "report", "--supervised")
         self._one: _Drawing | None = None
         self._work: asyncio.Task[None] | None = None
@@ -333,7 +337,7 @@ class Reports:
 
 
 class _FailedError(Exception):
-    """The reason, in words, why a report was not drawn."""
+    """A report could not be drawn. The text of this error is the reason."""
 
 
 def _why(said: str) -> str:

@@ -214,7 +214,11 @@ def _names(directory: str) -> set[str]:
 async def _renew(
     context: ssl.SSLContext, names: set[str], files: CertificateFiles, directory: str, log: Log
 ) -> None:
-    """Use changed certificate files for later connections, and add the new names to `names`."""
+    """When the certificate files change, load them into `context`, and add their names to `names`.
+
+    Open connections keep the old certificate. `files` detects the changes, and `directory` is the
+    directory of the files.
+    """
     while True:
         await asyncio.sleep(TIDY_S)
         if not files.renewed():

@@ -32,7 +32,7 @@ daemon accepts. When a client disconnects, the server sends a zero velocity with
 the client's last command, and the daemon must accept it."""
 
 PROGRAM = "app"
-"""Command source of a command that names no source. The page in the browser names `teleop`."""
+"""Command source of a command that does not name one. The page in the browser names `teleop`."""
 
 Short = Annotated[str, Meta(max_length=80)]
 Device = Annotated[str, Meta(max_length=200)]
@@ -131,11 +131,11 @@ class Begin(_Frame, frozen=True):
     port: Device = ""
     method: Short = ""
     positions: Short = ""
-    """The key on which positions arrive, for the method `positions` only."""
+    """Zenoh key on which the robot's positions are published; only for the method `positions`."""
 
 
 class Reply(_Frame, frozen=True):
-    """Answer the question whose number is `reply`. The value null selects the default."""
+    """Answer the question whose number is `reply`. If `value` is null, it selects the default."""
 
     reply: Annotated[int, Meta(ge=0, le=1 << 31)]
     value: float | Short | None = None
@@ -211,7 +211,7 @@ class Greeting(Struct, frozen=True):
     """The actions that the client's role does not allow, each with the reason in words. An action
     is the name of a service, "drive", "recordings" or "begin" (a check or calibration)."""
     camera: bool
-    """True if a camera is configured, whose pictures `GET /api/camera` returns."""
+    """True if a camera is configured. `GET /api/camera` returns its pictures."""
 
 
 class Hello(Struct, frozen=True):
@@ -254,13 +254,13 @@ class Row(Struct, frozen=True):
     """Measured forward speed, m/s."""
     link: str
     age: float | None
-    """Seconds since the last state arrived; None before the first one."""
+    """Seconds since the last state arrived; None before the first state."""
     version: str
     """Version of the daemon; "" until it is reported."""
     warnings: Sequence[str] = ()
     """Warnings of the robot, in words. A robot with warnings may still be ready."""
     place: Sequence[float] | None = None
-    """x and y in m, and yaw in rad, in the odom frame; None while no state arrives."""
+    """x and y in m, and yaw in rad, in the odom frame; None while the robot is silent or gone."""
     battery: str = ""
     """State of charge or, if it is unknown, the voltage, in words; "" if neither is known."""
 
@@ -270,7 +270,8 @@ class Rows(Struct, frozen=True):
 
     fleet: Sequence[Row]
     note: str
-    """Reason why robots may be missing; "" if all robots of a router are visible."""
+    """Reason why robots may be missing, in words. It is "" if the page's server is connected to a
+    router, and therefore sees all robots of this router."""
 
 
 class Pong(Struct, frozen=True):
