@@ -69,7 +69,7 @@ class Bridge:
         self._server = start(f"acsard {self._id}", address, listener, offered, context, acts=acts)
         self._objections: dict[int, Objections] = {}
         self._watch: Watch | None = None
-        """Follows the robot's `state` while a viewer drives; None while no viewer drives."""
+        """Receives the robot's `state` while a viewer drives; None while no viewer drives."""
         self._here = self._was_here = True
         key = robot.key("alive")
         self._token = robot.session.liveliness().declare_subscriber(key, self._alive, history=True)

@@ -66,7 +66,7 @@ def wish(encoding: str, payload: bytes) -> Wish:
 
 
 class Viewer:
-    """A viewer that may drive: its bus client, its newest command and its channels."""
+    """A viewer that publishes commands: its bus client, its newest command and its channels."""
 
     def __init__(self, robot: Client) -> None:
         self.robot, self.commander = robot, Commander(leads=True, gathers=True)

@@ -95,7 +95,7 @@ def ways(key_of: Callable[[str], str], ros: RosConfig, source: str) -> dict[str,
 
 
 class Reader:
-    """Converts commands of any kind to messages of the topic `cmd_vel_in/<source>`."""
+    """Converts commands in any encoding to messages of the topic `cmd_vel_in/<source>`."""
 
     def __init__(self, config: Config) -> None:
         self._receiver = Receiver(config.joints, Kinematics(config.drive))
@@ -158,7 +158,7 @@ class Commanders:
 
 
 class _Heard:
-    """The subscriptions to the commands of one source, and the commands that have arrived."""
+    """The subscriptions to the commands of one source, and the commands that wait to be read."""
 
     def __init__(
         self, session: zenoh.Session, by_key: Mapping[str, Way], wake: Callable[[], object]

@@ -303,7 +303,7 @@ class Refusals(logging.Handler):
 
 CALLED: tuple[Verb, ...] = tuple(verb for verb in SERVICES if verb != "set")
 """Services that viewers may call with the option `--drive`: all but `set`, because viewers change
-settings as parameters instead."""
+settings through Foxglove parameters instead."""
 
 STOPS: tuple[Verb, ...] = ("stop",)
 """Services that viewers may call without the option `--drive`. Any web page in a local browser can

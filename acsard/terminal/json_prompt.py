@@ -52,7 +52,7 @@ LINE_BYTES = 65536
 
 
 class Line(Struct, frozen=True):
-    """An input line: an answer, a key press (`key`), or neither as a sign of life.
+    """An input line: an answer, a key press (`key`), or a sign of life if it is neither.
 
     `answer` is the number of the answered question, or 0. Unknown fields are ignored.
     """
@@ -117,7 +117,7 @@ class Found(Struct, frozen=True):
 
 
 class Result(Struct, frozen=True):
-    """The complete result, as a terminal shows it. Nothing moves any more."""
+    """The complete result, as a terminal shows it. From then on, nothing moves."""
 
     result: str
 
@@ -192,7 +192,8 @@ class JsonPrompt:
     def keys(self, wait_s: float) -> str:
         """Wait up to `wait_s` s for a key press, and return " " if a key was pressed, else "".
 
-        A key that was pressed since the last answer or the last call counts too.
+        A key that was pressed earlier counts too, unless it was pressed before the last answer or
+        reported by an earlier call.
         """
         with self._news:
             self._news.wait_for(lambda: self._pressed, wait_s)

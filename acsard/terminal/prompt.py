@@ -91,7 +91,7 @@ class Prompt(Protocol):
         """
 
     def number(self, ask: Ask) -> float:
-        """Ask the question, and return the number. Without a person, return the default of `ask`.
+        """Ask the question, and return the number, or the default of `ask` if no person is there.
 
         Raises `NobodyError` if there is neither a person nor a default.
         """

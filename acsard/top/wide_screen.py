@@ -145,7 +145,7 @@ def _source(source: SourceState, state: RobotState, room: int) -> Text:
 def link(seen: ScreenData, state: RobotState, width: int) -> list[Text]:
     """Return the lines about the serial link, the commands and the rejected inputs.
 
-    Lines about the gyro, the effective track and the board's inputs follow if the robot has them.
+    If the robot has a gyro, an effective track or inputs of the board, lines about these follow.
     """
     before = seen.before or state
     head = title(seen, state)

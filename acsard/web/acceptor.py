@@ -82,7 +82,7 @@ class Acceptor:
         self._again: asyncio.TimerHandle | None = None
         """Timer of the next call of `_next`, or None if no call is scheduled."""
         self._ended: set[_Connection] = set()
-        """The connections whose token was missing from the argument `valid` of the last call of
+        """The connections whose token was not in the argument `valid` at the last call of
         `tidy()`."""
 
     def listen(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
@@ -111,13 +111,14 @@ class Acceptor:
     def spoke(self, transport: asyncio.BaseTransport | None, body: StreamReader) -> None:
         """Record that the headers of a request have arrived, which ends the time limit `REQUEST_S`.
 
-        `body` is the stream from which the body of this request is read.
+        `transport` identifies the connection, and `body` is the stream from which the body of this
+        request is read.
         """
         if (one := _connection(transport)) is not None:
             one.spoke(body)
 
     def admitted(self, transport: asyncio.BaseTransport | None, who: Who) -> None:
-        """Record the identity of the client of a connection.
+        """Record that the client of a connection has been identified as `who`.
 
         If connections must be closed to make room, those without an identity are closed first.
         """
@@ -125,10 +126,10 @@ class Acceptor:
             one.pool.prove(one, who.token)
 
     def tidy(self, valid: Collection[str]) -> None:
-        """Cut each connection whose token is missing from `valid` for the second call in a row.
+        """Cut each connection whose token was not in `valid` in two consecutive calls.
 
-        Call this once a second. At the first call, the connection stays open, so a WebSocket client
-        can receive the reason before the second call.
+        `valid` contains the digests of all valid tokens. Call this once a second. After the first
+        of the two calls, a WebSocket client still has time to receive the reason.
         """
         before = self._ended
         self._ended = {one for pool in (self._here, self._away) for one in pool.ended(valid)}
@@ -159,7 +160,8 @@ class Acceptor:
     def _no_file(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
         """Close an old connection because the process has no free file descriptor.
 
-        New connections are accepted again after `PAUSE_S`.
+        The listening socket `opened` accepts new connections again after `PAUSE_S`. The arguments
+        are those of `listen()`.
         """
         loop = asyncio.get_running_loop()
         loop.remove_reader(opened)
@@ -183,7 +185,7 @@ class Acceptor:
         one.cut()
 
     def wait(self, one: _Connection) -> None:
-        """Queue a connection for its TLS handshake, which starts when the limits allow it."""
+        """Queue a connection for its TLS handshake. `_next()` starts it when the limits permit."""
         self._waiting.setdefault(one.network, {})[one] = None
         if self._again is None:
             self._next()
@@ -250,7 +252,7 @@ class Acceptor:
 
 
 class _Connection(asyncio.Protocol):
-    """One TCP connection. Once it is open, this object passes received data to a `Reader`."""
+    """One TCP connection. After a TLS handshake, if any, it passes received data to a `Reader`."""
 
     def __init__(
         self,

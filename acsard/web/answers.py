@@ -1,4 +1,4 @@
-"""The HTTP answers of the page's server: JSON, files, problems, and the headers of all answers.
+"""The HTTP answers of the page's server: JSON, files, errors, and the headers of all answers.
 
 The script of the STOP button and the style sheet are sent inside `index.html`, so STOP works even
 if another file is late or never arrives.
@@ -59,7 +59,7 @@ never copied into it."""
 
 
 class TroubleError(AcsardError):
-    """A permitted request cannot be fulfilled. `status` is the HTTP status of the answer."""
+    """A request is permitted but cannot be fulfilled. `status` is the HTTP status of the answer."""
 
     def __init__(self, status: int, text: str) -> None:
         super().__init__(text)
@@ -218,7 +218,7 @@ class File(Struct, frozen=True):
     kind: str
     body: bytes
     packed: bytes | None
-    """The gzip form of the body, or None if it is not shorter."""
+    """The body in gzip form, or None if gzip does not make it shorter."""
     tag: str
     policy: str
     """Directives of the content security policy. They allow the scripts and styles of the files

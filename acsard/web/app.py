@@ -83,7 +83,7 @@ class Caller(Struct, frozen=True):
 
 
 class Setting(Struct, frozen=True, omit_defaults=True):
-    """One setting, with its value, its explanation and its allowed values."""
+    """One setting of the robot: its key, value, explanation and allowed values."""
 
     key: str
     value: Any
@@ -282,7 +282,7 @@ class Page:
     async def picture(self, request: web.Request) -> web.StreamResponse:
         """Wait for a camera picture that the client has not seen, and return it.
 
-        If none arrives in time, return an answer with the status 304.
+        If no such picture arrives in time, return an answer with the status 304.
         """
         seen = request.headers.get("If-None-Match", "").strip('"')
         begun_ns = clock.steady_ns()

@@ -30,7 +30,7 @@ Reason = Literal[
 Place = Literal["here", "away"]
 
 HERE = "here"
-"""Name of every client on the robot itself, which has no token from which to take a name."""
+"""Name of every client on the robot itself. Other clients have the name of their token."""
 
 COOKIE = "__Host-acsard"
 """Prefix of the cookie names. Browsers accept a cookie with the prefix `__Host-` only if it has the

@@ -39,7 +39,7 @@ MERGE_S = 0.02
 """Shortest interval between two stops that are sent for one client to one robot, s."""
 
 ANSWER_S = 8.0
-"""Time limit for an answer from the bus, s. `Client` has a shorter limit and
+"""Time limit for an answer over the bus, s. `Client` has a shorter limit and
 raises an error with a clear message."""
 
 T = TypeVar("T")
@@ -194,7 +194,7 @@ class Merged:
 
     def __init__(self) -> None:
         self._rests: dict[Hashable, asyncio.Event] = {}
-        """Maps (client, robot) to an event, which is set `MERGE_S` after the last stop was sent."""
+        """Maps (client, robot) to an event that is set `MERGE_S` after the last stop was sent."""
         self._next: dict[Hashable, asyncio.Task[ServiceReply]] = {}
         """Maps (client, robot) to the task that waits for the event in `_rests` and then sends a
         stop."""

@@ -23,8 +23,8 @@ from acsard.host.rate_limits import Places
 from acsard.web.answers import TroubleError
 
 WAIT_S = 1.0
-"""Time limit, s, for each of two waits: for a new picture from the camera, and then for a place to
-send it (see `SENDS`)."""
+"""Time limit, s, for each of two waits: the wait for a new picture from the camera, and the wait
+for the permission to send it (see `SENDS`)."""
 
 CONNECT_S, SILENT_S = 3.0, 3.0
 """Time limits, s: for connecting to the camera's server, and for each wait for data from it."""
@@ -99,8 +99,8 @@ class Camera:
     def __init__(self, url: str) -> None:
         self._url = url
         self.newest: Picture | None = None
-        """The newest picture; None before the first one, after a failure, and while no client asks
-        for pictures."""
+        """The newest picture. It is None before the first picture, after a failure, and while no
+        client asks for pictures."""
         self._number = 0
         self._trouble = "the camera's stream has no picture yet"
         self._asked_ns = 0

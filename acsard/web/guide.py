@@ -1,4 +1,4 @@
-"""Runs a board check or a calibration for a browser, in a child process that runs `acsard` itself.
+"""Runs a board check or a calibration for a browser, in a child process of the program `acsard`.
 
 Only one child runs at a time. The lines that the child prints (`terminal/json_prompt.py`) go only
 to the WebSocket that started the child, and only this WebSocket may answer the child's questions.
@@ -51,7 +51,7 @@ Say = Callable[[Guided], None]
 class Reach(Struct, frozen=True):
     """The options with which a child process connects to the daemon of this server's robot.
 
-    An option whose value is empty is left out.
+    If a value is empty, the child gets no such option.
     """
 
     config: str
@@ -126,9 +126,9 @@ class Guide:
             errand.leave()
 
     def begin(self, viewer: object, by: str, asked: Begin) -> str:
-        """Start the check or calibration `asked` for a viewer; `by` is the name of its user.
+        """Start the check or calibration `asked` for a viewer.
 
-        Return "" or the reason for a refusal.
+        `by` is the name of the viewer's user. Return "" or the reason for a refusal.
         """
         if self._errand is not None:
             return (
@@ -319,7 +319,7 @@ class _Errand:
         return code if code >= 0 else 128 - code, self._words()
 
     def answer(self, reply: Reply) -> bool:
-        """Send the child an answer; return False if it is not for the open question."""
+        """Send the child an answer; return False if its question is not the one that is open."""
         if not self._question or reply.reply != self._question:
             return False
         self._question, self._rides = 0, self._leg

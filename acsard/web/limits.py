@@ -70,7 +70,7 @@ behind one address can load the page at the same time."""
 
 HANDSHAKES = Rate(30.0, 100.0)
 """Limit on TLS handshakes per network, as a rate per second and a largest burst. Handshakes beyond
-the limit wait. A browser needs six."""
+the limit wait. A browser needs six to load the page."""
 
 HOLD_S = 0.5
 """Delay of a request beyond a rate limit, s. Refusing the request immediately would not help,

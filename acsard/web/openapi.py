@@ -25,7 +25,8 @@ Refs = dict[Any, Described]
 """Maps each type to a reference to its schema."""
 
 TO_ROBOT, FROM_ROBOT = "ToRobot", "FromRobot"
-"""Names of two schemas: the WebSocket messages to the page's server, and those from it."""
+"""Names of two schemas: that of the WebSocket messages that clients send, and that of the messages
+that the server sends."""
 
 VALUE = "Value."
 """Prefix of the schema names for the messages of subscribed keys."""

@@ -33,8 +33,8 @@ AGAIN_S = 1.0
 """Delay before the next attempt to reach a daemon that does not answer, s."""
 
 ASK_S, ASK_SOON_S = 10.0, 1.0
-"""Time until the next query of the values of `About`, s: after a query that was answered, and after
-a query that was not answered."""
+"""Delay before the next query of the values of `About`, s: after a query that the daemon answered,
+and after a query that it did not answer."""
 
 PATH_S, PATH_POINTS, PATH_STEP_M = 600.0, 5000, 0.02
 """Limits of the drawn path: maximum age of a point, s; maximum number of points; minimum distance
@@ -132,7 +132,7 @@ class Robots:
 
     @property
     def state(self) -> RobotState | None:
-        """The newest state, or None before the first one."""
+        """The newest state, or None before the first state."""
         return None if self._watch is None else self._watch.state
 
     def ask_anew(self) -> None:

@@ -1,7 +1,7 @@
 """Defines `Route`, a row of the table of paths `app.ROUTES`. This module is pure.
 
 The router, the admission of requests, the rate limits and the OpenAPI document use that table. The
-rows for the keys and services of the bus are made here.
+rows for the keys and services of the bus are created in this module.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Route(Struct, frozen=True):
     """Least role that may use the path; None opens it to every client, without a token."""
     handler: Handler
     summary: str = ""
-    """Description for the OpenAPI document; "" leaves the row out of it."""
+    """Description for the OpenAPI document. If it is "", the document leaves the route out."""
     takes: type | str | None = None
     """Type of the request's body, or the name of a bus message in `SCHEMAS`; None if there is no
     body."""
@@ -78,7 +78,7 @@ class Route(Struct, frozen=True):
     """Maps an HTTP status to the body of the answer. An answer with any other status contains a
     `Problem`."""
     rate: Rate = REQUESTS
-    """Limit on the rate of the requests of one token. All routes with the same rate share one
+    """Limit on the requests of each token, as a rate. All routes with the same rate share one
     limit."""
     waits: bool = False
     """True if a request beyond `rate` is delayed; False if it is refused. If true, the server

@@ -66,7 +66,7 @@ class Wanted(Struct, frozen=True):
 async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], log: Log) -> None:
     """Run the page's server until a signal arrives, or until the daemon that started it ends.
 
-    `announce` is called with the bound addresses. Raises `MendableError`.
+    `announce` is called with the addresses at which the server listens. Raises `MendableError`.
     """
     # A command or a stop waits at most this long while another thread holds the interpreter.
     sys.setswitchinterval(0.0005)

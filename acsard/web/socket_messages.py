@@ -1,8 +1,8 @@
 """The messages of `/ws`, in both directions. This module is pure.
 
 Each message is one JSON object. An incoming message is called a frame. It contains exactly one of
-the fields in `KINDS` (`subscribe`, `cmd`, `call`, ...), which gives its kind. A frame with none or
-two of these fields, or with an unknown field, is refused as a whole. An outgoing message is
+the fields in `KINDS` (`subscribe`, `cmd`, `call`, ...), which gives its kind. A frame with none
+or several of these fields, or with an unknown field, is refused as a whole. An outgoing message is
 identified by its first field. `socket_sender.py` builds the messages with the values of subscribed
 keys, because these values are JSON already.
 """
@@ -62,7 +62,11 @@ class _Frame(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Subscribe(_Frame, frozen=True):
-    """Subscribe to a key of a robot: send its messages from now on, at most `rate` per second."""
+    """Subscribe to a key of a robot.
+
+    From then on, the server sends new messages of this key, at most `rate` messages per
+    second.
+    """
 
     subscribe: Short
     rate: float = USUAL_RATE
@@ -109,7 +113,7 @@ class Command(_Frame, frozen=True):
 
 
 class Call(_Frame, frozen=True):
-    """Call a service of the robot. The answer has the `id` of the call."""
+    """Call a service of a robot. The server's answer contains the `id` of the call."""
 
     call: Short
     id: int | Short = 0
@@ -202,7 +206,7 @@ class Greeting(Struct, frozen=True):
     version: str
     role: Role
     sender: str
-    """Public name of this viewer, which is the value of `state.sender` while the viewer drives."""
+    """Public name of this viewer. It is the value of `state.sender` while the viewer drives."""
     limits: Limits
     simulated: bool
     state_rate: float
@@ -215,7 +219,7 @@ class Greeting(Struct, frozen=True):
 
 
 class Hello(Struct, frozen=True):
-    """The first message to a client, repeated whenever its content changes."""
+    """The first message to a client. The server sends it again whenever its content changes."""
 
     hello: Greeting
 
@@ -225,7 +229,7 @@ class DrivenPath(Struct, frozen=True):
 
     path: Sequence[Point]
     truth: Sequence[Point]
-    """True path of a simulated robot; empty for a real one."""
+    """Points (x, y) of the true path of a simulated robot, m; empty for a real robot."""
 
 
 class LastMinute(Struct, frozen=True):

@@ -62,12 +62,12 @@ class Vault:
     def known(self, text: str) -> Who | None:
         """Return the owner of the token `text`, or None if the token is not valid.
 
-        The token file is not read again, so a recent change of the file has no effect.
+        This call does not read the token file, so it does not notice a recent change of the file.
         """
         return owner_in(self._own(self._read[1]), text)
 
     def left_s(self, digest: str) -> int:
-        """Return the seconds until the token with this digest expires; 0 if it does not exist."""
+        """Return the time until the token with this digest expires, s; 0 if there is no such token."""
         ends = [one.ends for one in self.all() if one.digest == digest]
         return max(0, int(max(ends, default=0) - time.time()))
 

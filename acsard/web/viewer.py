@@ -80,8 +80,8 @@ class ViewerCommands:
         self._client, self._counts = client, counts
         self._rates = Buckets(COMMANDS)
         self.outbox = Outbox(partial(counts.add, "commands_dropped"))
-        """Queue of commands, with the thread that sends them. If the thread dies, the server could
-        not stop the robot of a viewer that disconnects, so the server must exit."""
+        """Queue of commands, with the thread that sends them. If the thread dies, the server
+        must exit, because it could not stop the robot of a viewer that disconnects."""
 
     def give(
         self, owner: str, source: str, commander: Commander, sender: Sender, wish: Wish
@@ -181,9 +181,9 @@ class Viewer:
             self._fleet.leave(self)
 
     def end(self, why: str) -> None:
-        """Stop the robot if this viewer may still drive it, and close the connection.
+        """Stop the robot if this viewer may still be driving it, and close the connection.
 
-        `why` is the reason for the client, with at most 120 characters.
+        `why` is the reason that the client receives, with at most 120 characters.
         """
         if self._ended:
             return
@@ -296,7 +296,7 @@ class Viewer:
             self._out.refuse("cmd", "too_fast", text)
 
     def _release(self) -> None:
-        """Queue a zero velocity for each command source with which this viewer may still drive."""
+        """Queue a zero velocity for each source with which this viewer may still be driving."""
         timeouts = self._robots.about.timeouts
         for source, commander in self._commanders.items():
             self._commands.outbox.release(commander, timeouts.get(source, LONGEST_S))
