@@ -65,10 +65,10 @@ class Calls:
         ends: Callable[[], Awaitable[Ending]],
         sees: Callable[[str], bool],
     ) -> None:
-        """Store the connection to the daemon, `robots`, and two functions.
+        """Store the arguments, and create the limits.
 
-        `ends` interrupts a running check or calibration. `sees(id)` returns whether the robot with
-        this id is known to the server.
+        `robots` holds the connection to the daemon. `ends` interrupts a running check or
+        calibration. `sees(id)` returns whether the robot with this id is known to the server.
         """
         self._robots, self._ends, self._sees = robots, ends, sees
         self._stops, self._merged = Stops(), Merged()

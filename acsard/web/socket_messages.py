@@ -64,8 +64,7 @@ class _Frame(Struct, frozen=True, forbid_unknown_fields=True):
 class Subscribe(_Frame, frozen=True):
     """Subscribe to a key of a robot.
 
-    From then on, the server sends new messages of this key, at most `rate` messages per
-    second.
+    From then on, the server sends new messages of this key, at most `rate` messages per second.
     """
 
     subscribe: Short

@@ -67,7 +67,7 @@ class Vault:
         return owner_in(self._own(self._read[1]), text)
 
     def left_s(self, digest: str) -> int:
-        """Return the time until the token with this digest expires, s; 0 if there is no such token."""
+        """Return the time until the token with this digest expires, s; 0 for an unknown token."""
         ends = [one.ends for one in self.all() if one.digest == digest]
         return max(0, int(max(ends, default=0) - time.time()))
 
