@@ -178,7 +178,7 @@ class Drives:
     # The main thread calls the methods below.
 
     def driving(self) -> dict[int, Client]:
-        """Return a dict from the id of each viewer that requests a speed now to its bus client."""
+        """Return the viewers that request a speed now, as a dict from viewer id to bus client."""
         now_ns = clock.steady_ns()
         with self._lock:
             viewers = self._viewers.items()

@@ -72,8 +72,8 @@ class Notices:
     def send(self, server: WebSocketServer, log: Callable[[Log], None], *, newcomers: bool) -> None:
         """Send and print the waiting notices; `log` publishes each of them on the topic `log`.
 
-        If `newcomers` is true, first send the messages that viewers must keep showing again, for
-        the new viewers.
+        If `newcomers` is true, first repeat the messages that stay visible, because new viewers
+        have not received them.
         """
         if newcomers:
             for one in self._staying.values():

@@ -42,7 +42,7 @@ class ScreenData(Struct, frozen=True):
     """Seconds since `state` arrived, or since the wait for the first state began."""
     info: Info | None = None
     undecodable: int = 0
-    """Number of state messages in a row that could not be decoded, up to the newest message."""
+    """Number of state messages that could not be decoded since the last one that could be."""
     hint: str = ""
     silent: bool = False
     """True if no state has arrived for too long, so the shown data is old."""

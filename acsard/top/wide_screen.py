@@ -145,7 +145,8 @@ def _source(source: SourceState, state: RobotState, room: int) -> Text:
 def link(seen: ScreenData, state: RobotState, width: int) -> list[Text]:
     """Return the lines about the serial link, the commands and the rejected inputs.
 
-    If the robot has a gyro, an effective track or inputs of the board, lines about these follow.
+    Further lines show the gyro, the effective track and the board's inputs, each only if the robot
+    reports it.
     """
     before = seen.before or state
     head = title(seen, state)

@@ -271,8 +271,8 @@ class Page:
         robot = given.pop("robot", "")
         if not isinstance(robot, str):
             text = (
-                "`robot` must be a text, the id of a robot; for robots other than its own, this "
-                "page accepts only the service stop"
+                "`robot` must be the id of a robot as a JSON string; for robots other than its "
+                "own, this page accepts only the service stop"
             )
             raise RefusedError("malformed", text)
         verb = request.path.removeprefix("/api/srv/")

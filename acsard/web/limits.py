@@ -112,8 +112,8 @@ class Sockets(Generic[C]):
        oldest one. If this token has at most `SOCKETS_OF_BROWSER` connections, the new connection is
        refused instead.
 
-    Even if places are free, a network that has `SOCKETS_OF_ONE` connections without a valid token
-    loses the oldest of them.
+    If a network has `SOCKETS_OF_ONE` connections without a valid token, a new connection from it
+    displaces the oldest of these, even if places are free.
     """
 
     def __init__(self, most: int) -> None:
