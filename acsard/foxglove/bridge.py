@@ -61,15 +61,15 @@ class Bridge:
         self._relay = Relay(robot, context, self._wake.set)
         self._relay.offer(facts)
         self._deaf = facts.deaf
-        """Why commands of other programs cannot be shown; "" if they can, or if the viewers have
-        already been told why."""
+        """Reason why the viewers cannot see the commands of other programs, in words. It is "" if
+        they can see them, or after the reason has been sent to the viewers."""
         logging.getLogger("foxglove").addHandler(Refusals(self._notices))
         listener = Listener(self._shown, self._drives, self._settings)
         offered = services(robot, ros, CALLED if acts else STOPS)
         self._server = start(f"acsard {self._id}", address, listener, offered, context, acts=acts)
         self._objections: dict[int, Objections] = {}
         self._watch: Watch | None = None
-        """Follows the robot's `state` while a viewer drives; None while no viewer drives."""
+        """Receives the robot's `state` while a viewer drives; None while no viewer drives."""
         self._here = self._was_here = True
         key = robot.key("alive")
         self._token = robot.session.liveliness().declare_subscriber(key, self._alive, history=True)
@@ -99,7 +99,10 @@ class Bridge:
         self._server.stop()
 
     def _viewer(self, client: int) -> Client:
-        """Return the viewer's bus client. To the daemon, each viewer is a different sender."""
+        """Return a bus client for the viewer with the id `client`.
+
+        To the daemon, each viewer is a different sender.
+        """
         name = self._robot.sender.rpartition("/")[0]
         return self._robot.like(self._id, f"{name}/{client}")
 
@@ -130,7 +133,10 @@ class Bridge:
         return True
 
     def _came_back(self) -> bool:
-        """Query the restarted daemon. Return False if it does not answer yet."""
+        """Query the facts about the robot after a restart of its daemon.
+
+        Return False if the daemon does not answer yet.
+        """
         try:
             facts = learn(self._robot)
         except AcsardError as error:
@@ -163,7 +169,10 @@ class Bridge:
                 self._watch.look(now)
 
     def _object(self, driving: dict[int, Client]) -> None:
-        """Tell all viewers why the robot does not obey a viewer that requests a speed."""
+        """Tell all viewers why the robot does not follow the commands of a viewer.
+
+        `driving` maps the id of each viewer that requests a speed to the viewer's bus client.
+        """
         now_ns = clock.steady_ns()
         for client in driving.keys() - self._objections.keys():
             self._objections[client] = Objections()

@@ -27,8 +27,9 @@ from acsard.foxglove.notices import Notices
 from acsard.host import clock
 
 SLOW_NS, SLOW_TIMES = 5 * NS_PER_S // 2, 3
-"""A panel publishes too rarely if `SLOW_TIMES` messages in a row each come after a silence of more
-than `commander.SILENCE_NS` (0.3 s) and at most `SLOW_NS` (2.5 s)."""
+"""Limits by which a panel counts as publishing too rarely. It does so if the silence before each of
+`SLOW_TIMES` consecutive messages is longer than `commander.SILENCE_NS` (0.3 s) and at most
+`SLOW_NS` (2.5 s)."""
 
 _receiver = Receiver(JointsConfig(), Kinematics(DriveConfig()))
 """Decoder of velocity commands (twists). It has the default joints and wheels, because a twist does
@@ -36,9 +37,10 @@ not depend on them."""
 
 
 def encoding_of(encoding: str, schema_name: str) -> str:
-    """Return the Zenoh encoding of a channel. Raises `DecodeError` if the channel cannot drive.
+    """Return the Zenoh encoding of a channel's messages.
 
     `encoding` is "json" or "cdr", and `schema_name` is a ROS type such as "geometry_msgs/Twist".
+    Raises `DecodeError` if such messages cannot drive the robot.
     """
     package, _, name = schema_name.partition("/")
     full = f"{package}/msg/{name.removeprefix('msg/')}"
@@ -64,12 +66,13 @@ def wish(encoding: str, payload: bytes) -> Wish:
 
 
 class Viewer:
-    """A viewer that may drive: its bus client, its newest command and its channels."""
+    """A viewer that publishes commands: its bus client, its newest command and its channels."""
 
     def __init__(self, robot: Client) -> None:
         self.robot, self.commander = robot, Commander(leads=True, gathers=True)
         self.channels: dict[int, tuple[str, str]] = {}
-        """Maps a channel's id to (Zenoh encoding, ""), or to ("", reason) if it cannot drive."""
+        """Maps a channel's id to (Zenoh encoding, ""). If commands on the channel cannot drive the
+        robot, the value is ("", reason)."""
         self._slow = 0
 
     def is_slow(self, silence_ns: int | None) -> bool:
@@ -102,7 +105,11 @@ class Drives:
     def advertised(
         self, client: int, channel: int, topic: str, encoding: str, schema_name: str
     ) -> None:
-        """Register a viewer's channel. If it cannot drive, `came` reports the reason later."""
+        """Register the channel with the id `channel` of the viewer with the id `client`.
+
+        If messages on the channel cannot drive the robot, `came` reports the reason when one
+        arrives.
+        """
         found, problem = "", ""
         if topic != self.topic:
             problem = f"no program listens on {topic}: send commands to {self.topic} instead"
@@ -119,8 +126,11 @@ class Drives:
                 viewer.channels[channel] = found, problem
 
     def came(self, client: int, channel: int, data: bytes) -> None:
-        """Queue the command in a viewer's message, or tell the viewers why the command is
-        refused."""
+        """Queue the command in a viewer's message, or tell the viewers why the command is refused.
+
+        `client` and `channel` are the ids of the viewer and of its channel, and `data` is the
+        message.
+        """
         viewer = self._viewers.get(client)
         encoding, problem = viewer.channels.get(channel, ("", "")) if viewer else ("", "")
         if viewer is None or not encoding:
@@ -151,7 +161,10 @@ class Drives:
             )
 
     def withdrawn(self, client: int, channel: int) -> None:
-        """Remove a channel. Send a zero command if the viewer may still be driving the robot."""
+        """Remove the channel with the id `channel` of the viewer with the id `client`.
+
+        If the viewer may still be driving the robot, send a zero command.
+        """
         with self._lock:
             viewer = self._viewers.get(client)
             if viewer is None:
@@ -165,7 +178,7 @@ class Drives:
     # The main thread calls the methods below.
 
     def driving(self) -> dict[int, Client]:
-        """Return the bus client of each viewer that requests a speed now, by the viewer's id."""
+        """Return the viewers that request a speed now, as a dict from viewer id to bus client."""
         now_ns = clock.steady_ns()
         with self._lock:
             viewers = self._viewers.items()

@@ -57,7 +57,7 @@ class Notices:
         """Queue a message to all viewers; `name` is its subject on the topic `log`.
 
         If `stays` is an id, the viewers show the message until `over` is called with this id. If it
-        is "", the message is dropped if its text was queued already within the limit `AGAIN`.
+        is "", a message whose text is repeated faster than `AGAIN` permits is dropped.
         """
         now_ns = clock.mono_ns()
         with self._lock:
@@ -72,7 +72,8 @@ class Notices:
     def send(self, server: WebSocketServer, log: Callable[[Log], None], *, newcomers: bool) -> None:
         """Send and print the waiting notices; `log` publishes each of them on the topic `log`.
 
-        If `newcomers` is true, the messages that stay are sent again first, for new viewers.
+        If `newcomers` is true, first repeat the messages that stay visible, because new viewers
+        have not received them.
         """
         if newcomers:
             for one in self._staying.values():
@@ -91,18 +92,19 @@ class Notices:
 
 
 class Objections:
-    """Decides when to report why the robot does not obey a viewer. The class is pure."""
+    """Decides when to report why the robot does not follow a viewer. The class is pure."""
 
     def __init__(self) -> None:
         self._since_ns: int | None = None
         self.told = ""
-        """The reported reason why the robot does not obey, in words; "" if none is reported."""
+        """The reported reason why the robot does not follow, in words; "" if none is reported."""
 
     def look(self, objection: str, now_ns: int) -> bool:
         """Update the reported reason `told`, and return whether it has changed.
 
-        `objection` is the present reason why the robot does not obey, or "" if it obeys. The reason
-        is reported when the robot has not obeyed for `GRACE_S`.
+        `objection` is the present reason why the robot does not follow the viewer, or "" if it
+        follows. A reason is reported after the robot has not followed for `GRACE_S`. `now_ns` is a
+        monotonic time, ns.
         """
         if not objection:
             self._since_ns = None

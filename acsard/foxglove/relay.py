@@ -34,14 +34,20 @@ EVENTS = "events"
 
 
 class News:
-    """Converts the lists of events that the daemon publishes to log messages, each event once."""
+    """Converts the lists of events that the daemon publishes to log messages.
+
+    The lists overlap, but each event becomes one log message.
+    """
 
     def __init__(self) -> None:
         self._total = self._stamp_ns = 0
         self._told: list[LogEvent] = []
 
     def of(self, events: Events) -> list[Log]:
-        """Return the new events as log messages. After a restart of the daemon, all are new."""
+        """Return the events that were in no earlier list, as log messages.
+
+        After a restart of the daemon, all events are new.
+        """
         known, told, stamp_ns = self._total, self._told, events.stamp.to_ns()
         if events.total < known:
             if stamp_ns <= self._stamp_ns:
@@ -68,8 +74,8 @@ class Way(Struct, frozen=True):
     """How the daemon interprets the commands that arrive on one key of the bus."""
 
     native: str
-    """The daemon's own key for these commands, without the robot's id. "*" stands for the name of a
-    certificate."""
+    """The Zenoh key that acsard itself uses for these commands, without the robot's id. "*" stands
+    for the name of a certificate."""
     encoding: str = ""
     """Encoding of all commands on the key; "" if each command names its encoding."""
     via: Via = "native"
@@ -78,7 +84,7 @@ class Way(Struct, frozen=True):
 def ways(key_of: Callable[[str], str], ros: RosConfig, source: str) -> dict[str, Way]:
     """Return a `Way` for each key on which commands of the source `source` may arrive.
 
-    The keys are the daemon's own and those of ROS. `key_of` adds the robot's id to a key.
+    These are the keys of acsard and those of ROS. `key_of` adds the robot's id to a key of acsard.
     """
     native = source_keys([source])
     found = {key_of(key): Way(key) for key in (*native, *source_keys([source], "*"))}
@@ -89,14 +95,17 @@ def ways(key_of: Callable[[str], str], ros: RosConfig, source: str) -> dict[str,
 
 
 class Reader:
-    """Converts commands of any kind to messages of the topic `cmd_vel_in/<source>`."""
+    """Converts commands in any encoding to messages of the topic `cmd_vel_in/<source>`."""
 
     def __init__(self, config: Config) -> None:
         self._receiver = Receiver(config.joints, Kinematics(config.drive))
         self._frame = config.odometry.base_frame
 
     def read(self, arrival: Arrival, wall_ns: int) -> TwistStamped:
-        """Return the twist of a command that arrived at `wall_ns`, or raise `DecodeError`."""
+        """Return the twist of a command that arrived at `wall_ns`, ns since 1970.
+
+        Raises `DecodeError`.
+        """
         twist = self._receiver.command(arrival).twist
         return asked(twist, Time.from_ns(wall_ns), self._frame)
 
@@ -149,7 +158,7 @@ class Commanders:
 
 
 class _Heard:
-    """The subscriptions to the commands of one source, and the commands that have arrived."""
+    """The subscriptions to the commands of one source, and the commands that wait to be read."""
 
     def __init__(
         self, session: zenoh.Session, by_key: Mapping[str, Way], wake: Callable[[], object]
@@ -184,7 +193,10 @@ class _Heard:
         self._box.put((arrival, now.wall_ns))
 
     def take(self) -> list[tuple[Arrival, int]]:
-        """Return the commands since the last call as pairs (command, wall-clock arrival in ns)."""
+        """Return the commands that arrived since the last call, as pairs (command, arrival time).
+
+        The arrival time is in ns since 1970.
+        """
         return self._box.take()
 
     def undeclare(self) -> None:
@@ -209,7 +221,7 @@ class Relay:
         """Number of samples that could not be decoded."""
 
     def offer(self, facts: Facts) -> None:
-        """Offer the robot's topics to the viewers. Topics that were offered earlier stay."""
+        """Offer the robot's topics to the viewers. Topics that were offered before remain."""
         self._commanders.use(facts)
         for row, source in facts.rows():
             topic = row.topic(facts.config.ros.namespace, source)

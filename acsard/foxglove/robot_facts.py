@@ -23,7 +23,7 @@ class Facts(Struct, frozen=True):
 
     config: Config
     tables: object
-    """The configuration as plain tables; None if this program may not read it."""
+    """The configuration as nested dicts; None if this program may not read it."""
     sources: tuple[str, ...]
     forbidden: str
     """Reason why this program may not drive, in words; "" if it may drive."""
@@ -31,9 +31,9 @@ class Facts(Struct, frozen=True):
     """Reason why this program cannot receive other programs' commands, in words; "" if it can."""
 
     def rows(self) -> list[tuple[Channel, str]]:
-        """Return the topics to offer to the viewers, each with the name of a command source.
+        """Return the topics to offer to the viewers, as pairs (topic, command source).
 
-        `CMD_VEL_IN` appears once for each source. Every other topic has the source "".
+        `CMD_VEL_IN` appears once for each source. For every other topic, the source is "".
         """
         found = []
         for row in published_channels(left_out(self.config)):
@@ -43,7 +43,10 @@ class Facts(Struct, frozen=True):
 
 
 def key_of(row: Channel, source: str) -> str:
-    """Return the Zenoh key of the topic's messages, without the robot's id."""
+    """Return the Zenoh key of the messages of a topic, without the robot's id.
+
+    `row` describes the topic, and `source` is the command source for `CMD_VEL_IN`.
+    """
     return row.native.replace(SOURCE, source)
 
 

@@ -74,7 +74,7 @@ class Settings:
 
     The main thread calls `learn` and `refresh`, and the server's threads call `get`, `set`,
     `follow` and `unfollow`. Only the main thread waits for the daemon, because the server's threads
-    also carry the stops of the viewers.
+    must also pass on the viewers' stops without delay.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class Settings:
     def learn(self, tables: object) -> dict[str, Any]:
         """Store the configuration, and return the settings that have changed.
 
-        `tables` is the configuration as plain tables, or None if this program may not read it.
+        `tables` is the configuration as nested dicts, or None if this program may not read it.
         """
         now = {} if tables is None else live_settings(tables)
         with self._lock:
@@ -120,9 +120,10 @@ class Settings:
             self._followed.difference_update(names)
 
     def set(self, wishes: dict[str, Any]) -> dict[str, Any]:
-        """Queue a change of these settings, and return their present values.
+        """Queue the change `wishes`, and return the present values of its settings.
 
-        `refresh` makes the change, and a notice tells all viewers whether the change succeeded.
+        `wishes` maps settings to their new values. Later `refresh` makes the change, and
+        a notice tells all viewers whether the change succeeded.
         """
         with self._lock:
             full = len(self._wishes.waiting) >= WISHES
@@ -135,10 +136,10 @@ class Settings:
             return asked(self._known, wishes.keys()) if wishes else {}
 
     def _change(self, wishes: dict[str, Any]) -> dict[str, Any]:
-        """Change all settings in `wishes` or none; return the settings whose values have changed.
+        """Change all settings in `wishes` or none; return settings with their present values.
 
-        The result also contains the settings in `wishes`, because a viewer may show the wished
-        values even if the change has failed.
+        The result contains all settings that have changed, and those in `wishes` even if the change
+        has failed. Viewers may show the wished values and need the present ones then.
         """
         news = dict[str, Any]()
         try:
@@ -179,13 +180,13 @@ class Settings:
 
 
 def live_settings(config: object) -> dict[str, Any]:
-    """Return the settings that can be changed at run time, by key. Tuples become lists."""
+    """Return the settings in `config` that can change at run time, by key. Tuples become lists."""
     found = ((key, value) for key, value in flat(config) if live(key))
     return {key: list(value) if isinstance(value, tuple) else value for key, value in found}
 
 
 def asked(known: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
-    """Return the settings with these names, or all of them if `names` is empty."""
+    """Return the settings of `known` that are in `names`, or all if `names` is empty."""
     return {key: value for key, value in known.items() if key in names or not names}
 
 
@@ -249,8 +250,8 @@ def start(
 ) -> WebSocketServer:
     """Start the server at `address`.
 
-    If `acts` is true, viewers may send commands and change settings. Raises `InUseError` if the
-    port is taken, and `NotPermittedError` if the port needs root.
+    The viewers show `name`. If `acts` is true, they may send commands and change settings. Raises
+    `InUseError` if the port is taken, and `NotPermittedError` if the port needs root.
     """
     host, port = address
     takes = [Capability.Services]
@@ -302,7 +303,7 @@ class Refusals(logging.Handler):
 
 CALLED: tuple[Verb, ...] = tuple(verb for verb in SERVICES if verb != "set")
 """Services that viewers may call with the option `--drive`: all but `set`, because viewers change
-settings as parameters instead."""
+settings through Foxglove parameters instead."""
 
 STOPS: tuple[Verb, ...] = ("stop",)
 """Services that viewers may call without the option `--drive`. Any web page in a local browser can

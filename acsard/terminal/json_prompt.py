@@ -5,8 +5,8 @@ answers, key presses and signs of life from standard input. If the input ends, o
 sends no line for `HEARD_S` while something may move, this module interrupts the subcommand as
 Ctrl-C does.
 
-deploy/web/README.md describes the fields. `web/openapi.py` describes the lines for other programs,
-with the docstrings of their classes.
+deploy/web/README.md describes the fields. The OpenAPI document of `web/openapi.py` describes the
+lines with the docstrings of the classes below.
 """
 
 from __future__ import annotations
@@ -48,11 +48,11 @@ of the command source replaces this limit.
 LISTEN_S = 0.05
 
 LINE_BYTES = 65536
-"""Largest length of an input line. A longer line interrupts the subcommand."""
+"""Maximum length of an input line, bytes. A longer line interrupts the subcommand."""
 
 
 class Line(Struct, frozen=True):
-    """An input line: an answer, a key press (`key`), or neither as a sign of life.
+    """An input line: an answer, a key press (`key`), or a sign of life if it is neither.
 
     `answer` is the number of the answered question, or 0. Unknown fields are ignored.
     """
@@ -117,7 +117,7 @@ class Found(Struct, frozen=True):
 
 
 class Result(Struct, frozen=True):
-    """The complete result, as a terminal shows it. Nothing moves any more."""
+    """The complete result, as a terminal shows it. From then on, nothing moves."""
 
     result: str
 
@@ -192,7 +192,8 @@ class JsonPrompt:
     def keys(self, wait_s: float) -> str:
         """Wait up to `wait_s` s for a key press, and return " " if a key was pressed, else "".
 
-        A key that was pressed since the last answer or the last call counts too.
+        A key that was pressed earlier counts too, unless it was pressed before the last answer or
+        reported by an earlier call.
         """
         with self._news:
             self._news.wait_for(lambda: self._pressed, wait_s)
@@ -223,7 +224,10 @@ class JsonPrompt:
         return wanted == "write"
 
     def _choose(self, words: str, answers: Sequence[str], **more: bool) -> str:
-        """Ask for one of the answers, and repeat the question after any other answer."""
+        """Ask for one of `answers`, and repeat the question after any other answer.
+
+        `words` is the text of the question, and `more` are further fields of `Question`.
+        """
 
         def chosen(value: str | float | None) -> str:
             if value not in answers:
@@ -238,7 +242,8 @@ class JsonPrompt:
     def _ask(self, read: Callable[[str | float | None], T], **about: object) -> T:
         """Ask a question until `read` accepts the answer, and return `read(answer)`.
 
-        `read` raises `ValueError` with a description of valid answers.
+        `read` raises `ValueError` with a description of valid answers. `about` are the fields of
+        the `Question`.
         """
         self._moves, wrong = False, ""
         while True:
@@ -266,7 +271,8 @@ class JsonPrompt:
     def _listen(self) -> None:
         """Read the input until the conversation is over.
 
-        If the input ends earlier, send SIGINT to the main thread.
+        If reading ends earlier for one of the reasons in `_heard_out()`, print the reason and send
+        SIGINT to the main thread.
         """
         try:
             self._end(self._heard_out())
@@ -275,7 +281,11 @@ class JsonPrompt:
             raise
 
     def _heard_out(self) -> str:
-        """Read the input until it ends, and return the reason; "" if the conversation is over."""
+        """Read the input until the subcommand must be interrupted, and return the reason in words.
+
+        The reason is the end of the input, a line that is too long, or a silence of more than
+        `HEARD_S` while something may move. Return "" if the conversation is over.
+        """
         held, heard_s = b"", time.monotonic()
         while not self._left:
             if self._readable(LISTEN_S):

@@ -17,8 +17,8 @@ from rich.table import Table
 from rich.text import Text
 
 WHOLE = 10_000
-"""Width, characters, that is larger than any row of a table. With it, no row is wrapped, so that a
-row can be copied."""
+"""Width, characters, that is larger than any row of a table. With this width, no row is wrapped, so
+a row can be copied from the terminal."""
 
 SENTENCES = 100
 """Largest width of output that contains sentences, characters."""

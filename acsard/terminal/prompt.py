@@ -33,7 +33,7 @@ class Ask(Struct, frozen=True):
     usual: float | None = None
     """Default, which an empty answer selects; None if there is no default."""
     name: str = ""
-    """The name by which a method of calibration refers to the answer."""
+    """Name under which the method of calibration stores the answer."""
 
     def number(self, text: str) -> float:
         """Return the number in an answer, which may have a decimal comma.
@@ -82,7 +82,7 @@ class Prompt(Protocol):
         """
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
-        """Ask the question. Return one of `answers`, or None if no person watches the robot."""
+        """Ask the question. Return one of `answers`, or None if no person is there to choose."""
 
     def start(self, text: str, by_key: bool = False) -> None:
         """Show the text, and wait until the person starts a drive.
@@ -91,7 +91,7 @@ class Prompt(Protocol):
         """
 
     def number(self, ask: Ask) -> float:
-        """Ask the question, and return the number. Without a person, return the default of `ask`.
+        """Ask the question, and return the number, or the default of `ask` if no person is there.
 
         Raises `NobodyError` if there is neither a person nor a default.
         """

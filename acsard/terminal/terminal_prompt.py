@@ -121,7 +121,10 @@ class TerminalPrompt(Screen):
     """
 
     def ask(self, question: str, answers: Sequence[str]) -> str:
-        """Return one of the answers; q, or the end of the input, ends the subcommand."""
+        """Ask the question, and return one of `answers`.
+
+        The answer "q" or the end of the input ends the subcommand.
+        """
         self._clear()
         choice = f" [{'/'.join((*answers, LEAVES))}]" if len(answers) > 1 else ""
         # A line that was typed before the question appeared must not answer it.

@@ -37,7 +37,7 @@ class Teleop(Struct, frozen=True):
     age: float
     """Seconds since `state` arrived, or since the wait for the first state began."""
     objection: str = ""
-    """Reason why the robot does not obey the keys, or "" if there is none."""
+    """Reason why the robot does not follow the keys, or "" if it follows them."""
     silent: bool = False
     """True if the robot is silent, so the shown data is old."""
 
@@ -99,7 +99,10 @@ def parting(seen: Teleop, width: int) -> list[str]:
 
 
 def released(seen: Teleop) -> bool:
-    """Return whether the robot stands and no longer follows the source of this drive."""
+    """Return whether the robot stands and no longer follows the source of this drive.
+
+    Return False if no state has arrived.
+    """
     if seen.state is None or moves(seen.state):
         return False
     return seen.state.mode != Mode.DRIVING or seen.state.source != seen.source
@@ -111,7 +114,7 @@ def moves(state: RobotState) -> bool:
 
 
 def silence(seen: Teleop) -> str:
-    """Return a sentence: no state has arrived yet, or none has arrived for some time."""
+    """Return a sentence which says that no state has arrived yet, or none for some time."""
     if seen.state is None and not seen.silent:
         return "waiting for the first state message of the daemon"
     return f"nothing received from the daemon for {seen.age:.0f} s: does it run?"
@@ -123,9 +126,10 @@ def reason(state: RobotState) -> str:
 
 
 def refused(objection: str) -> str:
-    """Return why the robot does not obey the keys.
+    """Return a sentence which says why the robot does not follow the keys.
 
-    If the robot requires a zero, the text also says how to send it with the keys.
+    `objection` is the reason. If the robot requires a zero command, the sentence also says how to
+    send it with the keys.
     """
     release = " (release the key, and press it again)" if "must send a zero" in objection else ""
     return f"your keys do not drive the robot: {printable(objection)}{release}"
@@ -142,7 +146,10 @@ def measured(state: RobotState) -> list[Text]:
 
 
 def _words(told: Sequence[str], width: int, figures: Sequence[Text] = ()) -> list[str]:
-    """Wrap the sentences `told`, and the figures below them. Continued lines are indented."""
+    """Return lines with the sentences `told`, and below them lines with `figures`.
+
+    No line has more than `width` characters. Wrapped lines are indented.
+    """
     width = max(20, width)
     lines = wrap("; ".join(told), width, subsequent_indent="  ", break_on_hyphens=False)
     return [*lines, *(f"  {line}" for line in flow(figures, width - 2))]

@@ -44,7 +44,7 @@ class Feed:
             self._take(state, now)
 
     def poll(self) -> None:
-        """Store the newest of the states that arrived since the last call, if one arrived."""
+        """If states have arrived since the last call, store the newest of them."""
         now = clock.steady_s()
         for state in self._watch.look(now)[-1:]:
             self._take(state, now)

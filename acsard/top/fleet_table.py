@@ -21,11 +21,12 @@ ROOM = (32, 8, 6, 7, 7, 22, 21, 6)
 """Maximum widths, in characters, of all columns except the last, which gets the remaining width."""
 
 NAME, WHY = 12, 32
-"""Minimum widths of the columns ROBOT and WHY, characters. ROBOT shrinks first to make room for
-WHY."""
+"""Minimum widths of the columns ROBOT and WHY, characters. If the terminal is too narrow, ROBOT
+shrinks to its minimum before WHY becomes shorter."""
 
 BATTERY = HEADS.index("BATTERY")
-"""Column of the state of charge. The table shows it only if a robot reports a battery."""
+"""Index of the column with the state of charge. The table has this column only if a robot reports a
+battery."""
 
 URGENT = ("fault", "stopped", "GONE", "SILENT")
 """Modes and kinds of absence that need attention. The table lists robots in this order.
@@ -65,9 +66,10 @@ def table(rows: Sequence[Row], width: int, height: int | None = None) -> list[st
 
 
 def shortened(names: Sequence[str], room: int) -> list[str]:
-    """Shorten names to `room` characters by cutting out a part, at the same place in each.
+    """Shorten each name that has more than `room` characters, by cutting out a part of it.
 
-    The cut is in the middle, unless a cut elsewhere keeps more names distinct.
+    The cut begins after the same number of characters in each name. It is near the middle of the
+    shortened names, unless a cut elsewhere keeps more names distinct.
     """
     if all(len(name) <= room for name in names):
         return list(names)
@@ -104,9 +106,10 @@ def told(row: Row) -> tuple[str, ...]:
 
 
 def _why(state: RobotState) -> str:
-    """Return brief warnings, the reason of the mode, and details.
+    """Return the warnings in brief, the reason of the mode, and details of the warnings.
 
-    If the mode is one of `URGENT`, its reason comes first.
+    The details also contain the speed limit, if there is one. If the mode is one of `URGENT`, its
+    reason comes first.
     """
     why = reason(state)
     found, parts = [one for one in warnings(state) if one.brief not in why], [why]
@@ -130,7 +133,10 @@ def _absence(row: Row) -> str:
 
 
 def _order(row: Row) -> tuple[int, str]:
-    """Return the sort key of a row: its urgency, then its id. Absence overrides the mode."""
+    """Return the sort key of a row: the urgency, then the robot's id.
+
+    For a robot that is gone or silent, the absence counts instead of the mode.
+    """
     what = _absence(row) or ("" if row.state is None else row.state.mode)
     if what in URGENT:
         return URGENT.index(what), row.robot_id
@@ -147,10 +153,11 @@ class Roster(Fleet):
         return [replace(row, here=bool(row.here)) for row in super().rows()]
 
     def gather(self) -> list[Row]:
-        """Wait until all robots that the user named have answered, and return the rows.
+        """Wait for the robots, and return the rows.
 
-        The wait ends after 1.5 s. If no robot has answered by then, it ends after 3 s with an empty
-        list, because on a busy computer the first answer is late.
+        The wait ends when all robots that the user named have reported, but at most after 1.5 s.
+        If no robot is present by then, the wait continues up to 3 s, because the first answer is
+        late on a busy computer. If no robot is present after 3 s, return [].
         """
         began, rows = time.monotonic(), self.rows()
         while not self.whole:

@@ -30,15 +30,15 @@ The repeats must be less than `REPEAT_S` apart. Keyboards repeat a key 10 to 30 
 """
 
 BURST = 8
-"""Largest number of keys that count if they arrive together.
+"""Largest number of keys that may arrive together and still drive the robot.
 
 If more keys arrive together, they were delayed, usually by an SSH connection that stalled. The
 operator may have released the key long ago.
 """
 
 BURST_S = 0.2
-"""Time after old keys during which further keys count as old too, s. One read may not return all
-the keys that have waited."""
+"""Time after the arrival of delayed keys, s, in which all further keys count as delayed too. One
+read from the terminal may not return all the delayed keys."""
 
 STOP = " "
 
@@ -63,16 +63,16 @@ class Keyboard:
         """Monotonic time of the last press of a driving key, s, and number of its repeats."""
         self._until = 0.0
         self._old_until = 0.0
-        """Monotonic time until which all keys count as old, s."""
+        """Monotonic time until which all keys count as delayed and only stop the robot, s."""
         self._zeros = ZEROS
 
     def take(self, text: str, now: float, waited: float = 0.0) -> None:
         """Process the keys of one read from the terminal at `now` (monotonic clock, s).
 
-        The keys may have waited for up to `waited` s. Keys are old if they may have waited for more
-        than `GRACE_S`, or if more than `BURST` keys arrive together. Old keys do not show what the
-        operator wants now, so they stop the robot. After such a wait, an earlier press does not
-        drive the robot any longer either.
+        The keys may have waited for up to `waited` s. They count as delayed if `waited` is above
+        `GRACE_S`, or if more than `BURST` keys arrive together. Delayed keys do not show what the
+        operator wants now, so they only stop the robot. After a wait of more than `GRACE_S`, the
+        robot is also stopped if no key was typed but an earlier press would still drive it.
         """
         keys = split(text)
         if len(keys) > BURST or waited > GRACE_S:

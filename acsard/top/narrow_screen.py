@@ -57,9 +57,10 @@ def motion(state: RobotState, width: int) -> list[Text]:
 
 
 def sources(state: RobotState, room: int, width: int) -> list[Text]:
-    """Return lines about each source: priority, age of the last command, and what it waits for.
+    """Return lines about each command source.
 
-    If the sources need more than about `room` lines, the last line names the other sources.
+    They show its priority, the age of its last command, and what it waits for. If the sources need
+    more than about `room` lines, the last line names the other sources.
     """
     lines = [rule(width, [(0, "sources"), (16, "priority"), (26, "seen")])]
     left = list(state.sources)

@@ -78,8 +78,8 @@ def _header(seen: ScreenData, width: int) -> Text:
 def _mode(seen: ScreenData, width: int) -> list[Text]:
     """Return the robot's mode as a colored label, with the reason of the mode beside or below it.
 
-    A wide screen uses two lines for mode and reason even if one suffices, so that the lines below
-    do not move when the reason becomes long.
+    A wide screen always uses two lines for mode and reason. Otherwise, the lines below would move
+    when the reason becomes long.
     """
     state = seen.state
     if state is None:

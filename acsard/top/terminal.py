@@ -85,10 +85,11 @@ def drive(ride: Ride) -> None:
 
 
 def part(ride: Ride) -> None:
-    """Wait until the robot has stopped, but at most 2 s, and print a last report on a terminal.
+    """Wait until the robot has stopped, but at most 2 s, and print a last report.
 
-    Without the wait, the report would say that the robot still moves, or that the source of this
-    drive still commands it. The daemon follows a source until its timeout, 0.25 s by default.
+    If standard input or output is not a terminal, do nothing. Without the wait, the report would
+    say that the robot still moves, or that it still follows the source of this drive. The daemon
+    follows a source until its timeout, 0.25 s by default.
     """
     left = clock.steady_s()
     while os.isatty(0) and os.isatty(1):
@@ -180,7 +181,7 @@ def _steer(ride: Ride, console: Console, suspend: list[bool]) -> bool:
 
 
 def _be_lenient() -> None:
-    """Make the output replace characters that its encoding lacks, instead of raising an error."""
+    """Let standard output replace characters that its encoding lacks, instead of failing."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")
 
@@ -291,15 +292,15 @@ class News:
 
 
 class Page:
-    """Repeats the help about the keyboard between the reports, before it scrolls out of sight."""
+    """Adds the help about the keys to the printed reports before it scrolls out of sight."""
 
     def __init__(self) -> None:
         self._shown = NO_END
-        """Number of lines printed since the last help, including those of the help; `NO_END` before
-        the first help."""
+        """Number of lines printed since the help was last printed, including the lines of the help.
+        It is `NO_END` before the help is first printed."""
 
     def with_help(self, told: list[str], height: int) -> list[str]:
-        """Return the lines `told`, after the help if the last help would scroll out of sight.
+        """Return the lines `told`, with the help above them if it would scroll out of sight.
 
         `height` is the number of lines of the terminal.
         """

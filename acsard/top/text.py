@@ -42,14 +42,14 @@ class ScreenData(Struct, frozen=True):
     """Seconds since `state` arrived, or since the wait for the first state began."""
     info: Info | None = None
     undecodable: int = 0
-    """Number of consecutive messages with a state of the robot that could not be decoded."""
+    """Number of state messages that could not be decoded since the last one that could be."""
     hint: str = ""
     silent: bool = False
     """True if no state has arrived for too long, so the shown data is old."""
     passed: float = 0.0
     """Seconds between the arrivals of `before` and `state`, on the local clock.
 
-    If the difference of their stamps is not the same, the robot's clock was adjusted.
+    If the difference of their stamps has another value, the robot's clock was adjusted.
     """
 
 
@@ -73,7 +73,10 @@ def count(number: int) -> str:
 
 
 def rate(later: int, earlier: int, seconds: float) -> str:
-    """Return the increase of a counter per second in 7 characters, or "-/s" if it is unknown."""
+    """Return a counter's increase per second as text with 7 characters, or "-/s" if unknown.
+
+    `seconds` is the time in which the counter rose from `earlier` to `later`.
+    """
     # After a clock change or a restart of the daemon, a wrong rate must not be shown.
     if not 0.05 <= seconds <= 60.0 or not 0 <= later - earlier < 10**6:
         return "-/s".rjust(7)
@@ -82,7 +85,10 @@ def rate(later: int, earlier: int, seconds: float) -> str:
 
 
 def bar(value: float, scale: float, cells: int) -> str:
-    """Return a bar for the magnitude of `value`. It has `cells` characters at `scale` or more."""
+    """Return a bar whose length shows the magnitude of `value`.
+
+    If the magnitude is `scale` or more, the bar has `cells` characters.
+    """
     if not math.isfinite(value):
         return ""
     eighths = round(min(1.0, abs(value) / scale) * cells * 8)

@@ -31,10 +31,10 @@ LINKS = {"up": "green", "booting": "yellow"}
 FIGURES = {
     "period_lateness": (
         "period due → step",
-        "from the first missed due time to the start of the step",
+        "from the (first missed) due time to the step's start",
     ),
     "step_time": ("work of one step", "from the start of a step to the end of its work"),
-    "command_age": ("arrival → each line", "from a command's arrival to each line that follows it"),
+    "command_age": ("arrival → each line", "from a command's arrival to each line that carries it"),
     "command_to_wire": (
         "arrival → first line",
         "from a command's arrival to the first line it causes",
@@ -45,7 +45,7 @@ FIGURES = {
     ),
     "mcu_round_trip": (
         "line out → answer in",
-        "from a line to its answer (only on a checked link)",
+        "from sending a line to its answer (checked link only)",
     ),
 }
 """Short and long explanation of each latency. `a → b` means the time from event a to event b."""
@@ -70,8 +70,10 @@ def motion(state: RobotState, width: int) -> list[Text]:
 
 
 def speeds(state: RobotState) -> tuple[tuple[float, ...], float]:
-    """Return a pair: the four wheel speeds (NaN if unknown), and that of a full bar; both in
-    rad/s."""
+    """Return a pair: the four wheel speeds, and the speed that a full bar stands for, rad/s.
+
+    An unknown speed is NaN.
+    """
     wheels = (*state.wheels[:4], *[math.nan] * (4 - len(state.wheels)))
     top = max((abs(speed) for speed in wheels if math.isfinite(speed)), default=0.0)
     return wheels, next((s for s in (20.0, 40.0, 80.0) if top <= s), 100.0)
@@ -143,7 +145,8 @@ def _source(source: SourceState, state: RobotState, room: int) -> Text:
 def link(seen: ScreenData, state: RobotState, width: int) -> list[Text]:
     """Return the lines about the serial link, the commands and the rejected inputs.
 
-    Lines about the gyro, the effective track and the board's inputs follow if the robot has them.
+    Further lines show the gyro, the effective track and the board's inputs, each only if the robot
+    reports it.
     """
     before = seen.before or state
     head = title(seen, state)

@@ -1,11 +1,11 @@
-"""Accepts TCP connections, and limits them before they cost memory.
+"""Accepts TCP connections, and refuses those beyond the limits before they use much memory.
 
 A connection goes through these states:
 
 1. silent: no byte has arrived yet. The connection costs only a file descriptor and a place in
    `Sockets`, because TLS starts with the first byte.
-2. waiting: the TLS handshake may not start yet, because too many handshakes are running or because
-   the client's network has started too many.
+2. waiting: the TLS handshake may not start yet, because too many handshakes are running, or because
+   the client's network has started handshakes too often.
 3. starting: the TLS handshake is running.
 4. open: aiohttp reads the connection's requests.
 """
@@ -40,7 +40,7 @@ HANDSHAKE_S, HANDSHAKES_AT_ONCE = 3.0, 32
 HURRIED_S = 0.3
 """Minimum age, s, of a running TLS handshake that may be aborted to make room for a waiting one.
 This happens only while `HANDSHAKES_AT_ONCE` handshakes run. Without this rule, clients that stop
-sending during their handshakes would delay a phone by `HANDSHAKE_S`."""
+sending during their handshakes would delay the handshake of a phone by up to `HANDSHAKE_S`."""
 
 REQUEST_S = 10.0
 """Time limit, s, from accepting a connection to the end of the headers of its first request."""
@@ -50,10 +50,12 @@ UNREAD_S = 5.0
 receive window closed."""
 
 READ_BYTES = 16384
-"""Read buffer of each TLS connection, bytes: one TLS record. asyncio's default is 256 KiB."""
+"""Size of the read buffer of each TLS connection, bytes. The buffer holds one TLS record. asyncio's
+default is 256 KiB."""
 
 PAUSE_S = 0.05
-"""Pause, s, in accepting connections after the process has run out of file descriptors."""
+"""Time, s, for which the server accepts no connections after the process has run out of file
+descriptors."""
 
 Factory = Callable[[], "Reader"]
 
@@ -80,7 +82,7 @@ class Acceptor:
         self._again: asyncio.TimerHandle | None = None
         """Timer of the next call of `_next`, or None if no call is scheduled."""
         self._ended: set[_Connection] = set()
-        """The connections whose token was missing from the argument `valid` of the last call of
+        """The connections whose token was not in the argument `valid` at the last call of
         `tidy()`."""
 
     def listen(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
@@ -109,13 +111,14 @@ class Acceptor:
     def spoke(self, transport: asyncio.BaseTransport | None, body: StreamReader) -> None:
         """Record that the headers of a request have arrived, which ends the time limit `REQUEST_S`.
 
-        `body` is the stream from which the body of this request is read.
+        `transport` identifies the connection, and `body` is the stream from which the body of this
+        request is read.
         """
         if (one := _connection(transport)) is not None:
             one.spoke(body)
 
     def admitted(self, transport: asyncio.BaseTransport | None, who: Who) -> None:
-        """Record the identity of the client of a connection.
+        """Record that the client of a connection has been identified as `who`.
 
         If connections must be closed to make room, those without an identity are closed first.
         """
@@ -123,10 +126,10 @@ class Acceptor:
             one.pool.prove(one, who.token)
 
     def tidy(self, valid: Collection[str]) -> None:
-        """Cut each connection whose token is missing from `valid` for the second call in a row.
+        """Cut each connection whose token was not in `valid` in two consecutive calls.
 
-        Call this once a second. At the first call, the connection stays open, so a WebSocket client
-        can receive the reason before the second call.
+        `valid` contains the digests of all valid tokens. Call this once a second. After the first
+        of the two calls, a WebSocket client still has time to receive the reason.
         """
         before = self._ended
         self._ended = {one for pool in (self._here, self._away) for one in pool.ended(valid)}
@@ -157,7 +160,8 @@ class Acceptor:
     def _no_file(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
         """Close an old connection because the process has no free file descriptor.
 
-        New connections are accepted again after `PAUSE_S`.
+        The listening socket `opened` accepts new connections again after `PAUSE_S`. The arguments
+        are those of `listen()`.
         """
         loop = asyncio.get_running_loop()
         loop.remove_reader(opened)
@@ -168,7 +172,7 @@ class Acceptor:
     # The connections call the methods below.
 
     def crowded(self, one: _Connection) -> None:
-        """Cut a connection that has no place or whose request headers are too long.
+        """Cut a connection for which there is no room, or whose request headers are too long.
 
         The refusal is counted under the reason `crowded`.
         """
@@ -181,7 +185,7 @@ class Acceptor:
         one.cut()
 
     def wait(self, one: _Connection) -> None:
-        """Queue a connection for its TLS handshake, which starts when the limits allow it."""
+        """Queue a connection for its TLS handshake. `_next()` starts it when the limits permit."""
         self._waiting.setdefault(one.network, {})[one] = None
         if self._again is None:
             self._next()
@@ -194,9 +198,9 @@ class Acceptor:
             self._waiting.pop(one.network, None)
 
     def started(self, one: _Connection) -> None:
-        """Record that a TLS handshake has succeeded or failed, and start a waiting one if possible.
+        """Record that the TLS handshake of the connection `one` has succeeded or failed.
 
-        The handshake is that of the connection `one`.
+        If another handshake is waiting and the limits allow it, start that handshake.
         """
         self._starting.pop(one, None)
         if self._again is None:
@@ -227,9 +231,9 @@ class Acceptor:
     def _has_room(self, now: float) -> bool:
         """Return whether a TLS handshake may start at the time `now`.
 
-        If `HANDSHAKES_AT_ONCE` handshakes run, try to make room: cut the oldest handshake of the
-        network that has the most, unless this handshake is younger than `HURRIED_S`. `now` is in s
-        on the event loop's clock.
+        If `HANDSHAKES_AT_ONCE` handshakes run, try to make room. The network with the most running
+        handshakes loses the oldest of them, unless it is younger than `HURRIED_S`. `now` is in s on
+        the event loop's clock.
         """
         if len(self._starting) < HANDSHAKES_AT_ONCE:
             return True
@@ -248,7 +252,7 @@ class Acceptor:
 
 
 class _Connection(asyncio.Protocol):
-    """One TCP connection. Once it is open, this object passes received data to a `Reader`."""
+    """One TCP connection. After a TLS handshake, if any, it passes received data to a `Reader`."""
 
     def __init__(
         self,
@@ -266,7 +270,7 @@ class _Connection(asyncio.Protocol):
         self._task: asyncio.Task[None] | None = None
         self._transport: asyncio.BaseTransport | None = None
         self._head = 0
-        """Number of bytes of the next request's head (request line and headers) received so far."""
+        """Number of received bytes of the next request's head (request line and headers)."""
         self._body: StreamReader | None = None
         self._inner: Reader | None = None
 
@@ -304,7 +308,7 @@ class _Connection(asyncio.Protocol):
             self._acceptor.wait(self)
 
     def start(self) -> None:
-        """Start the TLS handshake, or for plain HTTP open the connection."""
+        """Start the TLS handshake. For plain HTTP, open the connection immediately."""
         self._task = self._loop.create_task(self._open())
 
     async def _open(self) -> None:
@@ -344,7 +348,11 @@ class _Connection(asyncio.Protocol):
                 self._socket.shutdown(socket.SHUT_RDWR)
 
     def spoke(self, body: StreamReader) -> None:
-        """Record that the head of a request has arrived, which ends its limits of size and time."""
+        """Record that the head of a request (request line and headers) has arrived.
+
+        The time limit `REQUEST_S` ends, and the size of the next head is counted from 0. `body` is
+        the stream from which the body of this request is read.
+        """
         self._head, self._body = 0, body
         self._cancel_timer()
 
@@ -414,7 +422,7 @@ class Reader(RequestHandler):
     def reads_head(self) -> bool:
         """Whether the next received bytes belong to the head of a request.
 
-        False on a WebSocket, and while received requests wait for their turn.
+        False on a WebSocket, and while received requests wait to be handled.
         """
         return not self._upgraded and not self._messages
 

@@ -61,8 +61,8 @@ is open to every client."""
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 READ_EVERY_S = 0.005
-"""Shortest interval between two reads of the token file, s. Each read starts a thread. When each
-request of a flood started a thread, a stop was delayed by 200 ms."""
+"""Shortest interval between two reads of the token file, s. Each read starts a thread. Before
+this limit existed, each request of a flood started a thread, and a stop was delayed by 200 ms."""
 
 
 class Lookups:
@@ -74,9 +74,10 @@ class Lookups:
         self._read_s = -READ_EVERY_S
 
     async def read(self) -> Sequence[Token]:
-        """Return the robot's tokens from a read of the token file that starts after this call.
+        """Read the token file, and return the robot's tokens.
 
-        Raises `TimeoutError` if the disk does not answer.
+        The read starts after this call, so it sees all earlier changes of the file. Raises
+        `TimeoutError` if the disk does not answer.
         """
         if self._next is None:
             self._next = asyncio.create_task(self._later())
@@ -130,7 +131,9 @@ class Admission:
         return app
 
     async def owner(self, peer: str, shown: Sequence[str]) -> Who:
-        """Return the owner of the first valid token in `shown`; `peer` is the client's IP address.
+        """Return the owner of the first valid token in a request.
+
+        `peer` is the client's IP address, and `shown` contains the tokens in the request.
 
         Raises `RefusedError` if no token is valid, and `TimeoutError` if the disk does not answer.
         """
@@ -194,7 +197,7 @@ class Admission:
     async def _pace_stranger(self, request: web.Request) -> None:
         """Delay a request without a valid token by `HOLD_S` if it exceeds the limit `STRANGERS`.
 
-        The limit applies to all requests without a valid token from the client's network.
+        All requests without a valid token from the client's network share this limit.
         """
         if not self._strangers.take(network_of(peer_of(request)), clock.mono_ns()):
             await asyncio.sleep(HOLD_S)
@@ -202,9 +205,9 @@ class Admission:
     async def _admit(self, request: web.Request, row: Route | None) -> bool:
         """Store the client's identity in the request; return whether the request must be delayed.
 
-        It must be delayed if the client exceeds the rate limit of a path whose requests wait. `row`
-        is the route of the path, or None for an unknown path. Raises `RefusedError` if the client
-        may not use the path.
+        `row` is the route of the path, or None for an unknown path. The request must be delayed if
+        the client exceeds the rate limit of the path and `row.waits` is true. Raises `RefusedError`
+        if the client may not use the path.
         """
         said = asked_of(request)
         here = place(said, self._names | {own_address(request)}) == "here"
@@ -304,12 +307,16 @@ def own_port(request: web.Request) -> int:
 
 
 def tokens_shown(request: web.Request, robot: str) -> list[str]:
-    """Return the tokens from `tokens_sent()`. If there are none, return those in the cookies."""
+    """Return the tokens in the headers (see `tokens_sent()`), or else those in the cookies."""
     return tokens_sent(request) or tokens_in(request.cookies, robot, own_port(request))
 
 
 def tokens_sent(request: web.Request) -> list[str]:
-    """Return the token in `Authorization`. If there is none, use `Sec-WebSocket-Protocol`."""
+    """Return the tokens in the headers of a request.
+
+    This is the bearer token in `Authorization` or, if there is none, the tokens in
+    `Sec-WebSocket-Protocol`.
+    """
     kind, _, text = request.headers.get("Authorization", "").partition(" ")
     if kind.lower() == "bearer":
         return [text.strip()]

@@ -1,4 +1,4 @@
-"""The HTTP answers of the page's server: JSON, files, problems, and the headers of all answers.
+"""The HTTP answers of the page's server: JSON, files, errors, and the headers of all answers.
 
 The script of the STOP button and the style sheet are sent inside `index.html`, so STOP works even
 if another file is late or never arrives.
@@ -54,12 +54,12 @@ POLICY = (
     "form-action 'self'"
 )
 """Content security policy of every answer except a report. `{connect}` is replaced by the
-page's WebSocket URLs. An error answer does not contain these URLs, so that a forged `Host` header
-is not copied into it."""
+page's WebSocket URLs. An error answer does not contain these URLs, so a forged `Host` header is
+never copied into it."""
 
 
 class TroubleError(AcsardError):
-    """A permitted request cannot be fulfilled. `status` is the HTTP status of the answer."""
+    """A request is permitted but cannot be fulfilled. `status` is the HTTP status of the answer."""
 
     def __init__(self, status: int, text: str) -> None:
         super().__init__(text)
@@ -155,8 +155,8 @@ def takes_gzip(request: web.Request) -> bool:
 def cut(transport: asyncio.BaseTransport | None) -> None:
     """Abort a connection without waiting for the client; do nothing if `transport` is None.
 
-    A TLS connection that was closed twice cannot be aborted. It ends when the time limit of its TLS
-    shutdown is over.
+    On Python 3.11.2, a TLS connection that was closed twice cannot be aborted. It ends when the
+    time limit of its TLS shutdown is over.
     """
     if transport is None:
         return
@@ -205,9 +205,11 @@ INLINED = {
         "style.css": (b'<link rel="stylesheet" href="page/style.css">', "style"),
     }
 }
-"""Maps a file to the files that are sent inside it. Each inner file has a pair of values: the
-element in the outer file that loads the inner file, and the name of the element that replaces this
-element and contains the text of the inner file."""
+"""Maps the name of an outer file to the inner files that are sent inside it.
+
+Each inner file has a pair of values. The first is the HTML element that loads the inner file. The
+second is the name of the element that is sent instead and contains the text of the inner file.
+"""
 
 
 class File(Struct, frozen=True):
@@ -216,11 +218,11 @@ class File(Struct, frozen=True):
     kind: str
     body: bytes
     packed: bytes | None
-    """The gzip form of the body, or None if it is not shorter."""
+    """The body in gzip form, or None if gzip does not make it shorter."""
     tag: str
     policy: str
-    """Directives of the content security policy that allow the files that are sent inside this
-    one."""
+    """Directives of the content security policy. They allow the scripts and styles of the files
+    that are sent inside this file."""
     stamp: tuple[tuple[int, int], ...]
     """Modification time, ns, and size, bytes: first of this file, then of each file that is sent
     inside it."""
@@ -256,7 +258,10 @@ class Files:
 
 
 def _read(paths: Sequence[Path], kind: str, stamp: tuple[tuple[int, int], ...]) -> File:
-    """Read the file `paths[0]`, and put the other files into it as `INLINED` says."""
+    """Read the file `paths[0]`, and put the other files into it as `INLINED` says.
+
+    `kind` is the content type, and `stamp` is the value of `File.stamp`.
+    """
     whole, *parts = paths
     body, policy = whole.read_bytes(), ""
     for part in parts:

@@ -56,7 +56,7 @@ BODY_S = 5.0
 """Time limit for receiving the body of a request, s. A usual body has a few hundred bytes."""
 
 REPORT_S = 300.0
-"""Time limit for sending a report to a client that does not take gzip, s."""
+"""Time limit for sending a report to a client that does not accept gzip, s."""
 
 DRAWN: dict[State, int] = {"drawing": 202, "busy": 202, "ready": 200, "failed": 503}
 """HTTP status of the answer for each state of the report of a recording."""
@@ -67,7 +67,7 @@ DEFAULT = WebConfig()
 class TokenForm(Struct, frozen=True):
     """The token of an invitation, which the browser gets back as a cookie.
 
-    If `replace` is true, this cookie may replace an earlier one that has more permissions.
+    If `replace` is true, this cookie may replace a cookie whose token has more permissions.
     """
 
     token: str
@@ -83,7 +83,7 @@ class Caller(Struct, frozen=True):
 
 
 class Setting(Struct, frozen=True, omit_defaults=True):
-    """One setting, with its value, its explanation and its allowed values."""
+    """One setting of the robot: its key, value, explanation and allowed values."""
 
     key: str
     value: Any
@@ -122,9 +122,9 @@ class Page:
         self.app = self._admission.application(ROUTES, self)
 
     def end_all(self, why: str) -> None:
-        """Drop the report, close the camera, and end every WebSocket with the reason `why`.
+        """Drop the report, close the camera, and end every WebSocket.
 
-        `why` has at most 120 characters.
+        `why` is the reason that the clients receive, with at most 120 characters.
         """
         self._reports.end()
         self._camera.close()
@@ -271,8 +271,8 @@ class Page:
         robot = given.pop("robot", "")
         if not isinstance(robot, str):
             text = (
-                "`robot` must be the id of a robot, as text; for robots other than its own, this "
-                "page accepts only the call stop"
+                "`robot` must be the id of a robot as a JSON string; for robots other than its "
+                "own, this page accepts only the service stop"
             )
             raise RefusedError("malformed", text)
         verb = request.path.removeprefix("/api/srv/")
@@ -282,7 +282,7 @@ class Page:
     async def picture(self, request: web.Request) -> web.StreamResponse:
         """Wait for a camera picture that the client has not seen, and return it.
 
-        If none arrives in time, return an answer with the status 304.
+        If no such picture arrives in time, return an answer with the status 304.
         """
         seen = request.headers.get("If-None-Match", "").strip('"')
         begun_ns = clock.steady_ns()
@@ -409,7 +409,8 @@ ROUTES: tuple[Route, ...] = (
     Route("GET", "/api/whoami", "viewer", Page.whoami, "the caller's role and name",
         gives={200: Body("The caller.", Caller)}, rate=STOPS, waits=True),
     Route("GET", "/api/settings", least_role("config"), Page.settings,
-        "the settings that srv/set accepts, with values, ranges, and when each may change",
+        "the settings that srv/set accepts: values, ranges, and whether each may change while the "
+        "robot moves",
         gives={200: Body("A list.", list[Setting])}),
     Route("GET", "/api/guide", Begin.least, Page.guide,
         "the values that the WebSocket message `begin` accepts: calibration methods, serial ports",
@@ -439,7 +440,7 @@ ROUTES: tuple[Route, ...] = (
     *values(Page.value),
     *services(Page.service),
     Route("GET", "/metrics", "viewer", Page.metrics,
-        "state, counters and figures for Prometheus",
+        "the robot's state, counters and latencies as metrics for Prometheus",
         gives={200: Body("Text.", str, "text/plain")}),
 )  # fmt: skip
 

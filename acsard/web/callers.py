@@ -30,11 +30,11 @@ Reason = Literal[
 Place = Literal["here", "away"]
 
 HERE = "here"
-"""Name of every client on the robot itself, which has no token from which to take a name."""
+"""Name of every client on the robot itself. Other clients have the name of their token."""
 
 COOKIE = "__Host-acsard"
-"""Prefix of the cookie names. Browsers accept a cookie with the prefix `__Host-` only with Secure,
-with Path=/ and without Domain."""
+"""Prefix of the cookie names. Browsers accept a cookie with the prefix `__Host-` only if it has the
+attributes `Secure` and `Path=/` and no attribute `Domain`."""
 
 PROTOCOL, TOKEN = "acsard", "acsard.token."
 """The WebSocket's subprotocol, and the prefix of a subprotocol name that carries a token."""
@@ -143,8 +143,8 @@ def require_own_origin(asked: Asked) -> None:
 def by_listed_page(asked: Asked, origins: Collection[str]) -> bool:
     """Return whether a web page of an origin in `web.origins` made the browser send this request.
 
-    Return False for the robot's own page, even if `web.origins` lists its origin. Otherwise, the
-    cookies of the robot's own page would be ignored like those of a listed page.
+    Return False for the robot's own page, even if `web.origins` lists its origin. The server
+    ignores the cookies of listed pages, but it must accept those of the robot's own page.
     """
     if asked.origin is None or asked.origin.lower() == _own_origin(asked):
         return False

@@ -39,7 +39,8 @@ MERGE_S = 0.02
 """Shortest interval between two stops that are sent for one client to one robot, s."""
 
 ANSWER_S = 8.0
-"""Time limit for an answer from the bus, s. `Client` gives up sooner, with a clear message."""
+"""Time limit for an answer over the bus, s. `Client` has a shorter limit and
+raises an error with a clear message."""
 
 T = TypeVar("T")
 
@@ -64,10 +65,10 @@ class Calls:
         ends: Callable[[], Awaitable[Ending]],
         sees: Callable[[str], bool],
     ) -> None:
-        """Create the limits, with no call running.
+        """Store the arguments, and create the limits.
 
-        `ends` interrupts a running check or calibration. `sees(id)` returns whether the robot with
-        this id is known to the server.
+        `robots` holds the connection to the daemon. `ends` interrupts a running check or
+        calibration. `sees(id)` returns whether the robot with this id is known to the server.
         """
         self._robots, self._ends, self._sees = robots, ends, sees
         self._stops, self._merged = Stops(), Merged()
@@ -129,8 +130,8 @@ class Calls:
     async def get(self, robot: str, name: str) -> tuple[str, bytes]:
         """Query the last value of a robot's key as JSON; return the pair (encoding, payload).
 
-        Raises `MendableError` if there is no connection, if no answer arrives, or if `AT_ONCE`
-        requests are running already.
+        `robot` is the robot's id, and `name` is the key without this id. Raises `MendableError` if
+        there is no connection, if no answer arrives, or if `AT_ONCE` requests are running already.
         """
         client = self._robots.client
         if client is None:
@@ -142,8 +143,10 @@ class Calls:
     ) -> ServiceReply:
         """Stop another robot, and return its reply.
 
-        A robot that does not exist never replies, so at most `ELSEWHERE_AT_ONCE` calls wait for a
-        reply. Further calls only send the stop.
+        `robot` is the id of the robot, `client` is this server's bus client, and `who` is the
+        client of the page. `request` sends the stop and waits for the reply. A robot that does not
+        exist never replies, so at most `ELSEWHERE_AT_ONCE` calls wait for a reply. Further calls
+        only send the stop.
         """
         with self._elsewhere.held() as free:
             if free:
@@ -159,8 +162,9 @@ class Calls:
         )
         return ServiceReply(
             False,
-            f"the stop was sent to {robot}, but the page's server does not wait for the answer, "
-            "because too many other stops wait for theirs: check that the robot has stopped",
+            f"the stop was sent to {robot}, but the page's server does not wait for its answer, "
+            "because it already waits for the answers to too many other stops: check that the "
+            "robot has stopped",
         )
 
     def _require_few(self, who: Who) -> None:
@@ -190,15 +194,16 @@ class Merged:
 
     def __init__(self) -> None:
         self._rests: dict[Hashable, asyncio.Event] = {}
-        """Maps (client, robot) to an event, which is set `MERGE_S` after the last stop was sent."""
+        """Maps (client, robot) to an event that is set `MERGE_S` after the last stop was sent."""
         self._next: dict[Hashable, asyncio.Task[ServiceReply]] = {}
         """Maps (client, robot) to the task that waits for the event in `_rests` and then sends a
         stop."""
 
     async def ask(self, name: Hashable, stop: Stop) -> ServiceReply:
-        """Send a stop, or share one that is not sent yet, and return its reply.
+        """Send a stop by calling `stop`, and return the reply.
 
-        `name` identifies the client and the robot.
+        `name` identifies the client and the robot. If a stop with the same `name` is waiting to be
+        sent, share it and its reply instead.
         """
         if name in self._next:
             return await asyncio.shield(self._next[name])
@@ -233,7 +238,10 @@ class Stops:
         self._next: asyncio.Task[ServiceReply] | None = None
 
     async def ask(self, call: Callable[[], ServiceReply]) -> ServiceReply:
-        """Send a stop with `call`, or share a stop that is not sent yet, and return the reply."""
+        """Send a stop by calling `call`, and return the reply.
+
+        If `STOPS_AT_ONCE` stops are running, share the next stop and its reply with other callers.
+        """
         if not self._room.locked():
             async with self._room:
                 return await in_thread(call, ANSWER_S)

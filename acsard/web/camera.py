@@ -23,11 +23,11 @@ from acsard.host.rate_limits import Places
 from acsard.web.answers import TroubleError
 
 WAIT_S = 1.0
-"""Time limit, s, for each of two waits: for a new picture from the camera, and then for a place to
-send it (see `SENDS`)."""
+"""Time limit, s, for each of two waits: the wait for a new picture from the camera, and the wait
+for the permission to send it (see `SENDS`)."""
 
 CONNECT_S, SILENT_S = 3.0, 3.0
-"""Time limits for the connection to the camera's server, and for the next byte from it, s."""
+"""Time limits, s: for connecting to the camera's server, and for each wait for data from it."""
 
 MAX_PICTURE, MAX_HEAD = 1_000_000, 4096
 """Maximum size of a picture and of its header lines, bytes. A full HD picture has a few hundred
@@ -63,7 +63,7 @@ class Parts:
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> bytes | None:
-        """Add received bytes; return the newest picture that is now complete, or None.
+        """Add received bytes; return the newest picture that they complete, or None.
 
         Raises `ValueError` if a picture or its header lines are too long.
         """
@@ -99,8 +99,8 @@ class Camera:
     def __init__(self, url: str) -> None:
         self._url = url
         self.newest: Picture | None = None
-        """The newest picture; None before the first one, after a failure, and while no client asks
-        for pictures."""
+        """The newest picture. It is None before the first picture, after a failure, and while no
+        client asks for pictures."""
         self._number = 0
         self._trouble = "the camera's stream has no picture yet"
         self._asked_ns = 0
@@ -109,9 +109,10 @@ class Camera:
         self._reading: asyncio.Task[None] | None = None
 
     async def after(self, number: int) -> Picture | None:
-        """Return the newest picture as soon as its number is not `number`.
+        """Wait for a picture that is newer than the one with this number, and return it.
 
-        Return None if no such picture arrives within `WAIT_S`. Raises `TroubleError` if there is no
+        `number` is 0 if the client has no picture. Return None if no newer picture arrives within
+        `WAIT_S`. Raises `TroubleError` if there is no
         camera or its stream cannot be read.
         """
         if not self._url:
@@ -144,7 +145,7 @@ class Camera:
                     await self._sent.wait()
         except TimeoutError:
             text = f"{SENDS_OF_TOKEN} pictures with this token, or {SENDS} in total, are being sent"
-            raise TroubleError(503, f"{text}: ask again when one has arrived") from None
+            raise TroubleError(503, f"{text}: ask again when one of them has arrived") from None
         try:
             yield
         finally:

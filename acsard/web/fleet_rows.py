@@ -26,8 +26,8 @@ UNROUTED = (
 """Note to the viewers if the page's server is connected to a daemon instead of a router."""
 
 BY_NAME = (
-    "{endpoint} passes only exact keys, as every TLS endpoint does, so no other robot is "
-    "visible. To see all robots of a router, run this page's server on the router's machine: "
+    "{endpoint} allows only exact keys, as every TLS endpoint does, so this page sees no other "
+    "robot. To see all robots of a router, run this page's server on the router's machine: "
     "acsard web --connect tcp/127.0.0.1:7447 --id {robot}"
 )
 """Note to the viewers if the page's server is connected over TLS, which lets the server reach only
@@ -43,7 +43,8 @@ class Fleet:
         self._tracked: fleet.Fleet | None = None
         self._busy: set[asyncio.Task[None]] = set()
         self.note = ""
-        """Why robots may be missing from the rows; "" if all robots of a router are visible."""
+        """Reason why robots may be missing from the rows, in words. It is "" if the server is
+        connected to a router, and therefore sees all robots of this router."""
 
     def join(self, viewer: object) -> None:
         self._joined.add(viewer)
@@ -54,7 +55,7 @@ class Fleet:
         self._tidy()
 
     def rows(self) -> list[Row]:
-        """Return one row per robot, sorted by id, and start due queries in the background."""
+        """Return one row per robot, sorted by id; start the due queries in the background."""
         self._look()
         rows = [] if self._tracked is None else self._tracked.rows()
         return [_row(one) for one in sorted(rows, key=lambda one: one.robot_id)]
@@ -62,8 +63,8 @@ class Fleet:
     def sees(self, robot: str) -> bool:
         """Return whether the robot is known to this server.
 
-        A robot is known if its liveliness token is present, or if a viewer follows its `state` and
-        one has arrived.
+        A robot is known if its liveliness token is present, or if a viewer is subscribed to its key
+        `state` and a state has arrived.
         """
         states = self._robots.streams.followed(robot, STATE)
         here = self._tracked is not None and self._tracked.here(robot)

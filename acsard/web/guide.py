@@ -1,4 +1,4 @@
-"""Runs a board check or a calibration for a browser, in a child process that runs `acsard` itself.
+"""Runs a board check or a calibration for a browser, in a child process of the program `acsard`.
 
 Only one child runs at a time. The lines that the child prints (`terminal/json_prompt.py`) go only
 to the WebSocket that started the child, and only this WebSocket may answer the child's questions.
@@ -51,7 +51,7 @@ Say = Callable[[Guided], None]
 class Reach(Struct, frozen=True):
     """The options with which a child process connects to the daemon of this server's robot.
 
-    An option whose value is empty is left out.
+    If a value is empty, the child gets no such option.
     """
 
     config: str
@@ -71,18 +71,18 @@ class Choices(Struct, frozen=True):
     """The checks and calibrations that the page may start."""
 
     methods: dict[str, str]
-    """Description of the requirements of each calibration method."""
+    """Maps each calibration method to a description of its requirements."""
     method: str
     """The recommended method; "" selects the default."""
     advice: str
     """Reason for the recommendation and the alternatives."""
     ports: Sequence[Board]
     note: str
-    """Advice if this server sees no serial port, with the command to type instead; else ""."""
+    """Advice with the commands to type if this server sees no serial port; otherwise ""."""
 
 
 class _Said(Struct, frozen=True):
-    """The fields of the child's output lines that this server uses itself."""
+    """The fields of the child's output lines that this server reads. It passes on whole lines."""
 
     question: int = 0
     leg: bool = False
@@ -90,7 +90,7 @@ class _Said(Struct, frozen=True):
 
 
 class Guide:
-    """Runs one check or calibration at a time, and tells all viewers of the page what runs."""
+    """Runs one check or calibration at a time, and tells all viewers of the page which one runs."""
 
     def __init__(self, reach: Reach, configured: str) -> None:
         """Store the options that connect a child to the daemon, and the configured serial port."""
@@ -100,7 +100,11 @@ class Guide:
         self._task: asyncio.Task[None] | None = None
 
     async def choices(self, *, simulated: bool) -> Choices:
-        """Return the checks and calibrations that the page may start now."""
+        """Return the checks and calibrations that the page may start now.
+
+        `simulated` is true if the page's robot is simulated. It decides which calibration method is
+        recommended.
+        """
         found = await self._boards()
         way, advice = SIMULATED if simulated else ("", "")
         sees_one = any(board.port != SIMULATOR and board.what != ABSENT for board in found)
@@ -109,7 +113,8 @@ class Guide:
     def join(self, viewer: object, say: Say) -> None:
         """Add a viewer, and tell the viewer which check or calibration runs, or that none runs.
 
-        A viewer that connects again may have missed the end of a check or calibration.
+        `say` sends a message to the viewer. The message is sent even if nothing runs, because a
+        viewer that connects again may have missed the end of a check or calibration.
         """
         self._viewers[viewer] = say
         say(Guided(Running("")) if self._errand is None else self._errand.about(viewer))
@@ -121,14 +126,14 @@ class Guide:
             errand.leave()
 
     def begin(self, viewer: object, by: str, asked: Begin) -> str:
-        """Start the check or calibration `asked` for a viewer; `by` is the name of its user.
+        """Start the check or calibration `asked` for a viewer.
 
-        Return "" or the reason for a refusal.
+        `by` is the name of the viewer's user. Return "" or the reason for a refusal.
         """
         if self._errand is not None:
             return (
-                f"{self._errand.name} already runs ({self._errand.by}), and only one can run at a "
-                "time: wait until it ends"
+                f"{self._errand.name} is already running (started by {self._errand.by}), and only "
+                "one check or calibration can run at a time: wait until it ends"
             )
         self._errand = _Errand(viewer, by, asked.begin, self._viewers[viewer])
         self._tell_all()
@@ -140,14 +145,15 @@ class Guide:
         errand = self._of(viewer)
         if errand is None or not errand.answer(reply):
             return (
-                f"question {reply.reply} is not open on this page: answer the newest question here"
+                f"question {reply.reply} is not open on this page: answer the newest question that "
+                "this page shows"
             )
         return ""
 
     def press(self, viewer: object, press: Press) -> None:
         """Pass a key press to the child that the viewer started, or interrupt this child.
 
-        If the child has ended, do nothing.
+        `press` says which of the two to do. If the child has ended, do nothing.
         """
         if (errand := self._of(viewer)) is None:
             return
@@ -157,15 +163,16 @@ class Guide:
             errand.leave()
 
     async def stop(self) -> Ending:
-        """Interrupt the running check or calibration, because a client stops the robot.
+        """Interrupt the running check or calibration, and return the result within about 1 s.
 
-        Any client may do this, not only the one that started the check or calibration. The daemon
-        alone cannot stop the wheels during a check, because the check holds the serial port.
+        This method is called when a client stops the robot. Any client may do this, not only the
+        one that started the check or calibration. The daemon alone cannot stop the wheels during a
+        check, because the check holds the serial port.
         """
         if self._errand is None or self._task is None:
             return Ending()
         self._errand.leave()
-        what = f"the {self._errand.name} started by {self._errand.by}"
+        what = f"the job {self._errand.name} started by {self._errand.by}"
         done, _ = await asyncio.wait([self._task], timeout=1.0)
         return Ending(f"{what} has ended" if done else f"{what} is being ended", bool(done))
 
@@ -199,7 +206,7 @@ class Guide:
         except (FrameError, OSError, TimeoutError) as error:
             code, text = (
                 int(Exit.USAGE),
-                str(error) or "the serial ports were not found in time: try again",
+                str(error) or "listing the serial ports took too long: try again",
             )
         finally:
             self._errand = None
@@ -221,9 +228,10 @@ class Guide:
 
 
 def boards(configured: str) -> list[Board]:
-    """Return the serial ports, and the simulator, from which the user chooses one to check.
+    """Return the serial ports and the simulator. The user chooses one of them for a board check.
 
-    The configured port comes first. Call this function in a thread, because it blocks.
+    `configured` is the port in the configuration, which comes first. Call this function in a
+    thread, because it blocks.
     """
     found: dict[str, str] = {}
     for device in serial_devices():
@@ -244,9 +252,9 @@ def boards(configured: str) -> list[Board]:
 def words(begin: Begin, reach: Reach, ports: Collection[str]) -> list[str]:
     """Return the arguments with which `acsard` carries out the request `begin`.
 
-    This function chooses the options. A text from the browser can only become the value of an
-    option. It must be one of a known set of values, or a plain Zenoh key. Otherwise, this function
-    raises `FrameError`.
+    `reach` holds the options that connect to the daemon, and `ports` are the ports that a check may
+    use. A text from the browser can only become the value of an option. It must be one of a known
+    set of values, or a plain Zenoh key. Otherwise, this function raises `FrameError`.
     """
     config = [f"--config={reach.config}"] if reach.config else []
     if begin.begin == "check":
@@ -269,7 +277,7 @@ def _method(begin: Begin) -> list[str]:
     if (begin.method == POSITIONS) != bool(begin.positions):
         raise FrameError(
             "begin",
-            f"the method {POSITIONS} needs `positions`, a Zenoh key; other methods take none",
+            f"the method {POSITIONS} needs `positions`, a Zenoh key; no other method uses it",
         )
     if begin.positions and not KEY.match(begin.positions):
         raise FrameError("begin", "`positions` must be a Zenoh key of letters, digits, _ / -")
@@ -296,7 +304,10 @@ class _Errand:
         return Guided(Running(self.name, self.by, viewer is self.viewer))
 
     async def run(self, given: Sequence[str]) -> tuple[int, str]:
-        """Run the child; return the pair (exit code, last error output). Raises `OSError`."""
+        """Run the child; return the pair (exit code, last error output). Raises `OSError`.
+
+        `given` contains the arguments of `acsard`.
+        """
         if self.left:
             return int(Exit.FAILURE), ""
         async with running(acsard(*given), stdin=PIPE, stdout=PIPE, stderr=PIPE) as process:
@@ -308,7 +319,7 @@ class _Errand:
         return code if code >= 0 else 128 - code, self._words()
 
     def answer(self, reply: Reply) -> bool:
-        """Send the child an answer; return False if it is not for the open question."""
+        """Send the child an answer; return False if its question is not the one that is open."""
         if not self._question or reply.reply != self._question:
             return False
         self._question, self._rides = 0, self._leg

@@ -60,11 +60,10 @@ class Plotted(Struct, frozen=True):
     wheels: Sequence[Column]
     """Measured wheel speeds in rad/s: front right, front left, rear left, rear right."""
     late_p99: Column
-    """99th percentile of the delays with which the daemon's control periods began, over the minute
-    before the row, ms."""
+    """99th percentile of the lateness of the daemon's control periods, over the minute before the
+    row, ms."""
     late_max: Column
-    """Maximum of the delays with which the daemon's control periods began, over the minute before
-    the row, ms."""
+    """Maximum lateness of the daemon's control periods, over the minute before the row, ms."""
     volts: Column
     """Voltage of the battery, V; None if the board does not report it."""
 
@@ -79,7 +78,10 @@ class Minute:
         return not self._rows or at_ns - self._rows[-1][0] >= STEP_NS - EARLY_NS
 
     def add(self, at_ns: int, state: RobotState, wished: Twist | None) -> None:
-        """Append a row for `state`; `wished` is the commanded twist, or None if it is unknown."""
+        """Append a row for `state`, which arrived at `at_ns`.
+
+        `wished` is the commanded twist, or None if it is unknown.
+        """
         measured: list[float | None] = [state.linear, state.angular, *state.wheels[: len(WHEELS)]]
         if len(measured) != MEASURED:
             measured = [None] * MEASURED

@@ -17,12 +17,12 @@ opens six connections in addition to its WebSocket."""
 
 SOCKETS_OF_ONE, SOCKETS_OF_TOKEN = 64, 64
 """Maximum numbers of TCP connections: from one network without a valid token (`SOCKETS_OF_ONE`),
-and with one valid token (`SOCKETS_OF_TOKEN`). Further connections with this token count as
-connections without a valid token."""
+and with one valid token (`SOCKETS_OF_TOKEN`). Any further connection with the same token
+counts as a connection without a valid token."""
 
 SOCKETS_OF_BROWSER = 7
-"""Number of TCP connections that each token keeps when all places are taken. One browser needs this
-number."""
+"""Number of TCP connections that each token keeps even when all places are taken. One browser needs
+this number."""
 
 SOCKETS_LEAST = 16
 """Smallest limit on TCP connections from other machines. It applies if the process may open only
@@ -70,7 +70,7 @@ behind one address can load the page at the same time."""
 
 HANDSHAKES = Rate(30.0, 100.0)
 """Limit on TLS handshakes per network, as a rate per second and a largest burst. Handshakes beyond
-the limit wait. A browser needs six."""
+the limit wait. A browser needs six to load the page."""
 
 HOLD_S = 0.5
 """Delay of a request beyond a rate limit, s. Refusing the request immediately would not help,
@@ -106,10 +106,14 @@ def sockets_for(files: int) -> int:
 class Sockets(Generic[C]):
     """The open TCP connections. When all places are taken, a new connection displaces an older one.
 
-    1. The network with the most connections without a valid token loses the oldest of these.
+    1. If there are connections without a valid token, the network that has the most of them loses
+       the oldest of them.
     2. If every connection has shown a valid token, the token with the most connections loses its
        oldest one. If this token has at most `SOCKETS_OF_BROWSER` connections, the new connection is
        refused instead.
+
+    If a network has `SOCKETS_OF_ONE` connections without a valid token, a new connection from it
+    displaces the oldest of these, even if places are free.
     """
 
     def __init__(self, most: int) -> None:
@@ -127,7 +131,8 @@ class Sockets(Generic[C]):
     def enter(self, network: str, one: C) -> C | None:
         """Give the new connection `one` a place; return the connection to close in exchange.
 
-        Return None if a place was free, and `one` itself if no old connection may be closed.
+        `network` is the network of the client. Return None if no connection must be closed, and
+        `one` itself if it is refused.
         """
         own = self._strangers.get(network, {})
         gone = None
@@ -141,7 +146,10 @@ class Sockets(Generic[C]):
         return gone
 
     def displaced(self) -> C | None:
-        """Remove and return the connection to close for a new one; None if none may be closed."""
+        """Remove and return the connection that must make room for a new one.
+
+        Return None if no connection may be closed.
+        """
         if self._strangers:
             network = max(self._strangers, key=lambda name: len(self._strangers[name]))
             gone = next(iter(self._strangers[network]))
@@ -154,9 +162,10 @@ class Sockets(Generic[C]):
         return gone
 
     def prove(self, one: C, token: str) -> None:
-        """Record that `one` has shown a valid token; "" stands for a client on the robot itself.
+        """Record that the connection `one` has shown the valid token `token`.
 
-        A later token replaces an earlier one, because a browser may get another token.
+        The token is "" for a client on the robot itself. A later token replaces an earlier one,
+        because a browser may get another token.
         """
         network, before = self._networks.get(one), self._known.get(one)
         if network is None:
@@ -214,14 +223,14 @@ class Seats:
         self._addresses = Places(CONNECTIONS, CONNECTIONS_OF_ONE)
 
     def missing(self, address: str, token: str) -> str:
-        """Return "" if there is room for a WebSocket, else why it is refused and what to do."""
+        """Return "" if there is room for a WebSocket, else the reason and the remedy."""
         for places, name, full in self._places(address, token):
             if not places.room(name):
                 return full
         return ""
 
     def enter(self, address: str, token: str) -> str:
-        """Acquire a place for a WebSocket; return "", or the reason if it is refused."""
+        """Acquire a place for a WebSocket; return "", or the reason and the remedy of a refusal."""
         if full := self.missing(address, token):
             return full
         for places, name, _ in self._places(address, token):
@@ -271,7 +280,7 @@ class Shares:
         """For each resource, the number of times that each holder has acquired it."""
 
     def enter(self, holder: str, thing: Hashable) -> bool:
-        """Acquire a resource for a holder; return False if the limits forbid it.
+        """Acquire the resource `thing` for `holder`; return False if the limits forbid it.
 
         A holder may acquire the same resource several times, and must release it as often.
         """

@@ -68,7 +68,8 @@ def listens(text: str) -> Listen:
 def invitations(listen: Sequence[Listen], tls: str) -> list[str]:
     """Return the URLs to write on an invitation; the first one is the most likely to work.
 
-    Only HTTPS addresses have such URLs. IP addresses come before names, because not every phone
+    `listen` are the addresses of the server, and `tls` is the directory of the certificate. Only
+    HTTPS addresses have such URLs. IP addresses come before names, because not every phone
     resolves mDNS names. Call `require_certificate` first.
     """
     found: list[str] = []
@@ -91,7 +92,10 @@ def invitations(listen: Sequence[Listen], tls: str) -> list[str]:
 
 
 def opened_by(one: Listen, tls: str) -> list[str]:
-    """Return the URLs that open the page at the address `one`, the most reliable one first."""
+    """Return the URLs that open the page at the address `one`, the most reliable URL first.
+
+    `tls` is the directory of the certificate.
+    """
     return invitations([one], tls) if one.secure else [one.url]
 
 
@@ -113,7 +117,8 @@ def require_certificate(listen: Sequence[Listen], tls: str) -> None:
 def bound(listen: Sequence[Listen], next_port: bool) -> list[tuple[Listen, socket.socket]]:
     """Open a socket at each address.
 
-    If `next_port` is true and a port is taken, use a later port. Raises `InUseError`.
+    If `next_port` is true and a port is taken, try the next ports, `TRIES` ports in total. Raises
+    `InUseError` if no port is free.
     """
     older_ports = _older_ports(listen)
     return [_bound(one, next_port, one.port not in older_ports) for one in listen]

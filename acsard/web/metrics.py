@@ -32,8 +32,10 @@ def text(
 ) -> str:
     """Return all metrics in the text format of Prometheus.
 
+    `robot` is the robot's id, `version` is the daemon's version, and `state` is the newest state.
     `heard` is true while messages from the daemon arrive; if it is false, the robot's metrics are
-    left out. `viewers` is the number of open WebSockets.
+    left out. `viewers` is the number of open WebSockets. `counts` are the server's actions by name,
+    and `refused` are its refusals by reason.
     """
     lines: list[str] = []
 
@@ -79,7 +81,7 @@ def _of_robot(state: RobotState) -> Iterator[tuple[str, Kind, str, Iterable[Samp
         yield (
             "certificate_seconds",
             "gauge",
-            "seconds until the first of the TLS certificates expires",
+            "seconds until the next expiry of a TLS certificate",
             left,
         )
     if state.emergency_stop:
@@ -139,7 +141,8 @@ def _escaped(word: str) -> str:
 
 
 NAMED = 5
-"""Maximum number of clients that a log line about refusals names, the most frequent ones first."""
+"""Maximum number of clients that a log line about refusals names. It names the clients with the
+most refusals."""
 
 KNOWN = 1000
 """Maximum number of clients for which refusals are counted separately between two log lines. The

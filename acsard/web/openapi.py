@@ -25,7 +25,8 @@ Refs = dict[Any, Described]
 """Maps each type to a reference to its schema."""
 
 TO_ROBOT, FROM_ROBOT = "ToRobot", "FromRobot"
-"""Names of two schemas: the WebSocket messages to the page's server, and those from it."""
+"""Names of two schemas: that of the WebSocket messages that clients send, and that of the messages
+that the server sends."""
 
 VALUE = "Value."
 """Prefix of the schema names for the messages of subscribed keys."""
@@ -43,8 +44,8 @@ LINES = (
     json_prompt.JobMessage, json_prompt.Doing, json_prompt.Progress, json_prompt.Question,
     json_prompt.Found, json_prompt.Result,
 )  # fmt: skip
-"""Types of the values of the field `guide`, which reports a running check or calibration to the
-client."""
+"""Types of the values that the field `guide` of a WebSocket message may have. The field reports on
+a running check or calibration."""
 
 KEYS = {topic.key: topic.type for topic in FOLLOWED}
 """Message type of each key to which a client can subscribe."""
@@ -59,7 +60,10 @@ def _raw(schema: Described) -> Any:
 
 
 def _value(key: str, kind: str) -> type[Struct]:
-    """Return the type of the WebSocket messages that contain the values of a key."""
+    """Return the type of the WebSocket messages that contain the values of the key `key`.
+
+    `kind` is the name of the schema of these values.
+    """
     return msgspec.defstruct(
         VALUE + key.replace("/", "."),
         [
@@ -164,7 +168,8 @@ def _needed(kind: type | str) -> bool:
 def _messages() -> Described:
     """Return the schemas of the bus messages, by name.
 
-    The types in `$defs` become schemas of their own, because most readers cannot resolve `$defs`.
+    The types in `$defs` become schemas of their own, because most programs
+    that read the document cannot resolve `$defs`.
     """
     found: Described = {}
     for name, schema in SCHEMAS.items():
@@ -176,9 +181,10 @@ def _messages() -> Described:
 
 
 def _flat(node: Any, before: str) -> Any:
-    """Return a copy of `node` in which each reference `#/$defs/X` names the component `before` + X.
+    """Return a copy of `node` in which each reference to `$defs` is a reference to a component.
 
-    `node` is a JSON Schema or a part of one.
+    `node` is a JSON Schema or a part of one. The component of the definition X is named
+    `before` + X.
     """
     if isinstance(node, list):
         return [_flat(one, before) for one in node]
@@ -190,7 +196,10 @@ def _flat(node: Any, before: str) -> Any:
 
 
 def _components(kinds: Iterable[Any]) -> tuple[Described, Refs]:
-    """Return a pair: the schemas of `kinds` and their nested types, and a reference per kind."""
+    """Return a pair: schemas by name, and a reference to a schema for each type in `kinds`.
+
+    The schemas are those of the types in `kinds` and of the types that are nested in them.
+    """
     # In one call, msgspec gives different names to two types that have the same name.
     unique = list(dict.fromkeys(kinds))
     refs, parts = msgspec.json.schema_components(
@@ -203,7 +212,11 @@ def _components(kinds: Iterable[Any]) -> tuple[Described, Refs]:
 
 
 def _of_the_socket(refs: Refs) -> Described:
-    """Return the schemas `ToRobot`, `FromRobot` and `Guided` of all WebSocket messages."""
+    """Return the schemas `ToRobot`, `FromRobot` and `Guided`, by name.
+
+    Together they describe all WebSocket messages. `refs` maps the types of messages to references
+    to their schemas.
+    """
     guided = msgspec.defstruct(
         GUIDED,
         [("guide", _raw({"oneOf": [refs[kind] for kind in LINES]}))],

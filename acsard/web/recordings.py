@@ -39,7 +39,8 @@ LISTED_NS = NS_PER_S // 4
 NICE = 19
 
 DRAW_S = 600.0
-"""Time limit for drawing a report, s. A full recording of one to four hours takes minutes."""
+"""Time limit for drawing a report, s. To draw the report of a full recording (one to four hours)
+takes minutes."""
 
 ALONE_NS = 60 * NS_PER_S
 """Time, ns, after which the drawing of a report is cancelled if no client asks for its progress."""
@@ -51,7 +52,7 @@ BYTES = 32 << 20
 """Maximum size of a report, bytes; a typical one has 5 to 8 MB."""
 
 MEMORY = 256 << 20
-"""Limit of the data memory of the child process that draws a report, bytes."""
+"""Maximum data memory of the child process that draws a report, bytes."""
 
 TOO_LONG = (
     f"the drawing takes longer than {DRAW_S / 60:.0f} min here: fetch the recording, and draw its "
@@ -92,7 +93,7 @@ class BlackBox:
         """Monotonic time at which `_listing` began, ns."""
 
     async def rows(self) -> list[Recording]:
-        """Return all recordings, oldest first. The list may be `LISTED_NS` old.
+        """Return all recordings, oldest first. The list may be up to `LISTED_NS` old.
 
         All requests within this time share one list. Otherwise, a client that requests the list all
         the time would use so much processor time that the stops of other clients are delayed.
@@ -237,14 +238,17 @@ class Reports:
     """Draws one report at a time, in a child process, and keeps the newest report in memory.
 
     A recording may contain text from unknown senders, so a report could contain a malicious script.
-    There are three defences. The report escapes the text. The content security policy inside the
+    There are three defenses. The report escapes the text. The content security policy inside the
     report allows exactly two scripts, and does not allow the report to load anything. `POLICY`
     gives the report an opaque origin, so a script in the report could use neither the cookie nor
     the interface of the robot's page.
     """
 
     def __init__(self, command: Sequence[str] = ()) -> None:
-        """Set the command that draws a report. The default is `acsard recording report`."""
+        """Set the command that draws a report; the path of the recording is added at its end.
+
+        If `command` is empty, it is `acsard recording report --supervised`.
+        """
         self._command = command or acsard("recording", "report", "--supervised")
         self._one: _Drawing | None = None
         self._work: asyncio.Task[None] | None = None
@@ -252,9 +256,9 @@ class Reports:
     def ask(self, path: Path, stamp: tuple[int, int]) -> ReportState:
         """Return the progress of the report of a recording, and start drawing the report if needed.
 
-        `stamp` is the one from `BlackBox.found()`. A report is drawn again if the previous drawing
-        failed or if `stamp` shows that the recording has changed since then, but only after a
-        client has received the previous result.
+        `path` and `stamp` are from `BlackBox.found()`. A report is drawn again if the previous
+        drawing failed, or if `stamp` shows that the recording has changed since then. However, this
+        happens only after a client has received the previous result.
         """
         one, now_ns = self._one, clock.mono_ns()
         if one is not None and not one.ended and one.path != path:
@@ -273,9 +277,9 @@ class Reports:
         return ReportState("drawing", percent=one.percent, seconds=round(seconds, 1))
 
     def drawn(self, name: str) -> bytes | None:
-        """Return the finished report of the recording `name` as gzip, or None.
+        """Return the report of the recording `name` as gzip, or None if it is not finished.
 
-        Each call restarts the time `KEEP_NS`, after which the report is dropped.
+        Each call restarts the time `KEEP_NS` after which the report is dropped.
         """
         one = self._one
         if one is None or one.path.name != name or not one.packed:
@@ -284,9 +288,10 @@ class Reports:
         return one.packed
 
     def tidy(self) -> None:
-        """Cancel the drawing, or drop the finished report, if no client has asked for it in time.
+        """Cancel the drawing, or drop the finished report, if no client asks for it any more.
 
-        Call this once a second. The times are `ALONE_NS` and `KEEP_NS`.
+        Call this once a second. The drawing is cancelled `ALONE_NS` after the last request, and a
+        finished report is dropped `KEEP_NS` after it.
         """
         one = self._one
         if one is None:
@@ -333,7 +338,7 @@ class Reports:
 
 
 class _FailedError(Exception):
-    """The reason, in words, why a report was not drawn."""
+    """A report could not be drawn. The text of this error is the reason."""
 
 
 def _why(said: str) -> str:

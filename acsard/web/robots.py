@@ -27,14 +27,14 @@ from acsard.web.metrics import Counts
 from acsard.web.streams import DECLARE_S, UNREADY, Stream, Streams
 
 LOOK_S = 0.1
-"""Interval at which received states are processed, s."""
+"""Interval at which the server processes the states that have arrived, s."""
 
 AGAIN_S = 1.0
 """Delay before the next attempt to reach a daemon that does not answer, s."""
 
 ASK_S, ASK_SOON_S = 10.0, 1.0
-"""Time until the next query of the values of `About`, s: after a query that was answered, and after
-a query that was not answered."""
+"""Delay before the next query of the values of `About`, s: after a query that the daemon answered,
+and after a query that it did not answer."""
 
 PATH_S, PATH_POINTS, PATH_STEP_M = 600.0, 5000, 0.02
 """Limits of the drawn path: maximum age of a point, s; maximum number of points; minimum distance
@@ -69,14 +69,14 @@ def _path() -> Track:
 
 
 class _Asking:
-    """The bus client that a `Watch` uses. Queries run in threads, so they do not block the loop."""
+    """The bus client that a `Watch` uses. Queries run in threads, so the event loop never waits."""
 
     def __init__(self, client: Client) -> None:
         self.subscribe, self._client = client.subscribe, client
         self._asked: asyncio.Task[None] | None = None
 
     def ask(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
-        """Query a key, unless an earlier query is still running.
+        """Query the key `name`, unless an earlier query is still running.
 
         `take` is called with each reply.
         """
@@ -92,10 +92,11 @@ class Robots:
     """The connection to the daemon of the page's robot, and the data for a newly opened page."""
 
     def __init__(self, address: Address, connect: Connect, about: About, counts: Counts) -> None:
-        """Start without a connection.
+        """Store the arguments. `run()` connects to the daemon.
 
-        `about` holds the values of the local configuration, which are used until the daemon
-        answers.
+        `address` is the address of the daemon, and `connect` connects to it. `about` holds the
+        values of the local configuration, which are used until the daemon answers. `counts` are the
+        counters of the page's server.
         """
         self.id, self.endpoint = address.robot_id, address.endpoint
         self.certificate = shown_at(address.endpoint, address.tls)
@@ -131,7 +132,7 @@ class Robots:
 
     @property
     def state(self) -> RobotState | None:
-        """The newest state, or None before the first one."""
+        """The newest state, or None before the first state."""
         return None if self._watch is None else self._watch.state
 
     def ask_anew(self) -> None:

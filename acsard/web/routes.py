@@ -1,7 +1,7 @@
 """Defines `Route`, a row of the table of paths `app.ROUTES`. This module is pure.
 
 The router, the admission of requests, the rate limits and the OpenAPI document use that table. The
-rows for the keys and services of the bus are made here.
+rows for the keys and services of the bus are created in this module.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Route(Struct, frozen=True):
     """Least role that may use the path; None opens it to every client, without a token."""
     handler: Handler
     summary: str = ""
-    """Description for the OpenAPI document; "" leaves the row out of it."""
+    """Description for the OpenAPI document. If it is "", the document leaves the route out."""
     takes: type | str | None = None
     """Type of the request's body, or the name of a bus message in `SCHEMAS`; None if there is no
     body."""
@@ -78,11 +78,11 @@ class Route(Struct, frozen=True):
     """Maps an HTTP status to the body of the answer. An answer with any other status contains a
     `Problem`."""
     rate: Rate = REQUESTS
-    """Limit on the rate of the requests of one token. All routes with the same rate share one
+    """Limit on the requests of each token, as a rate. All routes with the same rate share one
     limit."""
     waits: bool = False
-    """True if a request beyond `rate` is delayed; False if it is refused. If true, a POST is
-    carried out immediately and only its answer is delayed. `rate` then applies to each token in
+    """True if a request beyond `rate` is delayed; False if it is refused. If true, the server
+    carries out a POST immediately and delays only the answer. `rate` then applies to each token in
     each network separately, so a program cannot use up the limit of a page that uses the same token
     in another network."""
 
@@ -98,13 +98,16 @@ class Route(Struct, frozen=True):
 
 
 def asked(topic: Topic) -> bool:
-    """Return whether a program may query the last value of the topic."""
+    """Return whether a program may query the last value of the key that `topic` describes."""
     own = topic.direction in ("out", "query") and "<key>" not in topic.key
     return own and topic.query in ROLES
 
 
 def values(handler: Handler) -> Iterator[Route]:
-    """Yield a route `GET /api/<key>` for each key whose last value a program may query."""
+    """Yield a route `GET /api/<key>` for each key whose last value a program may query.
+
+    `handler` answers the requests.
+    """
     for topic in filter(asked, TOPICS):
         path = f"/api/{topic.key.replace('<Type>', '{type}')}"
         gives = {200: Body("The last value.", topic.type if topic.type in SCHEMAS else "")}
@@ -112,7 +115,10 @@ def values(handler: Handler) -> Iterator[Route]:
 
 
 def services(handler: Handler) -> Iterator[Route]:
-    """Yield a route `POST /api/srv/<name>` for each service of the robot."""
+    """Yield a route `POST /api/srv/<name>` for each service of the robot.
+
+    `handler` answers the requests.
+    """
     notes = {topic.key: topic.note for topic in TOPICS}
     for key, verb in VERBS.items():
         # The daemon decodes the payload, so a refusal contains the daemon's message.

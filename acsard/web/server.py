@@ -66,7 +66,7 @@ class Wanted(Struct, frozen=True):
 async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], log: Log) -> None:
     """Run the page's server until a signal arrives, or until the daemon that started it ends.
 
-    `announce` is called with the bound addresses. Raises `MendableError`.
+    `announce` is called with the addresses at which the server listens. Raises `MendableError`.
     """
     # A command or a stop waits at most this long while another thread holds the interpreter.
     sys.setswitchinterval(0.0005)
@@ -214,7 +214,11 @@ def _names(directory: str) -> set[str]:
 async def _renew(
     context: ssl.SSLContext, names: set[str], files: CertificateFiles, directory: str, log: Log
 ) -> None:
-    """Use changed certificate files for later connections, and add the new names to `names`."""
+    """When the certificate files change, load them into `context`, and add their names to `names`.
+
+    Open connections keep the old certificate. `files` detects the changes, and `directory` is the
+    directory of the files.
+    """
     while True:
         await asyncio.sleep(TIDY_S)
         if not files.renewed():

@@ -1,8 +1,8 @@
 """The messages of `/ws`, in both directions. This module is pure.
 
 Each message is one JSON object. An incoming message is called a frame. It contains exactly one of
-the fields in `KINDS` (`subscribe`, `cmd`, `call`, ...), which gives its kind. A frame with none or
-two of these fields, or with an unknown field, is refused as a whole. An outgoing message is
+the fields in `KINDS` (`subscribe`, `cmd`, `call`, ...), which gives its kind. A frame with none
+or several of these fields, or with an unknown field, is refused as a whole. An outgoing message is
 identified by its first field. `socket_sender.py` builds the messages with the values of subscribed
 keys, because these values are JSON already.
 """
@@ -32,7 +32,7 @@ daemon accepts. When a client disconnects, the server sends a zero velocity with
 the client's last command, and the daemon must accept it."""
 
 PROGRAM = "app"
-"""Command source of a command that names no source. The page in the browser names `teleop`."""
+"""Command source of a command that does not name one. The page in the browser names `teleop`."""
 
 Short = Annotated[str, Meta(max_length=80)]
 Device = Annotated[str, Meta(max_length=200)]
@@ -62,7 +62,10 @@ class _Frame(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Subscribe(_Frame, frozen=True):
-    """Subscribe to a key of a robot: send its messages from now on, at most `rate` per second."""
+    """Subscribe to a key of a robot.
+
+    From then on, the server sends new messages of this key, at most `rate` messages per second.
+    """
 
     subscribe: Short
     rate: float = USUAL_RATE
@@ -109,7 +112,7 @@ class Command(_Frame, frozen=True):
 
 
 class Call(_Frame, frozen=True):
-    """Call a service of the robot. The answer has the `id` of the call."""
+    """Call a service of a robot. The server's answer contains the `id` of the call."""
 
     call: Short
     id: int | Short = 0
@@ -131,11 +134,11 @@ class Begin(_Frame, frozen=True):
     port: Device = ""
     method: Short = ""
     positions: Short = ""
-    """The key on which positions arrive, for the method `positions` only."""
+    """Zenoh key on which the robot's positions are published; only for the method `positions`."""
 
 
 class Reply(_Frame, frozen=True):
-    """Answer the question whose number is `reply`. The value null selects the default."""
+    """Answer the question whose number is `reply`. If `value` is null, it selects the default."""
 
     reply: Annotated[int, Meta(ge=0, le=1 << 31)]
     value: float | Short | None = None
@@ -202,7 +205,7 @@ class Greeting(Struct, frozen=True):
     version: str
     role: Role
     sender: str
-    """Public name of this viewer, which is the value of `state.sender` while the viewer drives."""
+    """Public name of this viewer. It is the value of `state.sender` while the viewer drives."""
     limits: Limits
     simulated: bool
     state_rate: float
@@ -211,11 +214,11 @@ class Greeting(Struct, frozen=True):
     """The actions that the client's role does not allow, each with the reason in words. An action
     is the name of a service, "drive", "recordings" or "begin" (a check or calibration)."""
     camera: bool
-    """True if a camera is configured, whose pictures `GET /api/camera` returns."""
+    """True if a camera is configured. `GET /api/camera` returns its pictures."""
 
 
 class Hello(Struct, frozen=True):
-    """The first message to a client, repeated whenever its content changes."""
+    """The first message to a client. The server sends it again whenever its content changes."""
 
     hello: Greeting
 
@@ -225,7 +228,7 @@ class DrivenPath(Struct, frozen=True):
 
     path: Sequence[Point]
     truth: Sequence[Point]
-    """True path of a simulated robot; empty for a real one."""
+    """Points (x, y) of the true path of a simulated robot, m; empty for a real robot."""
 
 
 class LastMinute(Struct, frozen=True):
@@ -254,13 +257,13 @@ class Row(Struct, frozen=True):
     """Measured forward speed, m/s."""
     link: str
     age: float | None
-    """Seconds since the last state arrived; None before the first one."""
+    """Seconds since the last state arrived; None before the first state."""
     version: str
     """Version of the daemon; "" until it is reported."""
     warnings: Sequence[str] = ()
     """Warnings of the robot, in words. A robot with warnings may still be ready."""
     place: Sequence[float] | None = None
-    """x and y in m, and yaw in rad, in the odom frame; None while no state arrives."""
+    """x and y in m, and yaw in rad, in the odom frame; None while the robot is silent or gone."""
     battery: str = ""
     """State of charge or, if it is unknown, the voltage, in words; "" if neither is known."""
 
@@ -270,7 +273,8 @@ class Rows(Struct, frozen=True):
 
     fleet: Sequence[Row]
     note: str
-    """Reason why robots may be missing; "" if all robots of a router are visible."""
+    """Reason why robots may be missing, in words. It is "" if the page's server is connected to a
+    router, and therefore sees all robots of this router."""
 
 
 class Pong(Struct, frozen=True):

@@ -62,7 +62,7 @@ class Outgoing:
         # If more than 200 messages wait, the oldest ones are dropped.
         self._out: deque[bytes] = deque(maxlen=200)
         self._pong: bytes | None = None
-        """Data of the newest ping that has no answer yet, or None."""
+        """Payload of the newest ping that is not answered yet, or None."""
         self._news = asyncio.Event()
         self._reports = Buckets(REPORTS)
         self._closing = False
@@ -78,7 +78,8 @@ class Outgoing:
     def refuse(self, what: str, reason: Reason, text: str) -> None:
         """Count a refused message, and report the reason to the client within the limit `REPORTS`.
 
-        `what` is the kind of the message.
+        `what` is the kind of the message, `reason` is the reason under which it is counted, and
+        `text` is the reason in words for the client.
         """
         self._counts.refuse(reason, self._origin)
         if self._reports.take(f"{what} {reason}", clock.mono_ns()):
@@ -109,8 +110,8 @@ class Outgoing:
     async def close(self, why: str) -> None:
         """Send a close frame with the reason `why`, and cut the connection 1 s later.
 
-        `why` has at most 120 characters. Without the delay, many programs would report a lost
-        network.
+        `why` has at most 120 characters. If the connection were cut immediately, many client
+        programs would report a network failure instead of the reason.
         """
         if self._closing:
             return
@@ -129,8 +130,8 @@ class Outgoing:
     def pong(self, data: bytes) -> None:
         """Queue the answer to a ping; it replaces an unsent answer to an earlier ping.
 
-        The WebSocket protocol allows the replacement. Because of it, a client that sends pings and
-        does not read the answers cannot fill the memory.
+        `data` is the payload of the ping. The WebSocket protocol allows the replacement. Without
+        it, a client that sends pings and does not read the answers could fill the memory.
         """
         self._pong = data
         self._news.set()
@@ -147,7 +148,7 @@ class Outgoing:
             await self._send(self._out.popleft())
 
     async def _send_due(self, one: Following, now: float) -> float:
-        """Send the newest value of a key if its time has come and the value is not sent yet.
+        """Send the newest value of a key if it is due and has not been sent yet.
 
         Return the time at which the next value is due, s on the event loop's clock.
         """
@@ -219,7 +220,7 @@ class Keys:
             self._out.wake()
         elif len(self._out.following) >= MOST:
             self._out.refuse(
-                "subscribe", "too_many", f"you follow more than {MOST} keys: unsubscribe from some"
+                "subscribe", "too_many", f"you already follow {MOST} keys: unsubscribe from some"
             )
         elif robot != self._robots.id and not self._shares.enter(self._holder, (robot, key)):
             text = (
@@ -267,7 +268,7 @@ class Keys:
         self._out.wake()
 
     async def _found(self, one: Following) -> Stream | None:
-        """Return the stream of a key, or None after a delay if the bus is not ready yet."""
+        """Return the stream of a key. If the bus is not ready, wait a moment and return None."""
         client = self._robots.client
         if client is None:
             await asyncio.sleep(0.2)

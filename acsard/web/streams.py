@@ -32,9 +32,8 @@ KEYS = frozenset(topic.key for topic in FOLLOWED)
 DECLARE_S = 3.0
 
 STATE = "state"
-"""Key of a robot's state. The server queries this key only of the page's own robot. For another
-robot, a router's storage would answer with an old state even if that robot has been off for a
-week."""
+"""Key of a robot's state. The server queries it only for the page's own robot. For another robot,
+a router's storage would answer with an old state even if that robot has been off for a week."""
 
 UNREADY = (TimeoutError, zenoh.ZError, UsageError)
 """Errors that mean that the bus is stuck or the session is closed. A later attempt may succeed."""
@@ -53,7 +52,7 @@ class Stream:
 
     @property
     def number(self) -> int:
-        """Number of the newest message, counted from 1; 0 before the first."""
+        """Number of the newest message, counted from 1; 0 before the first message."""
         return self._newest[0]
 
     @property
@@ -82,7 +81,7 @@ class Stream:
         return number, self._text[1], max(0.0, (clock.steady_ns() - at_ns) / 1e6)
 
     def raw(self) -> tuple[str, bytes] | None:
-        """Return the newest message as the pair (encoding, payload), or None before the first."""
+        """Return the newest message as the pair (encoding, payload), or None if there is none."""
         sample = self._newest[1]
         return None if sample is None else encoded(sample)
 

@@ -50,7 +50,7 @@ class Token(Struct, frozen=True):
 
 
 class Vault:
-    """The access tokens of one robot, in a file that all robots of one user share."""
+    """The access tokens of one robot. Their file also contains those of the user's other robots."""
 
     def __init__(self, directory: Path, robot: str) -> None:
         self.path, self.robot = directory / FILE, robot
@@ -62,12 +62,12 @@ class Vault:
     def known(self, text: str) -> Who | None:
         """Return the owner of the token `text`, or None if the token is not valid.
 
-        The token file is not read again, so a recent change of the file has no effect.
+        This call does not read the token file, so it does not notice a recent change of the file.
         """
         return owner_in(self._own(self._read[1]), text)
 
     def left_s(self, digest: str) -> int:
-        """Return the seconds until the token with this digest expires; 0 if it does not exist."""
+        """Return the time until the token with this digest expires, s; 0 for an unknown token."""
         ends = [one.ends for one in self.all() if one.digest == digest]
         return max(0, int(max(ends, default=0) - time.time()))
 
@@ -98,7 +98,10 @@ class Vault:
         return frozenset(one.digest for one in self.all() if one.ends > now_s)
 
     def unknown_to(self, service: Path = SERVICE) -> str:
-        """Return a warning if the service on this machine reads another token file, else ""."""
+        """Return a warning if `acsard web` as a service on this machine reads another token file.
+
+        `service` is the state directory of the service. Return "" if there is nothing to warn of.
+        """
         if self.path.parent == service or not os.path.lexists(service):
             return ""
         return (
@@ -148,9 +151,10 @@ class Vault:
 
     @contextmanager
     def _changing(self) -> Iterator[list[Token]]:
-        """Lock the token file for the duration of the `with` block, and yield all robots' tokens.
+        """Lock the token file during the `with` block, and yield the list of all robots' tokens.
 
-        At the end of the block, write the yielded list back, unless an exception occurred.
+        The block may change the list. At its end, the list is written to the file, unless an
+        exception occurred.
         """
         directory = self.path.parent
         try:
@@ -188,7 +192,11 @@ class Vault:
 
 
 def place() -> Path:
-    """Return the directory of the token file: the service's directory, or the user's."""
+    """Return the directory of the token file.
+
+    It is the state directory of the systemd service if this process is that service, or if it runs
+    as root and the directory exists. Otherwise, it is in the home directory of the user.
+    """
     if "STATE_DIRECTORY" in os.environ:
         return Path(os.environ["STATE_DIRECTORY"].partition(":")[0])
     if os.geteuid() == 0 and SERVICE.is_dir():

@@ -54,7 +54,8 @@ ACTIONS: dict[str, Role] = {
     "recordings": RECORDINGS,
     "begin": Begin.least,
 }
-"""Maps each action that has a control on the page to the least role that may use it."""
+"""Maps each action to the least role that may use it. The page disables the controls of the actions
+that its user may not use."""
 
 HEARTBEAT_S = 10.0
 """Interval of the pings, s. The connection ends if a ping is not answered within half of this
@@ -79,17 +80,18 @@ class ViewerCommands:
         self._client, self._counts = client, counts
         self._rates = Buckets(COMMANDS)
         self.outbox = Outbox(partial(counts.add, "commands_dropped"))
-        """Queue of commands, with the thread that sends them. If the thread dies, the server could
-        not stop the robot of a viewer that disconnects, so the server must exit."""
+        """Queue of commands, with the thread that sends them. If the thread dies, the server
+        must exit, because it could not stop the robot of a viewer that disconnects."""
 
     def give(
         self, owner: str, source: str, commander: Commander, sender: Sender, wish: Wish
     ) -> bool:
-        """Queue a command; it replaces an older command of the same commander that still waits.
+        """Queue the command `wish`; it replaces an unsent command of the same commander.
 
-        `owner` is the client's token, or the public name of a viewer on the robot itself. If the
-        owner exceeds the rate limit `COMMANDS`, return False and queue nothing. However, a zero
-        that follows a speed is always queued.
+        `owner` is the client's token, or the public name of a viewer on the robot itself. `source`
+        is the command source. `commander` holds the viewer's commands for this source, and `sender`
+        signs them. If the owner exceeds the rate limit `COMMANDS`, return False and queue nothing.
+        However, a zero that follows a speed is always queued.
         """
         ends = wish.twist == REST and commander.moves
         if not self._rates.take(owner, clock.mono_ns()) and not ends:
@@ -155,7 +157,7 @@ class Viewer:
         self._stops: set[asyncio.Task[None]] = set()
         self._ended = False
         self._stamp_ns = -1
-        """Stamp of the last command, ns since 1970; -1 before the first."""
+        """Stamp of the last command, ns since 1970; -1 before the first command."""
         self._gone, self._about = "", parts.robots.about
         self._fleet_due: float | None = None
 
@@ -179,9 +181,9 @@ class Viewer:
             self._fleet.leave(self)
 
     def end(self, why: str) -> None:
-        """Stop the robot if this viewer may still drive it, and close the connection.
+        """Stop the robot if this viewer may still be driving it, and close the connection.
 
-        `why` is the reason for the client, with at most 120 characters.
+        `why` is the reason that the client receives, with at most 120 characters.
         """
         if self._ended:
             return
@@ -228,9 +230,10 @@ class Viewer:
             self.end("too many messages")
 
     def _ping(self, message: aiohttp.WSMessage) -> None:
-        """Answer a ping of the WebSocket protocol.
+        """Answer a ping of the WebSocket protocol, and ignore a pong.
 
-        The rate limit `MESSAGES` counts not only messages but also pings and pongs.
+        Both count toward the rate limit `MESSAGES`, as other messages do. If the client exceeds the
+        limit too often, cut the connection.
         """
         if not self._bucket.take(clock.mono_ns()):
             self._overruns += 1
@@ -293,7 +296,7 @@ class Viewer:
             self._out.refuse("cmd", "too_fast", text)
 
     def _release(self) -> None:
-        """Queue a zero velocity for each command source with which this viewer may still drive."""
+        """Queue a zero velocity for each source with which this viewer may still be driving."""
         timeouts = self._robots.about.timeouts
         for source, commander in self._commanders.items():
             self._commands.outbox.release(commander, timeouts.get(source, LONGEST_S))
@@ -372,10 +375,10 @@ class Viewer:
         self._out.say(socket_messages.Hello(greeting))
 
     def _look_around(self, now: float) -> float:
-        """Tell the client what has changed, and send the list of robots when it is due.
+        """Tell the client about changes of the connection to the daemon and of `About`.
 
-        Return the time at which this method must be called again. This time and `now` are in s on
-        the event loop's clock.
+        Also send the list of robots when it is due. Return the time at which this method must be
+        called again. This time and `now` are in s on the event loop's clock.
         """
         if self._robots.gone != self._gone:
             self._gone = self._robots.gone

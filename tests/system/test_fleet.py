@@ -564,7 +564,7 @@ async def test_a_page_by_tls_has_a_card_of_its_own_robot_and_says_why_of_no_othe
             await ours.say(subscribe="fleet")
             seen = await ours.find(lambda said: said.get("fleet"))
             assert [(one["robot"], one["mode"]) for one in seen["fleet"]] == [("robot1", "ready")]
-            assert "passes only exact keys" in seen["note"]
+            assert "allows only exact keys" in seen["note"]
 
 
 # the files
