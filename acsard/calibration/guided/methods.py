@@ -33,19 +33,22 @@ BY_EYE = 0.07
 """Standard deviation of a heading that a person judges by eye, rad."""
 
 END_M = 0.003
-"""Standard deviation of the measured distance between robot and marks after a square, m.
+"""Standard deviation of a measured distance between the robot and its marks after a square, m.
 
 It includes the error with which the person made the marks beside the robot.
 """
 
 FIRST_TURN = 1.2
-"""Turn rate that the first turn in place would have without skidding, rad/s."""
+"""Turn rate of the first turn in place, rad/s, for a robot without skidding."""
 
 MISSED = 1.1
-"""Timeout of the first turn, as a multiple of the time for a full turn with the ratio `WIDEST`."""
+"""Timeout of the first turn, as a multiple of the time for a full turn.
+
+This time is that of a robot with the ratio `WIDEST` of effective track to wheel separation.
+"""
 
 MOST_SPIN_S = 24.0
-"""Longest total time of several full turns in place in one leg, s."""
+"""Longest time that several full turns in place may take together in one leg, s."""
 
 STOP, SETTLE = Move(0.6), Move(1.0)
 """Pauses between moves. In `STOP` the robot comes to rest; in `SETTLE` it also stops shaking."""
@@ -70,7 +73,7 @@ def _at_the_edge(setup: Setup) -> str:
 def once_round(setup: Setup, until: str, asks: tuple[Ask, ...] = (), *measures: Measure) -> Leg:
     """Return the leg of one left turn in place, which the person ends with a key.
 
-    `until` completes the instruction "Press SPACE ...".
+    `until` completes the instruction "Press SPACE ...". `asks` and `measures` are those of the leg.
     """
     longest = MISSED * 2 * math.pi * WIDEST
     rate = abs(setup.command(FIRST_TURN)) * setup.rate_per_command
@@ -80,9 +83,10 @@ def once_round(setup: Setup, until: str, asks: tuple[Ask, ...] = (), *measures: 
 
 
 def turns(setup: Setup, rate: float, track: float, most: int) -> int:
-    """Return the number of full turns in place that fit into `MOST_SPIN_S`: 1 to `most`.
+    """Return the number of full turns in place that fit into `MOST_SPIN_S`, from 1 to `most`.
 
-    `rate` is the true turn rate, rad/s. `track` is the ratio of effective track to separation.
+    `rate` is the true turn rate, rad/s. `track` is the ratio of effective track to wheel
+    separation.
     """
     one = setup.turn(2 * math.pi, rate, track).seconds
     return max(1, min(most, int(MOST_SPIN_S / one)))
@@ -101,7 +105,10 @@ TO_LINE = (
     Ask("How far is the rear left wheel from the line?", "mm", 0, 1500, name="rear"),
 )
 LINE = "front", "rear", "wheelbase"
-"""Values of `Slant.near`, `Slant.far` and `Slant.apart` for a line on the robot's left."""
+"""Names of the answers for `Slant.near`, `Slant.far` and `Slant.apart`.
+
+They are for a line on the robot's left.
+"""
 
 
 def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
@@ -243,7 +250,10 @@ CORNER_RATE = 0.9
 
 
 def side_of_square(setup: Setup) -> float:
-    """Return the side of the square in the method "umbmark": 1.2 m, or less for a large robot."""
+    """Return the side length of the square in the method "umbmark", m.
+
+    It is 1.2 m, or less for a large robot.
+    """
     return min(1.2, ROOM - 2 * (setup.from_edge + 2 * EDGE))
 
 
@@ -311,7 +321,7 @@ def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
 # floor although its effective track is unknown.
 
 FAST, SLOW, CURVE = 1.5, 0.75, 0.8
-"""Turn rates that fast turns, slow turns and curves would have without skidding, rad/s."""
+"""Turn rates of fast turns, slow turns and curves, rad/s, for a robot without skidding."""
 
 SPIN_S, CURVE_M, TURN_RAD = 7.5, 1.2, 5.0
 """Sizes of moves in the methods "gyro" and "positions".
@@ -322,9 +332,10 @@ SPIN_S, CURVE_M, TURN_RAD = 7.5, 1.2, 5.0
 """
 
 PETALS = ((FAST, CURVE), (-FAST, -CURVE), (SLOW, 0.0), (-SLOW, CURVE), (FAST, -CURVE))
-"""Moves of the method "positions": each pair is a turn in place and the curve after it.
+"""Moves of the method "positions": each pair is a turn in place, and a curve there and back.
 
-The numbers are the turn rates that these moves have without skidding, rad/s.
+The two numbers are the turn rates of the turn and of the curve without skidding, rad/s. A curve
+with the rate 0 is straight.
 """
 
 STANDING, PAUSE, SHORT = Move(2.5), Move(1.4), Move(0.7)
