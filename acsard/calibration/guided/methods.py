@@ -65,8 +65,9 @@ DISTANCE = Mean("distance", ("metres",), TAPE_M)
 
 def _at_the_edge(setup: Setup) -> str:
     return (
-        f"Place the middle of the robot {setup.from_edge:.2f} m from the near edge of a free floor "
-        f"of {ROOM:g} m x {ROOM:g} m, {ROOM / 2:g} m from both sides, facing the far edge."
+        f"Place the robot so that its middle is {setup.from_edge:.2f} m from the edge behind it, "
+        f"on a free floor of {ROOM:g} m x {ROOM:g} m, and {ROOM / 2:g} m from the edges to its "
+        "left and right."
     )
 
 
@@ -96,13 +97,19 @@ def turns(setup: Setup, rate: float, track: float, most: int) -> int:
 
 TO_LINE = (
     Ask(
-        "How far is the front left wheel from the line, at a right angle?",
+        "How far is the front left wheel from the line, measured at a right angle to the line?",
         "mm",
         0,
         1500,
         name="front",
     ),
-    Ask("How far is the rear left wheel from the line?", "mm", 0, 1500, name="rear"),
+    Ask(
+        "How far is the rear left wheel from the line, measured in the same way?",
+        "mm",
+        0,
+        1500,
+        name="rear",
+    ),
 )
 LINE = "front", "rear", "wheelbase"
 """Names of the answers for `Slant.near`, `Slant.far` and `Slant.apart`.
@@ -133,10 +140,10 @@ def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
             "ahead",
             f"On a free floor of {ROOM:g} m x {ROOM:g} m, find or draw a straight line across its "
             "middle (a joint of tiles, a board, chalk). Place the robot to the right of the line, "
-            f"about 300 mm away, its middle {setup.from_edge:.2f} m from the near edge, facing "
-            "along the line, so that its front left and rear left wheel have the same distance "
-            "from the line, to the millimetre. Mark where one wheel stands. Do not move the robot "
-            "by hand until the calibration is done. The robot drives "
+            f"about 300 mm away, its middle {setup.from_edge:.2f} m from the edge behind it, "
+            "facing along the line. Its front left and its rear left wheel must have the same "
+            "distance from the line, to the millimetre. Mark on the floor where one wheel stands. "
+            "Do not move the robot by hand until the calibration is done. The robot drives "
             f"{setup.length:.2f} m straight ahead.",
             (SETTLE, setup.ahead(setup.length), SETTLE),
             (FROM_MARK, *TO_LINE),
@@ -205,7 +212,7 @@ def _wall(setup: Setup, track: float) -> tuple[Leg, ...]:
         Leg(
             "out",
             f"Along a straight wall, {ROOM:g} m x {ROOM:g} m must be free. {SQUARE}, in the "
-            "middle of the free floor. The robot drives straight away from the wall for "
+            "middle of the free part of the wall. The robot drives straight away from the wall for "
             f"{setup.length:.2f} m.",
             (STOP, out, STOP),
             (
@@ -275,11 +282,11 @@ def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
         corner = setup.turn(side * math.pi / 2, CORNER_RATE, track)
         return Leg(
             f"square to the {to}",
-            f"Place the robot's middle {(ROOM - edge) / 2:.2f} m from the near edge of the floor "
-            f"and the same distance from its {other} edge, facing the far edge. Make two marks on "
-            "the floor: one exactly beside the middle of the robot's left side, one exactly beside "
-            f"the middle of its right side. The robot drives a square with sides of {edge:.2f} m "
-            f"and all turns to the {to}, and ends about where it started.",
+            f"Place the robot so that its middle is {(ROOM - edge) / 2:.2f} m from the edge of the "
+            f"floor behind it, and the same distance from the edge on its {other}. Make two marks "
+            "on the floor: one exactly beside the middle of the robot's left side, one exactly "
+            f"beside the middle of its right side. The robot drives a square with sides of "
+            f"{edge:.2f} m and all turns to the {to}, and ends about where it started.",
             (STOP, *(setup.ahead(edge), STOP, corner, STOP) * 4),
             ends,
             (
@@ -293,7 +300,7 @@ def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
     return (
         Leg(
             "ahead",
-            f"{_at_the_edge(setup)} Mark where one wheel stands. The robot drives "
+            f"{_at_the_edge(setup)} Mark on the floor where one wheel stands. The robot drives "
             f"{setup.length:.2f} m straight ahead.",
             (STOP, setup.ahead(setup.length), STOP),
             (FROM_MARK,),
