@@ -225,7 +225,7 @@ def parts(
     yield (
         f"{report.log}: {many(drives.runs, 'run')}, {drives.seconds:.0f} s, "
         f"{drives.metres:.1f} m, {drives.turns:.1f} turns at up to {drives.fastest:.2f} rad/s; "
-        f"compared with {report.reference}"
+        f"the wheels were compared with {report.reference}"
     )
     now, new = calibration.configured, calibration.multipliers
     was = report.effective_track / new.values[SEPARATION] * now.values[SEPARATION]
@@ -254,7 +254,7 @@ def parts(
 
 
 def _better(report: Report) -> list[str]:
-    noise = f"random {{}} error that the odometry messages state after {METRES:g} m of driving"
+    noise = f"random {{}} error after {METRES:g} m of driving, according to the odometry messages"
     sentences = [
         f"{words}: {_two(before * factor)} {unit} now, {_two(after * factor)} {unit} with the new "
         "values"
@@ -286,7 +286,11 @@ def _remains(report: Report, calibration: Calibration, *, guided: bool) -> list[
     fastest = calibration.drives.fastest
     multipliers = calibration.multipliers
     share = multipliers.std[SEPARATION] / multipliers.values[SEPARATION]
-    known = "" if TRACK in report.kept else f"this log determines it to {share:.1%}, and it "
+    known = (
+        ""
+        if TRACK in report.kept
+        else f"this log determines it with a standard deviation of {share:.1%}, and the track "
+    )
     sentences = [
         "remaining error: if wheels skid, the effective track is not constant: "
         f"{known}{'it ' * (not known)}changes by {report.effective_track_growth * fastest:+.1%} "

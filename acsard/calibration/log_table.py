@@ -294,7 +294,7 @@ def _columns(header: list[str], number: int) -> list[str]:
     if missing := [name for name in wanted if name not in header]:
         raise LogError(
             f"{where}: no column {', '.join(missing)}{_near(missing, header)}; the header "
-            f"must name t, and fr, fl, rl, rr or left, right, for example {EXAMPLE}"
+            f"must name t, and either fr, fl, rl and rr, or left and right, for example {EXAMPLE}"
         )
     sensors: list[str] = [name for name in ("yaw_rate", "yaw") if name in header]
     if {"x", "y"} <= set(header):
@@ -334,7 +334,7 @@ def _ignored(header: list[tuple[str, str]], names: list[str]) -> list[str]:
 def _unknown_units(header: list[tuple[str, str]], names: list[str]) -> list[str]:
     return [
         f"column {name} has the unknown unit ({unit[:20]}): the values were read as "
-        f"{SI.get(name, 'rad/s')}; correct the header if this unit is wrong"
+        f"{SI.get(name, 'rad/s')}; correct the header if they have another unit"
         for (_, unit), name in zip(header, names, strict=True)
         if name and name != "run" and factor(name, unit) is None
     ]

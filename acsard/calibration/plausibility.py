@@ -179,8 +179,9 @@ def heading_follows(source: str, rows: Rows, base: Base, sides: Floats) -> None:
     if not spread or float(off @ off) > UNLIKE * spread:
         raise RefusedError(
             f"{source} does not follow the wheels. Check that it is the yaw rate (not roll or "
-            "pitch), that both come from the same run and their clocks differ by less than 2 s, "
-            "that the wheels touched the ground, and that their columns are speeds, not angles"
+            "pitch), that it and the wheel speeds come from the same run, that their clocks differ "
+            "by less than 2 s, that the wheels touched the ground, and that the columns of the "
+            "wheels are speeds, not angles"
         )
 
 

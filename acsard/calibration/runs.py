@@ -444,7 +444,7 @@ def _ordered(stream: list[Floats], what: str, notes: Notes) -> Iterator[Floats]:
     order = np.argsort(t, kind="stable")
     times, first = np.unique(t[order], return_index=True)
     notes.add(
-        f"{{}} rows of {what} repeat a time: the first row of each time is used",
+        f"{{}} rows of {what} are left out, because an earlier row has the same time",
         len(t) - len(times),
     )
     yield times

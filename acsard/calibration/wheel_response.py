@@ -103,8 +103,8 @@ class WheelResponse(Struct, frozen=True):
                 then += "first lower limits.wheel_speed as the next note says"
             else:
                 then += (
-                    "even longer response times leave too little reserve; if the wheels are "
-                    "healthy, raise feedback.fault_time"
+                    "a longer response time would not prevent this with enough reserve; if the "
+                    "wheels are healthy, raise feedback.fault_time"
                 )
         elif max(self.seconds / self.present, self.present / self.seconds) > SAME:
             then = (

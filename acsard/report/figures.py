@@ -224,7 +224,7 @@ def path_figure(data: ReportData) -> Figure:
         "margin": {"l": 58, "r": 12, "t": 8, "b": 48},
     }
     caption = (
-        "This is the path by odometry. Both axes are in m and have the same scale."
+        "Odometry computed this path. Both axes are in m and have the same scale."
         if places
         else "There is no valid feedback, so the path is unknown."
     )

@@ -264,7 +264,7 @@ def _events(data: ReportData, clock: Clock) -> str:
         for mark in marks
     ]
     more = (
-        f'<p class="soft">{left_out} more events of the same names are left out; '
+        f'<p class="soft">{left_out} more events with these names are left out; '
         "acsard recording show prints all of them.</p>"
         if left_out
         else ""

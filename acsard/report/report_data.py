@@ -28,8 +28,8 @@ NS_PER_MS = 1_000_000
 MODES = ("fault", "stopped", "shutdown", "waiting", "inactive", "driving", "ready")
 """Modes of the robot.
 
-If neighboring spans of time with different modes are merged, the merged span has the mode that comes
-first in this tuple.
+If neighboring spans of time with different modes are merged, the merged span has the mode that
+comes first in this tuple.
 """
 
 LINKS = ("down", "stale", "booting", "up")

@@ -195,7 +195,7 @@ def rows(data: ReportData, origin: Origin, clock: Clock) -> Iterator[tuple[str, 
     began, config = data.began or 0.0, data.config
     yield "When", f"{clock(began, True)} to {clock(data.ended, True)}"
     yield "Duration", f"{lasting(data.seconds)}, {data.steps} steps"
-    yield "Distance", f"{data.metres:.2f} m, forward and backward"
+    yield "Distance", f"{data.metres:.2f} m, the sum of forward and backward driving"
     fast = data.fastest
     yield "Top speed", f"{fast.linear:.2f} m/s, {fast.angular:.2f} rad/s (measured)"
     drivers = [
