@@ -21,11 +21,14 @@ from acsard.terminal.output import table
 NAMES = (
     "wheel_separation_multiplier", "left_wheel_radius_multiplier", "right_wheel_radius_multiplier",
 )  # fmt: skip
-"""Settings of `[drive]` in the order of `Multipliers.values`."""
+"""Names of the multipliers in `[drive]`, in the order of `Multipliers.values`."""
 
 DIGITS = 5
-"""Decimals of the multipliers and significant digits of the `[odometry]` settings, as they are
-written into `acsard.toml`."""
+"""Precision of the settings that are written into `acsard.toml`.
+
+A multiplier has this number of decimals. A setting of `[odometry]` has this number of significant
+digits.
+"""
 
 
 class Refusal(Struct, frozen=True):
@@ -40,18 +43,21 @@ class Refusal(Struct, frozen=True):
 class Report(Struct, frozen=True):
     """The object that `--json` prints for a calibration.
 
-    A field `..._error_before` gives the error with the configured multipliers, and
-    `..._error_after` the error with the new multipliers. Both are measured on parts of the log that
-    the fit did not use. They are None if no sensor measures the error.
+    A field `..._error_before` is an error with the configured multipliers, and `..._error_after` is
+    the same error with the new multipliers. Both are measured on drives that the fit did not use.
+    Both are None if the log does not show this error.
     """
 
     log: str
     reference: str
-    """Sensors or measuring tool with which the wheels were compared, in words."""
-    scale: str
-    """Measurements that show the size of the wheels, in words; "" if none does.
+    """Names of the sensors, or of the measuring tool, with which the wheels were compared.
 
-    If none does, the mean radius stays as configured.
+    Examples are "yaw_rate and positions" and "a tape".
+    """
+    scale: str
+    """Measurements that show the size of the wheels: "positions", "distance" (by tape), or both.
+
+    If it is "", no measurement shows the size, and the mean radius stays as configured.
     """
     wheel_separation_multiplier: float
     left_wheel_radius_multiplier: float
@@ -63,12 +69,18 @@ class Report(Struct, frozen=True):
     right_wheel_radius_multiplier_std: float | None
     """Standard deviation of the multiplier; None if the ratio of the radii stays as configured."""
     covariance: Sequence[Sequence[float]]
-    """Covariance of the multipliers of wheel separation, left radius and right radius."""
+    """Covariance matrix (3 x 3) of the multipliers: wheel separation, left radius, right radius."""
     odometry: dict[str, float]
-    """New settings of `[odometry]`: the uncertainty of the wheel radii and of the track. They also
-    contain the noise if the new noise settings are surely better."""
+    """New settings of `[odometry]`, by name: the uncertainty of the wheel radii and of the track.
+
+    They include the noise settings if the new noise settings are better by more than chance
+    explains.
+    """
     feedback: dict[str, float]
-    """New settings of `[feedback]`; empty unless the present ones cause false wheel faults."""
+    """New settings of `[feedback]`, by name.
+
+    It is empty unless the configured settings would cause false wheel faults and better ones exist.
+    """
     effective_track: float
     """Effective track, m."""
     effective_track_std: float | None
@@ -92,22 +104,26 @@ class Report(Struct, frozen=True):
     """RMS position error over whole drives with the configured multipliers, m."""
     position_error_after: float | None
     heading_noise_before: float | None
-    """Standard deviation (deg) of the heading after 10 m, due to the configured noise settings.
+    """Standard deviation of the heading after 10 m that the configured noise settings give, deg.
 
-    The robot is assumed to turn as much per metre as in the log. The value is None if the noise
-    settings stay as configured.
+    The calculation assumes that the robot turns as much per metre as in the log. The value is None
+    if the noise settings stay as configured.
     """
     heading_noise_after: float | None
-    """The same figure as `heading_noise_before`, with the new noise settings."""
+    """The same standard deviation as `heading_noise_before`, but with the new noise settings."""
     distance_noise_before: float | None
-    """Standard deviation (m) of the distance after 10 m, due to the configured noise settings.
+    """Standard deviation of the distance after 10 m that the configured noise settings give, m.
 
     It is None if the noise settings stay as configured, or if the log has no positions.
     """
     distance_noise_after: float | None
-    """The same figure as `distance_noise_before`, with the new noise settings."""
+    """The same standard deviation as `distance_noise_before`, but with the new noise settings."""
     time_offsets: dict[str, float]
-    """Delay of each sensor's recorded times behind those of the wheels, s, by the sensor's name."""
+    """Maps the name of each sensor to its delay, s.
+
+    The delay is the time by which the sensor's recorded times are later than those of the wheels
+    for the same event.
+    """
     gyro_bias: float
     """Gyro bias, rad/s."""
     runs: int
@@ -117,18 +133,19 @@ class Report(Struct, frozen=True):
     turns: float
     """Total turning to the left and to the right, as a number of turns of 360 deg."""
     kept: Sequence[str]
-    """Quantities that stay as configured, because the log does not improve them, in words."""
+    """Names of the quantities that stay as configured, because the log does not improve them."""
     notes: Sequence[str]
     written: str | None
-    """File to which the tool wrote the settings, or None."""
+    """Name of the file to which the tool wrote the new settings; None if it wrote none."""
     refused: None = None
 
 
 def report(log: str, calibration: Calibration, drive: DriveConfig, written: str) -> Report:
-    """Return the report of a calibration.
+    """Return the object that `--json` prints for a calibration.
 
-    `drive` is the configured geometry. `written` is the name of the file to which the new settings
-    were written, or "" if none was written.
+    `log` is the path of the log file, or "the drive" for a guided drive. `drive` is the configured
+    geometry. `written` is the name of the file to which the new settings were written, or "" if
+    none was written.
     """
     multipliers = calibration.multipliers
     track, left, right = multipliers.values.tolist()
@@ -163,10 +180,10 @@ def report(log: str, calibration: Calibration, drive: DriveConfig, written: str)
 
 
 def _noise(calibration: Calibration) -> tuple[BeforeAfter, BeforeAfter]:
-    """Return the standard deviations that noise causes after `METRES` m of driving.
+    """Return the standard deviations of heading, deg, and distance, m, after `METRES` m of driving.
 
-    The first of the pair is for the heading, deg, the second for the distance, m. Each has the
-    values with the configured and with the new noise settings.
+    Each has two values: with the configured noise settings, and with the new noise settings. Both
+    values are None if the noise settings stay as configured.
     """
     noise = calibration.noise
     if noise is None or not noise.better:
@@ -199,7 +216,7 @@ def odometry(calibration: Calibration) -> dict[str, float]:
 def parts(
     report: Report, calibration: Calibration, where: str, *, guided: bool
 ) -> Iterator[RenderableType]:
-    """Yield the sentences and the table of the report.
+    """Yield the parts of the printed report: sentences, and a table of the multipliers.
 
     `where` names the configuration file. `guided` is True if the tool guided the drive, and False
     for a recorded drive (`--log`).
@@ -208,7 +225,7 @@ def parts(
     yield (
         f"{report.log}: {many(drives.runs, 'run')}, {drives.seconds:.0f} s, "
         f"{drives.metres:.1f} m, {drives.turns:.1f} turns at up to {drives.fastest:.2f} rad/s; "
-        f"compared with {report.reference}"
+        f"the wheels were compared with {report.reference}"
     )
     now, new = calibration.configured, calibration.multipliers
     was = report.effective_track / new.values[SEPARATION] * now.values[SEPARATION]
@@ -237,7 +254,7 @@ def parts(
 
 
 def _better(report: Report) -> list[str]:
-    noise = f"random {{}} error that the odometry messages state after {METRES:g} m of driving"
+    noise = f"random {{}} error after {METRES:g} m of driving, according to the odometry messages"
     sentences = [
         f"{words}: {_two(before * factor)} {unit} now, {_two(after * factor)} {unit} with the new "
         "values"
@@ -269,7 +286,11 @@ def _remains(report: Report, calibration: Calibration, *, guided: bool) -> list[
     fastest = calibration.drives.fastest
     multipliers = calibration.multipliers
     share = multipliers.std[SEPARATION] / multipliers.values[SEPARATION]
-    known = "" if TRACK in report.kept else f"this log determines it to {share:.1%}, and it "
+    known = (
+        ""
+        if TRACK in report.kept
+        else f"this log determines it with a standard deviation of {share:.1%}, and the track "
+    )
     sentences = [
         "remaining error: if wheels skid, the effective track is not constant: "
         f"{known}{'it ' * (not known)}changes by {report.effective_track_growth * fastest:+.1%} "

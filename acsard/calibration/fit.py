@@ -2,9 +2,9 @@
 
 The fit is a Gauss-Newton fit. The evidence of a sensor is its contribution to the normal equations,
 summed over each block (a few seconds of driving). The standard deviations come from a jackknife
-over the blocks (Quenouille and Tukey), which leaves out each block in turn. The parameters without
-a block are found by one linear step, which starts at the parameters that fit all blocks. These
-deviations are right even if the errors within a block are correlated.
+over the blocks (Quenouille and Tukey): each block is left out in turn, and the parameters are
+computed from the other blocks. This takes only one linear step from the parameters that fit all
+blocks. These deviations are right even if the errors within a block are correlated.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class P(IntEnum):
     TRACK_GROWTH = 3
     """Fraction by which the effective track grows for each rad/s of turn rate."""
     DELAY = 4
-    """Time by which the recorded times of positions are later than those of the wheels, s."""
+    """Delay of the positions' recorded times behind those of the wheels for the same event, s."""
     SENSOR_X = 5
     """Distance by which the position sensor is ahead of the robot's middle, m."""
     SENSOR_Y = 6
@@ -73,7 +73,7 @@ class Base(Struct, frozen=True):
         )  # fmt: skip
 
     def start(self) -> Floats:
-        """Return parameters that describe the configured multipliers. All others are 0."""
+        """Return the parameters for the configured multipliers. All other parameters are 0."""
         return np.array([self.left, self.right, 1 / self.track, *[0.0] * (COUNT - P.TRACK_GROWTH)])
 
     @property
@@ -108,6 +108,7 @@ def of_rows(
     Args:
         jacobian: derivatives of each prediction by the parameters, shape (measurements, COUNT).
         residual: measured minus predicted values.
+        weight: weight of each measurement.
         block: index of the block of each measurement.
         blocks: number of blocks.
     """
@@ -122,10 +123,10 @@ def of_rows(
 
 
 def condition(normal: Floats) -> float:
-    """Return the condition number of the matrix `normal` after it was scaled to a diagonal of 1.
+    """Return the condition number of `normal`, scaled so that its diagonal is 1.
 
-    The units of the parameters then do not matter. The number is infinite if a parameter has no
-    influence (0 on the diagonal).
+    Because of the scaling, the units of the parameters do not matter. The number is infinite if a
+    parameter has no influence (0 on the diagonal).
     """
     size = np.sqrt(np.diag(normal))
     if not np.all(size > 0.0):
@@ -136,7 +137,8 @@ def condition(normal: Floats) -> float:
 def huber(residuals: Floats | Complexes, least: float) -> Floats:
     """Return Huber's weight of each residual: 1 up to `HUBER` standard deviations, less above.
 
-    The standard deviation is the scaled median absolute residual, but at least `least`.
+    The standard deviation is taken as 1.4826 times the median absolute residual, but at least
+    `least`.
     """
     size = np.abs(residuals)
     scale = max(least, 1.4826 * float(np.median(size)) if len(size) else 0.0)
@@ -148,10 +150,10 @@ Source = Callable[[Floats], Evidence]
 
 MOST_STEPS = 30
 SMALL, SETTLED = 1e-5, 0.02
-"""Limits for the largest change of radii and track, as fractions, in the latest step of the fit.
+"""Limits for one step of the fit: the largest change of the radii, the track or the track growth.
 
-After a change below `SMALL`, the fit ends. If the last change is below `SETTLED`, the fit counts as
-converged.
+A change is measured in the units of `P`, so that 0.01 is 1 % of a radius. The fit ends after a step
+below `SMALL`. It has converged if its last step is below `SETTLED`.
 """
 
 USUAL = {P.TRACK_GROWTH: 0.06, P.DELAY: 1.0, P.SENSOR_X: 0.5, P.SENSOR_Y: 0.5}
@@ -168,14 +170,14 @@ Held = tuple[Floats, float]
 value that the sum must have."""
 
 MANY = 16
-"""Minimum number of blocks for a jackknife that also leaves out pairs of neighboring blocks."""
+"""Minimum number of blocks at which the jackknife also leaves out pairs of neighboring blocks."""
 
 LEAST_BLOCKS = 5
-"""Minimum number of blocks (or runs) for a jackknife that leaves out each of them in turn."""
+"""Minimum number of blocks, or of runs, at which the jackknife leaves out each of them in turn."""
 
 
 def student_factor(free: Floats | float) -> Floats:
-    """Return the variance of Student's t with `free` degrees of freedom; less than 3 count as 3."""
+    """Return the variance of Student's t with max(`free`, 3) degrees of freedom."""
     free = np.maximum(3.0, free)
     return np.asarray(free / (free - 2))
 
@@ -198,7 +200,7 @@ class Fit(Struct, frozen=True):
     """Prior standard deviation of each parameter that has one."""
 
     def without(self, blocks: Mask) -> Floats:
-        """Return the parameters without the blocks in the mask `blocks`, approximately.
+        """Return the parameters that fit all blocks outside the mask `blocks`, approximately.
 
         They are computed by one linear step from `parameters`, without another fit.
         """
@@ -208,7 +210,7 @@ class Fit(Struct, frozen=True):
         return found
 
     def marginal(self) -> Floats:
-        """Return the normal equations (left-hand side) of the left radius, right radius and track.
+        """Return the left-hand side of the normal equations of left radius, right radius and track.
 
         All other parameters are eliminated. If no positions show the size of the wheels, only two
         unknowns remain: the difference of the radii, and the inverse track.
@@ -244,11 +246,12 @@ class Fit(Struct, frozen=True):
         return np.asarray(chance + pull @ np.diag(1 / np.where(usual, usual, np.inf)) @ pull.T)
 
     def _changes(self, group: npt.NDArray[np.int64]) -> tuple[Floats, Floats]:
-        """Return a pair: the changes of the parameters, and their jackknife variances.
+        """Return a pair: changes of the parameters if a group of blocks is left out, and variances.
 
-        `group` contains the number of each block's group. The changes have a row for each group:
-        the parameters without this group minus `parameters`. The variances are widened to those of
-        Student's t, with the degrees of freedom of Satterthwaite (An approximate distribution of
+        `group` contains, for each block, the number of its group. The changes have a row for each
+        group: the parameters without this group minus `parameters`. The variances come from a
+        jackknife over the groups, and have one number for each parameter. They are widened to those
+        of Student's t, with the degrees of freedom of Satterthwaite (An approximate distribution of
         estimates of variance components, 1946).
         """
         change = np.array(
@@ -267,8 +270,10 @@ def fit(
     """Return the fit of the parameters to the evidence of all sensors.
 
     Args:
+        sources: one function for each sensor, which returns its evidence for given parameters.
         start: the parameters to start from, which must be nearly right.
-        places, gyro: whether positions and a gyro are among the sources.
+        places: whether positions are among the sources.
+        gyro: whether a gyro is among the sources.
         bias_std: standard deviation of the gyro bias, rad/s; 0 if the fit must not change the bias.
         held: constraints on the parameters.
     """
@@ -304,8 +309,8 @@ def fit(
 def _sum(evidence: Sequence[Evidence]) -> tuple[Floats, Floats]:
     """Return the normal equations of all sensors: a pair of their left-hand and right-hand sides.
 
-    Both are weighted sums over the sensors. The weight of a sensor follows from the scatter of its
-    right-hand sides from block to block. Unlike the size of the residuals, this scatter becomes
+    Both are weighted sums over the sensors. The weight of a sensor follows from the differences
+    between the right-hand sides of its blocks. Unlike the residuals, these differences become
     larger if the residuals are correlated.
     """
     normal, score = np.zeros_like(evidence[0].normal), np.zeros_like(evidence[0].score)

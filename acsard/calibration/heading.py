@@ -28,9 +28,10 @@ Samples in the margins are not used, because the robot may shake there.
 """
 
 TURNED_BY_HAND = 0.05
-"""Limit for the gyro's mean rate in one rest minus the median rate of all rests, rad/s.
+"""Limit for the difference between the gyro's mean rate in one rest and its usual rate, rad/s.
 
-If the difference is larger, a person turned the robot during this rest, so the rest is not used.
+The usual rate is the median over all rests. If the difference is larger, a person turned the robot
+during this rest, so the rest is not used.
 """
 
 LEAST_SAMPLES = 5
@@ -64,7 +65,7 @@ class Heading(Struct, frozen=True):
     angle: Floats
     """Heading at the times `t`, rad."""
     gaps: Floats
-    """Gaps between the samples, one row (begin, end) each, in s."""
+    """Long intervals without a sample, one row (begin, end) for each, s. See `runs.gaps`."""
 
 
 class Headings(Struct, frozen=True):
@@ -90,7 +91,7 @@ TURNING = 0.05
 """Turn rate up to which the robot is considered to drive straight, rad/s."""
 
 FASTEST = 0.95
-"""Fraction of the total turned angle that the robot turned more slowly than `Rates.fastest`."""
+"""Fraction of the total turned angle that the robot turned at rates below `Rates.fastest`."""
 
 
 class Rows(Struct, frozen=True):
@@ -113,9 +114,9 @@ class Rates(Struct, frozen=True):
     """The turn rates of a log, rad/s."""
 
     mean: float
-    """Mean turn rate, weighted by the turned angle."""
+    """Mean turn rate, rad/s, weighted by the turned angle."""
     fastest: float
-    """Turn rate below which the robot turned 95 % (`FASTEST`) of its total turned angle."""
+    """Turn rate, rad/s, below which the robot turned 95 % (`FASTEST`) of its total turned angle."""
 
 
 def of_gyro(driven: Sequence[Run]) -> Headings | None:
@@ -241,8 +242,9 @@ def _sums(rate: Floats, steps: Floats) -> Floats:
 def offset(found: Sequence[Heading], driven: Sequence[Run]) -> float:
     """Return the delay of the sensor, s, for which its turns correlate best with the wheels'.
 
-    The turn according to the wheels is the right minus the left angle. The sum of both angles is
-    tried as well, because the speeds of one side may have the wrong sign.
+    `found` contains the sensor's headings in the runs `driven`. The turn according to the wheels is
+    the right minus the left angle. The sum of both angles is tried as well, because the speeds of
+    one side may have the wrong sign.
     """
     reach = round(FURTHEST_S / GRID_S)
     scores, sizes = np.zeros((2, 2 * reach + 1)), np.zeros(2)
@@ -327,7 +329,7 @@ def rates(rows: Rows, by_wheels: Floats) -> Rates:
 
 
 def level(rows: Rows) -> Rows:
-    """Return `rows` without the part of each column that is proportional to time.
+    """Return `rows` without the part of each column that is proportional to the intervals' length.
 
     An unknown constant gyro bias then has no effect on a comparison with the wheels.
     """
@@ -346,7 +348,7 @@ def _fast(run: Run) -> Floats:
 
 
 NOISE, SHARE = 0.01, 0.03
-"""Usual difference between the sensor's and the wheels' turn in an interval of the log.
+"""Usual difference between the turn of the sensor and that of the wheels in an interval of the log.
 
 It has two parts, whose squares are added: `NOISE` rad for each second of the interval, and the
 fraction `SHARE` of the wheels' turn.
@@ -393,7 +395,7 @@ def _weight(rows: Rows, residual: Floats, by_wheels: Floats) -> Floats:
 
 
 def bias(rows: Rows, by_wheels: Floats) -> float:
-    """Return the bias of the gyro, rad/s: its mean turn rate minus that of the wheels."""
+    """Return the gyro's bias, rad/s: its mean turn rate minus that according to the wheels."""
     seconds, found = rows.seconds, 0.0
     off = rows.turned - by_wheels
     for _ in range(10):
@@ -403,10 +405,11 @@ def bias(rows: Rows, by_wheels: Floats) -> float:
 
 
 def first(rows: Rows, base: Base) -> Floats:
-    """Return the factors of the left and of the right wheels that fit the sensor's turns best.
+    """Return two factors, of the left and the right wheels, that fit the sensor's turns best.
 
-    A factor is wheel radius / effective track, divided by `base.gain`. It is negative if the
-    sign of this side's wheel speeds, or the sign of the sensor, is wrong.
+    A factor is wheel radius / effective track, divided by the configured wheel radius / wheel
+    separation (`base.gain`). It is negative if the sign of this side's wheel speeds, or the sign of
+    the sensor, is wrong.
     """
     columns = base.gain * np.column_stack((-rows.left, rows.right))
     weight = np.ones(len(rows.turned))
@@ -420,7 +423,7 @@ def first(rows: Rows, base: Base) -> Floats:
 
 
 def by_sides(rows: Rows, base: Base, sides: Floats) -> Floats:
-    """Return the robot's turn in each interval, rad, as the wheels measure it.
+    """Return the robot's turn in each interval of `rows`, rad, computed from the wheels.
 
     `sides` contains the two factors that `first` returns.
     """

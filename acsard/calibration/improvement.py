@@ -53,16 +53,16 @@ SURE = 2.0
 HALVED = float(np.log(2.0))
 """The value of `Improvement.gain` if the calibration halves one error.
 
-A larger gain counts as sure, whatever its standard deviation is. In a guided drive, one leg may
-show nearly all of the error. The standard deviation is then large although the gain is real.
+A larger gain always counts as sure. In a guided drive, one leg may show nearly all of the error.
+The standard deviation of the gain is then large although the gain is real.
 """
 
 NEAR, FAR = 2.0, 3.0
-"""Limits for the distance of the new multipliers from the configured ones, in standard deviations.
+"""Limits for the distance between new and configured multipliers, in standard deviations.
 
-Up to `NEAR`, the configured multipliers are kept. Above `FAR`, a smaller `Improvement.gain` is
-enough to accept the new multipliers. At twice `FAR`, half of the usual gain is enough. By chance
-alone, the distance exceeds `FAR` in one log of thirty.
+Up to `NEAR`, the configured multipliers are kept. Above `FAR`, the `Improvement.gain` that is
+needed to accept the new multipliers becomes smaller: at twice `FAR`, half of it is enough. By
+chance alone, the distance exceeds `FAR` in one log of thirty.
 """
 
 LEAST_SQUARE = 1e-9
@@ -77,9 +77,15 @@ class Improvement(Struct, frozen=True):
     straight: BeforeAfter
     """Heading error after 10 m straight ahead, deg."""
     heading: BeforeAfter
-    """RMS heading error over whole drives, deg. Each drive is first rotated to fit best."""
+    """RMS heading error over whole drives, deg.
+
+    The heading of each drive is first rotated so that it fits the sensor best.
+    """
     place: BeforeAfter
-    """RMS position error over whole drives, m. Each path is first moved and rotated to fit best."""
+    """RMS position error over whole drives, m.
+
+    The path of each drive is first shifted and rotated so that it fits the positions best.
+    """
     gain: float = np.inf
     """Natural logarithm of (error before / error after); inf if it was not computed.
 
@@ -171,6 +177,7 @@ def improvement(
     Args:
         held: the folds. Each contains a drive, and parameters that were fitted without this drive.
         configured: the parameters with the configured multipliers.
+        base: the configured geometry.
         rows: the motion in intervals of about a second. `rows.turned` is 0 if the log has no
             heading sensor.
         places: for each fold, the measured positions of its drive.
@@ -265,9 +272,14 @@ def _by_group(
 ) -> Floats:
     """Return the three numbers for `per_amount`: total error before, total error after, `amount`.
 
-    `before` and `after` contain the error of the turn in each interval, rad. Only the intervals in
-    the mask `among` count. Within a group, the errors are added with their signs. The absolute
-    values of the groups' sums then give the total.
+    Args:
+        before: error of the turn in each interval before the calibration, rad.
+        after: error of the turn in each interval after the calibration, rad.
+        group: number of the group of each interval. The total error is the sum of the absolute
+            errors of the groups. In a group, the errors of the intervals are added with their
+            signs.
+        among: mask of the intervals that count.
+        amount: the driven angle or distance.
     """
     sums = (np.abs(np.bincount(group[among], errors[among])).sum() for errors in (before, after))
     return np.array([*sums, amount])

@@ -35,7 +35,10 @@ APPLIED = "applied_linear", "applied_angular"
 """Columns with the twist that the daemon commands to the wheels, in m/s and rad/s."""
 
 UNITS = {"t": TIME, "x": LENGTH, "y": LENGTH, "yaw": ANGLE, APPLIED[0]: SPEED}
-"""Factors from known units to SI, by column. All other columns have the units of `RATE`."""
+"""Maps a column to its known units, and each unit to its factor to SI.
+
+All other columns have the units of `RATE`.
+"""
 
 SI = {"t": "s", "x": "m", "y": "m", "yaw": "rad", APPLIED[0]: "m/s"}
 
@@ -66,7 +69,7 @@ WHEELS = ("fr", "fl", "rl", "rr", "left", "right")
 
 BOUNDS = dict.fromkeys(WHEELS, 1e3) | {"t": 1e20, "yaw_rate": 1e4, "yaw": 1e7}
 PLACE_BOUND = 1e9
-"""Largest possible absolute value, in SI units, in a column that `BOUNDS` does not list.
+"""Largest plausible absolute value in a column that `BOUNDS` does not list, in SI units.
 
 This limit and those in `BOUNDS` also allow values in degrees or nanoseconds, so that later checks
 can name the wrong unit.
@@ -78,8 +81,9 @@ RATES = frozenset((*WHEELS, "yaw_rate"))
 SPIKE, FEW_VALUES, SLOW = 10.0, 0.02, 0.02
 """Definition of a spike, which is a rate that was recorded wrongly.
 
-A spike is more than `SPIKE` times as large as each neighboring sample, and as the usual rate. The
-usual rate is the quantile 1 - `FEW_VALUES` of all rates above `SLOW` rad/s.
+A spike is more than `SPIKE` times as large as each of the two neighboring samples, and more than
+`SPIKE` times as large as the usual rate. The usual rate is the quantile 1 - `FEW_VALUES` of all
+rates above `SLOW` rad/s.
 """
 
 
@@ -116,7 +120,10 @@ def spikes(values: Floats, order: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_
 
 
 def _alone(sizes: Floats, usual: float) -> npt.NDArray[np.bool_]:
-    """Return a mask of values far above `usual` and above the nearest values that are not NaN."""
+    """Return a mask of the values that are more than `SPIKE` times as large as their surroundings.
+
+    These are `usual`, and the nearest values on both sides that are not NaN.
+    """
     held = np.flatnonzero(np.isfinite(sizes))
     seen = np.concatenate([[0.0], sizes[held], [0.0]])
     around = np.maximum(np.maximum(seen[:-2], seen[2:]), usual)
@@ -142,11 +149,16 @@ COMMENTS = ("#", "%")
 """First characters of the comment lines above the table."""
 
 BEHIND = re.compile(r"(?:^|\s)#")
-"""Pattern for the start of a comment after a number, but not for "1.#QNAN", which means NaN."""
+"""Pattern for the start of a comment after a number.
+
+It does not match the "#" in "1.#QNAN", which means NaN.
+"""
 
 FEW, SHARE = 3, 0.01
-"""Limits for unreadable rows: their number, and their share of the readable rows. The larger limit
-applies."""
+"""Largest accepted number of unreadable rows, and the same as a fraction of the readable rows.
+
+The larger of the two limits applies.
+"""
 
 EXAMPLE = '"t,left,right,yaw_rate" or "t,fr,fl,rl,rr,x,y"'
 
@@ -162,7 +174,7 @@ class RefusedError(AcsardError):
 
 
 def noted(error: Exception, notes: Iterable[str]) -> None:
-    """Add the notes about a log to an error, because the notes may explain the error."""
+    """Attach the notes about a log to an error, because they may explain the error."""
     for note in notes:
         error.add_note(note)
 
@@ -282,7 +294,7 @@ def _columns(header: list[str], number: int) -> list[str]:
     if missing := [name for name in wanted if name not in header]:
         raise LogError(
             f"{where}: no column {', '.join(missing)}{_near(missing, header)}; the header "
-            f"must name t, and fr, fl, rl, rr or left, right, for example {EXAMPLE}"
+            f"must name t, and either fr, fl, rl and rr, or left and right, for example {EXAMPLE}"
         )
     sensors: list[str] = [name for name in ("yaw_rate", "yaw") if name in header]
     if {"x", "y"} <= set(header):
@@ -322,7 +334,7 @@ def _ignored(header: list[tuple[str, str]], names: list[str]) -> list[str]:
 def _unknown_units(header: list[tuple[str, str]], names: list[str]) -> list[str]:
     return [
         f"column {name} has the unknown unit ({unit[:20]}): the values were read as "
-        f"{SI.get(name, 'rad/s')}; correct the header if this unit is wrong"
+        f"{SI.get(name, 'rad/s')}; correct the header if they have another unit"
         for (_, unit), name in zip(header, names, strict=True)
         if name and name != "run" and factor(name, unit) is None
     ]

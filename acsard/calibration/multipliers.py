@@ -50,7 +50,7 @@ class Deviations(Struct, frozen=True):
 
 
 class Multipliers(Struct, frozen=True):
-    """The multipliers of wheel separation, left and right wheel radius, and their covariance."""
+    """The multipliers of wheel separation, left radius and right radius, with their covariance."""
 
     values: Floats
     """The multipliers in the order of `SEPARATION`, `LEFT_RADIUS` and `RIGHT_RADIUS`."""
@@ -74,9 +74,10 @@ class Multipliers(Struct, frozen=True):
         return math.sqrt(off @ np.linalg.solve(self.covariance + SAME**2 * np.eye(3), off))
 
     def own(self) -> Deviations:
-        """Return the standard deviations of these multipliers in the form that `[odometry]` uses.
+        """Return the standard deviations of track, ratio of the radii and mean radius.
 
-        The odometry treats the errors of track, ratio and scale as independent.
+        `[odometry]` describes the uncertainty in this form, because the odometry treats the errors
+        of these three quantities as independent.
         """
         shares = self.covariance / np.outer(self.values, self.values)
         rows = np.array([[1.0, -0.5, -0.5], [0.0, -1.0, 1.0], [0.0, 0.5, 0.5]])
@@ -91,9 +92,14 @@ def configured(base: Base) -> Multipliers:
 def multipliers(parameters: Floats, covariance: Floats, rate: Rates) -> Multipliers:
     """Return the multipliers that fit best at the turn rates of the log.
 
-    The multiplier of the separation describes a track that is the same for all turn rates. The
-    variance of this multiplier does not cover skidding that differs from turn to turn, because that
-    is noise of the odometry.
+    The daemon uses one track for all turn rates, so the multiplier of the separation describes the
+    track at the mean of `rate`. Its variance does not cover skidding that differs from turn to
+    turn, because that is noise of the odometry.
+
+    Args:
+        parameters: the fitted parameters, shape (COUNT,).
+        covariance: the covariance of the parameters.
+        rate: the turn rates of the log.
     """
     inverse, growth = parameters[P.INVERSE_TRACK], parameters[P.TRACK_GROWTH]
     slower = 1.0 - growth * rate.mean
@@ -111,8 +117,8 @@ TAPE_M = 0.01
 CONTRADICTS, CONTRADICTS_STD = 0.02, 5.0
 """Limits for the difference between a distance by tape and the same distance by positions.
 
-If the difference exceeds the fraction `CONTRADICTS` of the distance and also `CONTRADICTS_STD`
-standard deviations, one of the distances is wrong.
+If the difference exceeds the fraction `CONTRADICTS` of the distance and also exceeds
+`CONTRADICTS_STD` standard deviations, one of the two distances is wrong.
 """
 
 UNKNOWN = 1.0
@@ -148,7 +154,10 @@ class Extent(Struct, frozen=True):
 
 
 Follow = Callable[[Floats, int], Extent]
-"""Function of `Multipliers.values` and the index of a run. It returns the `Extent` of this run."""
+"""Function that returns the `Extent` of a run for given multipliers.
+
+Its arguments are the multipliers, as in `Multipliers.values`, and the index of the run.
+"""
 
 
 def scaled(
@@ -157,14 +166,20 @@ def scaled(
     """Correct the multipliers with a distance that was measured by tape.
 
     The correction is the update step of a Kalman filter on the logarithms of the multipliers.
-    `known` is true if positions have already shown the size of the wheels.
+
+    Args:
+        found: the multipliers to correct.
+        tape: the distance that was measured.
+        names: the names of the runs.
+        follow: returns the `Extent` of a run for given multipliers.
+        known: whether positions have already shown the size of the wheels.
 
     Returns:
         A pair: the corrected multipliers, and the name of the run that the distance belongs to.
 
     Raises:
-        RefusedError: the log has no such run, the run is not straight enough, or the distance
-            contradicts the positions.
+        RefusedError: the log has no such run, the run is too short or not straight enough, or the
+            distance contradicts the positions.
     """
     if tape.run and tape.run not in names:
         raise RefusedError(

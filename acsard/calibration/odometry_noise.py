@@ -1,8 +1,8 @@
 """Fits the noise settings of `[odometry]` to drives that the fit of the geometry did not use.
 
-A window is about half a minute of a drive. A residual is the heading or the position that a sensor
-measured at one time, minus the heading or the position that the wheels give. Some errors last for a
-whole turn, for example if the track changes with the turn rate. The residuals of a window are
+A window is about half a minute of a drive. A residual is the difference between a measured heading
+or position and the heading or position that the wheels give for the same time. Some errors last for
+a whole turn, for example if the track changes with the turn rate. The residuals of a window are
 therefore seconds apart, so that each contains the whole of such an error.
 
 The residuals are modelled as normal with mean 0. Their covariance V is linear in the noise x, which
@@ -41,7 +41,10 @@ from acsard.core.config.settings import OdometryConfig
 
 
 class Source(IntEnum):
-    """Sources of noise, as indices of arrays: six of the robot (0 to 5), then those of sensors."""
+    """Sources of noise, as indices of arrays.
+
+    The sources 0 to 5 are those of the robot, and the others those of sensors.
+    """
 
     DISTANCE = 0
     """Variance of the distance per metre driven, m2/m."""
@@ -50,7 +53,10 @@ class Source(IntEnum):
     SKID = 2
     """Variance of the heading per radian turned, rad2/rad."""
     SLIP = 3
-    """Variance of the fraction of the distance that is lost in a window (half a minute)."""
+    """Variance of the fraction of the distance that is lost because wheels slip.
+
+    The fraction is constant in a window (half a minute) and differs from window to window.
+    """
     RATIO = 4
     """Relative variance of the ratio of the right to the left wheel radius, from window to window
     (half a minute)."""
@@ -71,13 +77,13 @@ START = np.array([1e-4, 1e-4, 1e-3, 1e-4, 1e-6, 1e-4, 1e-5, 1e-6, 1e-4])
 """Noise of each `Source` from which the search starts. The numbers only have to be positive."""
 
 WINDOW_S, APART_S = 32.0, 4.0
-"""Length of a window, and time between its residuals, s. A shorter drive is one window."""
+"""Length of a window, and time between its residuals, s. A shorter drive has one window."""
 
 LEAST = 4
-"""Minimum number of intervals into which the residuals divide a window."""
+"""Minimum number of intervals between the residuals of a window."""
 
 MOST_WINDOWS = 80
-"""Maximum number of windows that are used. From a longer log, only every n-th window is used."""
+"""Maximum number of windows that are used. A longer log is thinned to every n-th window."""
 
 FINE_S = 0.5
 """Duration of the steps into which a window is divided, s.
@@ -99,7 +105,7 @@ STEPS, FEWER_STEPS = 150, 60
 """
 
 OUTLIER = 9.0
-"""Mean square of the normalized residuals of a window above which the window weighs less."""
+"""A window weighs less if the mean square of its normalized residuals exceeds this limit."""
 
 ROUNDING = 1e-12
 """Variance added to each residual, so that even a perfect sensor's covariance can be inverted."""
@@ -107,27 +113,29 @@ ROUNDING = 1e-12
 FLOOR = 0.25
 """Minimum for the noise of `DISTANCE`, `YAW` and `SKID`, in standard deviations of its estimate.
 
-In a short log, the fit often finds a noise of 0, and the odometry would then state an exact pose.
+In a short log, the fit often finds a noise of 0. Without the minimum, the odometry would then state
+that the pose is exact.
 """
 
 CHANGES = 0.1
 """Minimum for the noise of `DISTANCE`, as a fraction of the noise of `SLIP`.
 
-`Windows.lasting` first converts the noise of `SLIP` to the unit of `DISTANCE`. In the same way,
-`RATIO` gives the minimum for `YAW`, and `TRACK` gives the minimum for `SKID`. A window does not
-show how long an error lasts beyond the window's end. Without this minimum, the pose covariance of
-one robot in eight had no width in some direction.
+In the same way, `RATIO` gives the minimum for `YAW`, and `TRACK` gives the minimum for `SKID`.
+`Windows.lasting` first converts the noise of one source to the unit of the other.
+
+The reason is that a window does not show whether an error lasts longer than the window. Without
+this minimum, the pose covariance of one robot in eight was singular.
 """
 
 TWICE = math.log(2.0) - 3 / 8
-"""A `Noise.gain` above this value always counts as sure, even if `Noise.chance` is large.
+"""Limit for `Noise.gain` above which the new noise always counts as better.
 
-If a standard deviation is stated at twice its true value, the log likelihood per residual is lower
-by this amount.
+The limit is the mean loss of log likelihood per residual if each standard deviation is stated at
+twice its true value. Above it, a large `Noise.chance` does not matter.
 """
 
 MOST = 1.0
-"""Largest value of a setting that a calibration proposes. The configuration accepts this value."""
+"""Limit to which each proposed setting is reduced. The configuration accepts this value."""
 
 METRES = 10.0
 """Distance after which the report states the uncertainty that noise causes, m."""
@@ -143,15 +151,20 @@ class Windows(Struct, frozen=True):
     residual: Floats
     """Residuals after the unknown start pose was projected out, shape (windows, n)."""
     effects: Floats
-    """Covariance of the residuals if the noise of a source is 1, shape (windows, COUNT, n, n)."""
-    known: Floats
-    """Covariance of the residuals due to the uncertain geometry and gyro bias, shape
-    (windows, n, n)."""
-    lasting: Floats
-    """Factors that convert the noise of one source to equivalent noise of another source.
+    """Covariance of the residuals that each source alone causes if its noise is 1.
 
-    They convert `SLIP` to `DISTANCE` (m), `RATIO` to `YAW` (1/m) and `TRACK` to `SKID` (rad), with
-    the same effect in a window of average motion.
+    The shape is (windows, COUNT, n, n).
+    """
+    known: Floats
+    """Covariance of the residuals due to the uncertain geometry and gyro bias.
+
+    The shape is (windows, n, n).
+    """
+    lasting: Floats
+    """Factors that convert the noise of one source to an equivalent noise of another source.
+
+    They convert `SLIP` to `DISTANCE` (m), `RATIO` to `YAW` (1/m) and `TRACK` to `SKID` (rad).
+    Equivalent means that the effect in a window of average motion is the same.
     """
 
     def of(self, chosen: Mask | npt.NDArray[np.int64]) -> Windows:
@@ -182,7 +195,7 @@ class Windows(Struct, frozen=True):
         return noise
 
     def at_least(self, noise: Floats) -> Floats:
-        """Return `noise`, increased so that it is safe to state for other drives.
+        """Return `noise`, increased so that it is not too small for other drives.
 
         `FLOOR` and `CHANGES` give minima. If few residuals show the noise of `DISTANCE`, `YAW` or
         `SKID`, this noise is also increased like the variance of Student's t. Windows overlap by
@@ -267,7 +280,8 @@ def settings(
     Args:
         known: the standard deviations of the new geometry.
         track: the new multiplier of the wheel separation.
-        kept: the quantities that stay as configured, `TRACK` or `RATIO` of `plausibility`.
+        kept: the quantities that stay as configured: `TRACK` or `RATIO` of `plausibility`, or both.
+        odometry: the configured settings.
         shown: the noise that the log shows, or None if the noise stays as configured.
         scaled: whether the size of the wheels was measured.
     """
@@ -309,7 +323,7 @@ class Reference(Struct, frozen=True):
 def noise(
     held: Sequence[Fold], seen: Reference, known: Deviations, odometry: OdometryConfig
 ) -> Noise | None:
-    """Return the noise that a log shows, or None if fewer than two drives show it.
+    """Return the noise that a log shows, or None if fewer than two drives have residuals.
 
     `held` contains the drives, each with parameters that were fitted without this drive. `known`
     contains the standard deviations of track and wheel radii in these parameters.
@@ -379,23 +393,33 @@ class _Window(Struct, frozen=True):
 
     residual: Floats
     start: Floats
-    """Effects of the unknown start pose on the residuals, shape (residuals, unknowns)."""
+    """Change of each residual with each coordinate of the unknown start pose.
+
+    The shape is (residuals, unknowns).
+    """
     motion: _Motion
     along: Floats
-    """Effect of an error of each step's distance on each residual, shape (residuals, steps)."""
+    """Change of each residual if the distance of a step is wrong by 1 m.
+
+    The shape is (residuals, steps).
+    """
     yaw: Floats
-    """Effect of an error of each step's turn on each residual, shape (residuals, steps)."""
+    """Change of each residual if the turn of a step is wrong by 1 rad.
+
+    The shape is (residuals, steps).
+    """
     sensor: dict[Source, Floats]
     """Maps each source of sensor noise to the covariance of the residuals if this noise is 1."""
     bias: Floats | float = 0.0
     """Covariance of the residuals due to the uncertain bias of the gyro; 0 without a gyro."""
 
     def projected(self, known: Deviations) -> tuple[Floats, Floats, Floats]:
-        """Return three arrays: residuals, their covariance by source of noise, known covariance.
+        """Return three arrays without the effect of the unknown start pose, which is projected out.
 
-        The unknown start pose is projected out of all three. The second contains, for each
-        `Source`, the covariance of the residuals if the noise is 1. The known covariance is due to
-        the uncertainty `known` of track and wheel radii, and to the gyro's bias.
+        - The residuals.
+        - For each `Source`, the covariance of the residuals if its noise is 1.
+        - The covariance of the residuals due to the uncertainty `known` of track and wheel radii,
+          and to the uncertain bias of the gyro.
         """
         distance, turn, track = self.motion.distance, self.motion.turn, self.motion.track
         sides = np.maximum(np.abs(distance), track / 2 * np.abs(turn))
@@ -421,7 +445,10 @@ class _Window(Struct, frozen=True):
 def _windows(
     held: Sequence[Fold], seen: Reference, known: Deviations, motions: list[_Motion]
 ) -> Windows | None:
-    """Return the windows of all drives, or None if none exist. Add their motions to `motions`."""
+    """Return the windows of all drives, or None if there are none.
+
+    `held` contains the drives. The motions in the windows are appended to `motions`.
+    """
     rows = []
     for number, fold in enumerate(held):
         for window in _of_drive(fold, seen):
@@ -482,9 +509,11 @@ def _by_headings(
     t: Floats, at: Floats, heading: Heading, way: Path, track: float, headings: Headings,
     parameters: Floats,
 ) -> _Window:  # fmt: skip
-    """Return the window with the residuals of the heading at the times `t`, s.
+    """Return the window whose residuals are those of the heading at the times `t`, s.
 
-    `t` are times on the wheels' clock, and `at` the same moments on the sensor's clock.
+    `t` are times on the wheels' clock, and `at` the same moments on the sensor's clock. `heading`
+    is the heading that the sensor measured, and `way` the path according to the wheels. `track` is
+    the effective track, m.
     """
     motion, since = _Motion.of(t, way, track), t - t[0]
     turned = np.interp(at, heading.t, heading.angle) - parameters[P.BIAS_ERROR] * since
@@ -505,8 +534,8 @@ def _by_places(
     """Yield the window of the positions `place` (x + iy, m), measured at the times `at`, s.
 
     There is a residual for each of the times `t`. It is the median over the positions that are
-    nearer to this time than to the others. If one of the times has no position, no window is
-    yielded.
+    nearer to this time than to the other times. If one of the times has no position, no window is
+    yielded. `way` is the path according to the wheels, and `track` the effective track, m.
     """
     group = np.searchsorted((t[1:] + t[:-1]) / 2, at)
     numbers = range(len(t))

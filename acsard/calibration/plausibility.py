@@ -20,7 +20,7 @@ from acsard.calibration.positions import StartingPoint
 from acsard.calibration.runs import Block
 
 LEAST_ANGLE = 2 * np.pi
-"""Minimum turn of the robot in a whole log, rad. Turns to both sides add up."""
+"""Minimum total turn of the robot in a log, rad. Left turns and right turns are added."""
 
 LEAST_ROLL = 3.0
 """Minimum angle that the wheels must roll in a log, rad.
@@ -46,7 +46,7 @@ DRIVE = (
 )
 
 UNLIKE = 0.5
-"""Largest fraction of a sensor's motion (sum of squares) that the wheels may leave unexplained."""
+"""Largest fraction of a sensor's motion (sum of squares) that may contradict the wheels."""
 
 UNITS = 8.0
 """Largest credible ratio of a measured to a configured value. If it is larger, a unit is wrong."""
@@ -83,13 +83,16 @@ LARGE_BIAS = 0.05
 """Gyro bias, rad/s, above which the bias is reported."""
 
 ONE_SIDED = 0.1
-"""A remark is made if the turns to one side are less than this fraction of those to the other."""
+"""Limit for the ratio of the turns to one side to the turns to the other side.
+
+If the ratio is smaller, a remark says that nearly all turns are to one side.
+"""
 
 ODD_SIZE = 1.25
-"""Smallest factor between the measured and the configured radius that is reported."""
+"""Factor between the measured and the configured wheel radius from which it is reported."""
 
 ODD_RATIO = 1.1
-"""Smallest ratio of the larger to the smaller radius that is reported as unusual."""
+"""Ratio of the larger to the smaller wheel radius from which it is reported as unusual."""
 
 LEAST_TRACK, MOST_TRACK = 0.85, 3.0
 """Usual range of the ratio of effective track to wheel separation. Other ratios are reported."""
@@ -105,9 +108,10 @@ def drives_enough(parts: Sequence[Block]) -> None:
 def rolls_enough(rows: Rows, *, spins: bool = False) -> None:
     """Raise `RefusedError` if the log lacks a movement of the wheels that the fit needs.
 
-    The mean of the left and the right angle, and half their difference, must each add up to
-    `LEAST_ROLL`, and must not be proportional to each other (`ALIKE`). If `spins` is true, a log
-    with only turns in place, in which the mean is nearly 0, is accepted too.
+    Two angles are checked in each interval: the mean of the left and the right angle, and half
+    their difference. Each must add up to `LEAST_ROLL`, and the two must not be proportional to each
+    other (`ALIKE`). If `spins` is true, a log with only turns in place, in which the mean is nearly
+    0, is accepted too.
     """
     together, against = (rows.right + rows.left) / 2, (rows.right - rows.left) / 2
     for rolled, what in ((together, "ahead or back"), (against, "in opposite directions")):
@@ -128,7 +132,10 @@ def rolls_enough(rows: Rows, *, spins: bool = False) -> None:
 
 
 def turns_enough(turned: Floats) -> None:
-    """Raise `RefusedError` if the robot hardly turns. `turned` contains its turns in rad."""
+    """Raise `RefusedError` if the robot hardly turns.
+
+    `turned` contains its turn in each interval of the log, rad.
+    """
     if (angle := float(np.abs(turned).sum())) < LEAST_ANGLE:
         raise RefusedError(
             f"the robot turned by {np.degrees(angle):.0f} deg in total, which is too little to "
@@ -143,7 +150,7 @@ TRACK, RATIO = "the effective track", "the ratio of the left to the right wheel 
 def unsure(
     found: Multipliers, track_std: float, worst: tuple[float, float] = WORST
 ) -> dict[str, float]:
-    """Map each quantity that is too uncertain to its relative standard deviation.
+    """Map the name of each quantity that is too uncertain to its relative standard deviation.
 
     `worst` contains the limits for `TRACK` and `RATIO`. `track_std` is the relative standard
     deviation of the mean track. The track of a single turn varies more.
@@ -164,15 +171,17 @@ def separates_track(fitted: Fit) -> bool:
 def heading_follows(source: str, rows: Rows, base: Base, sides: Floats) -> None:
     """Raise `RefusedError` if the heading sensor's turns differ much from those of the wheels.
 
-    `sides` is the result of `heading.first`.
+    `source` is the name of the sensor. `sides` is the result of `heading.first`, the two factors
+    with which the wheels fit the sensor best.
     """
     spread = float(rows.turned @ rows.turned)
     off = rows.turned - heading.by_sides(rows, base, sides)
     if not spread or float(off @ off) > UNLIKE * spread:
         raise RefusedError(
             f"{source} does not follow the wheels. Check that it is the yaw rate (not roll or "
-            "pitch), that both come from the same run and their clocks differ by less than 2 s, "
-            "that the wheels touched the ground, and that their columns are speeds, not angles"
+            "pitch), that it and the wheel speeds come from the same run, that their clocks differ "
+            "by less than 2 s, that the wheels touched the ground, and that the columns of the "
+            "wheels are speeds, not angles"
         )
 
 
@@ -189,9 +198,12 @@ def positions_follow(begun: StartingPoint) -> None:
 def turns_the_right_way(source: str, sides: Floats | None, begun: StartingPoint | None) -> None:
     """Raise `RefusedError` if wheels and sensors show turns in different directions.
 
-    The error names the sign that is wrong. `source` is the name of the heading sensor, and `sides`
-    is the result of `heading.first`, or None without such a sensor. `begun` is the result of
-    `positions.search`, or None without positions.
+    The text of the error names the sign that is wrong.
+
+    Args:
+        source: the name of the heading sensor.
+        sides: the result of `heading.first`, or None without a heading sensor.
+        begun: the result of `positions.search`, or None without positions.
     """
     by_places = by_heading = ""
     if begun is not None:
@@ -231,10 +243,10 @@ def turns_the_right_way(source: str, sides: Floats | None, begun: StartingPoint 
 
 
 def _wrong_sign(sides: Floats) -> str:
-    """Return the side with a wrong sign: "left" or "right", "turn" for both, or "" for none.
+    """Return the side whose wheel speeds have the wrong sign: "left", "right", or "" for none.
 
-    `sides` contains the factors of the left and of the right side. A negative factor means a wrong
-    sign.
+    Return "turn" if both sides have the wrong sign. `sides` contains the factors of the left and of
+    the right side. A negative factor means a wrong sign.
     """
     left, right = (sides > 0.0).tolist()
     if left:
@@ -295,7 +307,10 @@ def turn_units(source: str, turn: float, bare: float, base: Base) -> None:
 
 
 def distance_units(size: float, base: Base) -> None:
-    """Raise `RefusedError` if `size`, the measured / the configured radius, shows a wrong unit."""
+    """Raise `RefusedError` if the measured size of the wheels shows that a unit must be wrong.
+
+    `size` is the ratio of the measured to the configured wheel radius.
+    """
     if 1 / UNITS < size < UNITS:
         return
     may = (

@@ -37,7 +37,7 @@ JUMP, JUMP_M = 6.0, 0.05
 """Limits for the distance between two successive positions.
 
 This distance may exceed the rolled distance by `JUMP` standard deviations plus `JUMP_M` m. A larger
-distance is a jump, which means that the source of positions erred or has relocalized.
+distance is a jump: the source of the positions was wrong, or it corrected itself.
 """
 
 SPEED_S = 0.05
@@ -88,10 +88,10 @@ class Path(Struct, frozen=True):
     """Derivatives of `heading` by the radii, the inverse track and the track growth."""
 
     def at(self, t: Floats, parameters: Floats) -> tuple[Complexes, Complexes]:
-        """Return a pair: the places of the position sensor, m, and their derivatives.
+        """Return the places of the position sensor at the times `t`, m, and their derivatives.
 
-        `t` contains recorded times, s, which are late by `P.DELAY`. The derivatives are those by
-        the parameters, shape (times, COUNT).
+        `t` contains recorded times, s, which are late by the parameter `P.DELAY`. The derivatives
+        are with respect to the parameters, and have the shape (times, COUNT).
         """
         t = t - parameters[P.DELAY]
         derivatives = np.zeros((len(t), COUNT), dtype=np.complex128)
@@ -116,7 +116,7 @@ class Path(Struct, frozen=True):
 
 
 def segments(driven: Sequence[Run], parts: Sequence[Block]) -> list[Segment]:
-    """Return the positions of each block, split at jumps.
+    """Return the positions of the blocks `parts`, split at jumps of the positions.
 
     Segments with fewer than `LEAST_POINTS` positions are left out.
     """
@@ -180,7 +180,10 @@ def path(steps: WheelSteps, base: Base, parameters: Floats) -> Path:
 
 
 def place(steps: WheelSteps, base: Base, parameters: Floats) -> Complexes:
-    """Return only the places of `path()`, which takes less time. TRACK_GROWTH must be 0."""
+    """Return the places of `path()` without its other results, which takes less time.
+
+    The parameter TRACK_GROWTH must be 0.
+    """
     left, right = parameters[P.LEFT] * steps.left, parameters[P.RIGHT] * steps.right
     _, ahead = _directions(base.gain * parameters[P.INVERSE_TRACK] * (right - left))
     return _sums(ahead * base.radius * (left + right) / 2)
@@ -241,7 +244,10 @@ def aligned(segments: Sequence[Segment], paths: Paths, parameters: Floats) -> It
 def evidence(
     segments: Sequence[Segment], paths: Paths, parameters: Floats, blocks: int
 ) -> Evidence:
-    """Return the evidence of the positions at `parameters`, with which `paths` were computed."""
+    """Return the evidence of the positions, linearized at `parameters`.
+
+    `paths` must be computed with the same parameters. `blocks` is the number of blocks.
+    """
     normal, score = np.zeros((blocks, COUNT, COUNT)), np.zeros((blocks, COUNT))
     squares, counts = np.zeros(blocks), np.zeros(blocks)
     for part in aligned(segments, paths, parameters):
@@ -264,38 +270,42 @@ def spread(segments: Sequence[Segment], paths: Paths, parameters: Floats) -> flo
 
 
 TURNS = np.unique(np.concatenate((np.geomspace(0.03, 10.0, 60), np.geomspace(0.28, 1.4, 40))))
-"""Ratios of configured to true track that the search tries, closer together in the usual range."""
+"""Ratios of configured to true track that the search tries.
+
+They are closer together in the usual range.
+"""
 
 DELAYS = np.arange(-1.5, 1.55, 0.1)
 """Delays of the positions that the search tries, s."""
 
 MOST_SEGMENTS, REFINED_SEGMENTS = 60, 20
-"""Maximum numbers of segments that are used to try starting points, and to refine them.
+"""Maximum number of segments for trying starting points, and maximum number for refining them.
 
-The segments with the largest extent are used.
+If there are more segments, those with the largest extent are used.
 """
 
 MOST_POINTS = 80
 """Approximate number of positions of a segment that the search uses, evenly spaced."""
 
 MOST_REFINED, FAR_WORSE = 4, 20.0
-"""Limits for the starting points that are refined.
+"""Limits for the starting points that are refined: their number, and their badness.
 
-At most `MOST_REFINED` points are refined. Points that are over `FAR_WORSE` times worse than the
-best one are never refined.
+A point is not refined if its badness (see `search`) is more than `FAR_WORSE` times that of the best
+point.
 """
 
 USUAL_TURN = 0.31, 1.25
-"""Usual range of the robot's turn, divided by the turn that wheel radius and separation predict.
+"""Usual range of the robot's turn, divided by the turn that the configured geometry predicts.
 
-A robot that skids much is at the lower end. A robot that does not skid is near the upper end.
+The prediction uses wheel radius and wheel separation without multipliers. A robot that skids much
+is at the lower end. A robot that does not skid is near the upper end.
 """
 
 NEAR_HEADING = 0.8, 1.25
 """Usual range of the turn that positions show, divided by the turn that a heading sensor shows."""
 
 WRONG_WAY = 4.0
-"""Penalty factor if the wheels of one side, or the turns of the robot, seem to be reversed."""
+"""Penalty factor if the wheels of one side seem to roll backwards, or all turns seem reversed."""
 
 NOTHING = 1e-3
 """Number that is added to each `StartingPoint.unexplained` before these values are compared.
@@ -304,7 +314,10 @@ Differences below this number, which are only noise of the positions, then hardl
 """
 
 STRAYED = 1.3
-"""Factor by which a refinement may change the robot's turn. Beyond it, the result is discarded."""
+"""Largest factor by which a refinement may change the robot's turn.
+
+After a larger change, the refinement is discarded.
+"""
 
 COARSE_S = 0.1
 """Time step for integrating paths during the search, s."""
@@ -382,14 +395,18 @@ def _penalty(point: StartingPoint, sides: Floats | None) -> float:
 
 
 def _turn(parameters: Floats) -> float:
-    """Return the turn if only the right wheels roll, by 1 rad. Its unit is `Base.gain` rad."""
+    """Return the robot's turn, in `Base.gain` rad, if only the right wheels roll, by 1 rad."""
     return float(parameters[P.INVERSE_TRACK] * parameters[P.RIGHT])
 
 
 def _timed(
     point: StartingPoint, kept: Sequence[Segment], steps: dict[int, WheelSteps], base: Base
 ) -> StartingPoint:
-    """Return `point` with the delay of the positions, from `DELAYS`, that fits best."""
+    """Return `point` with the delay of the positions that fits best among `DELAYS`.
+
+    `kept` contains the segments that are compared, and `steps` the motion of the wheels in each
+    run.
+    """
     parameters = point.parameters
     shape = float(np.sign(parameters[P.LEFT])), _turn(parameters)
     tried = [_tried(kept, steps, base, (*shape, late)) for late in DELAYS]
@@ -404,8 +421,9 @@ def _tried(
 ) -> StartingPoint:
     """Return the starting point for a shape of the path, with the wheel size that fits best.
 
-    `shape` contains three numbers: the sign of the left side, the ratio of configured to true track
-    (negative if the robot turns opposite to its wheels), and the delay of the positions, s.
+    `kept` contains the segments that are compared, and `steps` the motion of the wheels in each
+    run. `shape` contains three numbers: the sign of the left side, the ratio of configured to true
+    track (negative if the robot turns opposite to its wheels), and the delay of the positions, s.
     """
     parameters = base.start()
     parameters[[P.LEFT, P.RIGHT, P.INVERSE_TRACK, P.DELAY]] = shape[0], 1.0, shape[1], shape[2]
@@ -429,7 +447,11 @@ def _tried(
 def _refined(
     point: StartingPoint, few: Sequence[Segment], steps: dict[int, WheelSteps], base: Base
 ) -> StartingPoint:
-    """Refine `point` by a fit to a few segments. Return `point` if the result is not better."""
+    """Return a starting point that is refined by a fit to the segments `few`.
+
+    Return the parameters of `point` if the refined ones fit worse, or if the turn changed too much
+    (`STRAYED`).
+    """
     segments = [replace(segment, block=number) for number, segment in enumerate(few)]
 
     def source(parameters: Floats) -> Evidence:

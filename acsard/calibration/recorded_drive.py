@@ -40,8 +40,10 @@ OTHER_BAGS = {
     ".bag": (b"#ROSBAG V", "of ROS 1: convert it to a ROS 2 bag in MCAP with `rosbags-convert`"),
     ".zstd": (b"\x28\xb5\x2f\xfd", "that is compressed as a whole file: unpack it with `zstd -d`"),
 }
-"""The kinds of bags that this module cannot read, by file suffix. A value contains the first bytes
-of such a file, and words for the error message."""
+"""The kinds of bags that this module cannot read, by file suffix.
+
+A value contains the first bytes of such a file, and words for the error message.
+"""
 
 
 def calibrated(log: Path, config: Config, tape: Tape | None, choice: Choice) -> Calibration:
@@ -145,9 +147,9 @@ def _messages(file: Path, notes: list[str]) -> Iterator[RosMessage]:
 
 
 def _measured(log: Path) -> bytes:
-    """Return a black-box recording as a CSV table.
+    """Return the CSV table of a black-box recording.
 
-    Raises `LogError` if the recording is unreadable or contains no gyro.
+    Raises `LogError` if the recording is unreadable or contains no gyro samples.
     """
     try:
         recording = Recording(log)

@@ -48,21 +48,27 @@ LEAST_MESSAGES = 20
 """A topic is used only if at least this many of its messages have a value."""
 
 CLOCKS_APART_S = 1.0
-"""Largest difference between the delays of two topics, s. A topic's delay is the median time from
-the stamp of a message to its recording. If two delays differ by more, the stamps come from
-different clocks."""
+"""Largest difference between the delays of two topics with stamps from the same clock, s.
+
+A topic's delay is the median time from the stamp of a message to its recording.
+"""
 
 STEP_S = 1.0
 """Length of the intervals in which a sensor's turns are compared with those of the wheels, s."""
 
 UPRIGHT, LYING = 0.5, 0.8
-"""Limits for the absolute correlation between the turns about an IMU axis and the turns that the
-wheels show. If the correlation is below `UPRIGHT` for the chosen axis and above `LYING` for another
-axis, the IMU lies on its side, and the log is refused."""
+"""Limits for the absolute correlation between turns about an IMU axis and turns of the wheels.
+
+The log is refused if the correlation is below `UPRIGHT` for the chosen axis and above `LYING` for
+another axis, because the IMU then lies on its side.
+"""
 
 OWN = 3e-3
-"""RMS difference between the turns of an `Odometry` and of the wheels, divided by the RMS turn. If
-the quotient is at most `OWN`, the `Odometry` was computed from the wheels."""
+"""Limit for the RMS difference between the turns of an `Odometry` and those of the wheels.
+
+The difference is divided by the RMS turn. Up to this limit, the `Odometry` counts as computed from
+the wheels.
+"""
 
 DELAYS_S = np.arange(-0.1, 0.101, 0.01)
 """Delays of an `Odometry` relative to the wheels, s. `_computed_from` tries each of them."""
@@ -188,7 +194,10 @@ _NO_WHEEL = ("caster", "castor", "steer")
 
 
 def wheel_of(joint: str) -> str:
-    """Return the log column, such as "fl" or "left", that a joint's name means; "" if none."""
+    """Return the log column for the wheel that a joint's name means, such as "fl" or "left".
+
+    Return "" if the name does not mean a wheel.
+    """
     name = re.sub(r"([a-z])([A-Z])", r"\1_\2", joint).lower()
     if any(word in name for word in _NO_WHEEL):
         return ""
@@ -223,9 +232,10 @@ def wheel_joints(names: tuple[str, ...], joints: tuple[str, ...]) -> dict[str, l
 
 
 def table(messages: Iterable[RosMessage], joints: Sequence[str], choice: Choice) -> Table:
-    """Build the table of a log from the messages of a bag. Raises `LogError`.
+    """Build the table of a log from the messages of a bag.
 
-    `joints` contains the configured names of the wheel joints, in the order of `FOUR`.
+    `joints` contains the configured names of the wheel joints, in the order of `FOUR`. Raises
+    `LogError` if the bag lacks usable data or its topics are ambiguous.
     """
     topics: dict[str, _Topic] = {}
     others: dict[str, str] = {}
@@ -277,7 +287,10 @@ class _Log:
     # Choice of the topics
 
     def _chosen(self) -> tuple[_Topic, _Topic | None, _Topic | None]:
-        """Return the topics of the wheels, the gyro and the positions. Raises `LogError`."""
+        """Return the topics of the wheels, the gyro and the positions.
+
+        Raises `LogError` if a needed topic is missing, has too few messages, or is ambiguous.
+        """
         names = self._choice.topics
         known = {topic.name: topic for topic in self._topics}
         for name in names:
@@ -318,9 +331,9 @@ class _Log:
     def _one(self, what: str, fit: Sequence[_Topic], *, free: bool = True) -> _Topic | None:
         """Return the topic to use among `fit`, or None. Topics that the user named take precedence.
 
-        `what` names the topic's role in error messages. If `free` is false, only a topic that the
-        user named is used. Raises `LogError` if several topics remain, or if the topic has too few
-        messages.
+        `what` names the data in error messages, such as "the wheels". If `free` is false, only a
+        topic that the user named is used. Raises `LogError` if several topics remain, or if the
+        topic has too few messages.
         """
         named = [topic for topic in fit if topic.name in self._choice.topics]
         for topic in named:
@@ -520,7 +533,10 @@ def _edges(t: Floats, sides: tuple[Floats, Floats, Floats]) -> Floats:
 
 
 def _follows(t: Floats, rates: Floats, sides: tuple[Floats, Floats, Floats]) -> float:
-    """Return the correlation between a sensor's turns and those of the wheels; NaN if unknown."""
+    """Return the correlation between a sensor's turns and those of the wheels; NaN if unknown.
+
+    `rates` contains the sensor's turn rates at the times `t`, s. `sides` is the result of `_sides`.
+    """
     order = np.argsort(t, kind="stable")
     edges = _edges(t, sides)
     if len(edges) < 4:
@@ -534,7 +550,10 @@ def _follows(t: Floats, rates: Floats, sides: tuple[Floats, Floats, Floats]) -> 
 
 
 def _computed_from(t: Floats, yaw: Floats, sides: tuple[Floats, Floats, Floats]) -> bool:
-    """Return whether the yaw, rad, follows the wheels so exactly that it was computed from them."""
+    """Return whether the yaw follows the wheels so exactly that it was computed from them.
+
+    `yaw`, rad, was measured at the times `t`, s. `sides` is the result of `_sides`.
+    """
     held = np.isfinite(yaw)
     order = np.argsort(t[held], kind="stable")
     times, angle = t[held][order], np.unwrap(yaw[held][order])

@@ -30,8 +30,11 @@ RESTART_S = 1.0
 """Smallest backward step of the times in a log, s, that may be a restart of the recording."""
 
 FEW_RESTARTS = 100
-"""Maximum number of restarts in a log. If the times jump back more often, the rows are taken as
-unsorted rows of one recording."""
+"""Maximum number of restarts in a log.
+
+If the times jump back more often, the log counts as one recording whose rows are not sorted by
+time.
+"""
 
 SLOWEST_S = 0.7
 """Longest period of wheel samples, s. If it is longer, the times are probably not in seconds."""
@@ -43,14 +46,19 @@ PAUSE_S = 60.0
 """Time without a wheel sample after which a new run begins, s."""
 
 ROUNDED_S, REPEATED = 0.2, 4.0
-"""The times in the column `t` were rounded if the median interval between different times exceeds
-`ROUNDED_S`, s, and if on average more than `REPEATED` rows share a time."""
+"""Limits that show that the times in the column `t` were rounded.
+
+They were rounded if the median interval between different times exceeds `ROUNDED_S`, s, and if on
+average more than `REPEATED` rows have the same time.
+"""
 
 ROLLING, AGAIN = 0.2, 0.4
-"""The wheels roll if the absolute speeds of the left and the right side add up to more than
-`ROLLING` rad/s. The logger has repeated old positions (or yaws) if, while the wheels roll, more
-than the fraction `AGAIN` of the rows have the same value as the row before. Such rows are
-removed."""
+"""Limits that show that the logger repeated old positions or yaws. Such rows are removed.
+
+The wheels roll if the absolute speeds of the left and the right side add up to more than `ROLLING`
+rad/s. The logger repeats values if, while the wheels roll, more than the fraction `AGAIN` of the
+rows have the same value as the row before.
+"""
 
 WHEELS = "left right"
 COMMANDS = " ".join(APPLIED)
@@ -67,11 +75,18 @@ TOGETHER = 50
 """Number of rows whose speeds are summed before the two wheels of a side are compared."""
 
 NOTED, APART = 0.15, 0.8
-"""Limits for the difference between the front and the rear wheel of a side, as a fraction of the
-distance rolled. The report mentions a difference above `NOTED`. Above `APART` a log is refused."""
+"""Limits for the difference between the front and the rear wheel of a side.
+
+They are fractions of the distance rolled. The report mentions a difference above `NOTED`. A log
+with a difference above `APART` is refused.
+"""
 
 GAP_S, GAP_PERIODS = 0.3, 5.0
-"""An interval between samples is a gap if it exceeds `GAP_S` s and `GAP_PERIODS` median periods."""
+"""Limits for the interval between two samples.
+
+An interval is a gap if it exceeds `GAP_S` s and also exceeds `GAP_PERIODS` times the median
+interval.
+"""
 
 STILL = 0.02
 """Largest speed at which a wheel is considered to stand still, rad/s."""
@@ -84,8 +99,11 @@ LONGEST_S = 12.0
 """Maximum length of a block, s, unless the caller of `blocks()` asks for longer blocks."""
 
 SMOOTH_S = 0.3
-"""Time over which a wheel speed is averaged before it is squared, s. Otherwise the speeds of a
-coarse encoder would be 0 in some samples and far too large in others."""
+"""Time over which a wheel speed is averaged before it is squared, s.
+
+Without this average, the speeds of a coarse encoder would be 0 in some samples and far too large in
+others.
+"""
 
 LEAST_TURN = 0.2
 """A block is left out if the wheels of each side roll by less than this angle in it, rad."""
@@ -123,14 +141,14 @@ class Run(Struct, frozen=True, dict=True):
 
     @cached_property
     def gaps(self) -> Floats:
-        """The gaps between the wheel samples, one row (begin, end) each, in s."""
+        """Long intervals without a wheel sample, one row (begin, end) for each, s. See `gaps()`."""
         return gaps(self.t)
 
     @cached_property
     def rolled(self) -> tuple[Floats, Floats]:
         """A pair: the angles that the left and the right wheels have rolled since the start, rad.
 
-        Both arrays have a value for each of the times `t`. They stay constant across a gap in the
+        Both arrays have a value for each of the times `t`. They stay constant during a gap in the
         samples.
         """
         steps = np.diff(self.t)
@@ -144,15 +162,18 @@ class Run(Struct, frozen=True, dict=True):
         return np.asarray((np.abs(self.left) > STILL) | (np.abs(self.right) > STILL))
 
     def angles(self, t: Floats) -> tuple[Floats, Floats]:
-        """Return a pair: the angles that the left and the right wheels have rolled up to `t`, rad.
+        """Return the angles that the left and the right wheels have rolled at the times `t`, rad.
 
-        `t` contains times, s.
+        Times and angles count from the start of the run. `t` is in s.
         """
         left, right = self.rolled
         return np.interp(t, self.t, left), np.interp(t, self.t, right)
 
     def speed_difference(self, t: Floats) -> Floats:
-        """Return the right minus the left wheel speed, averaged over `SMOOTH_S`, rad/s."""
+        """Return the speed of the right minus that of the left wheels at the times `t`, rad/s.
+
+        It is averaged over `SMOOTH_S`.
+        """
         begin, end = (np.clip(t + s / 2, self.t[0], self.t[-1]) for s in (-SMOOTH_S, SMOOTH_S))
         (left, right), (far_left, far_right) = self.angles(begin), self.angles(end)
         turned = far_right - right - (far_left - left)
@@ -285,7 +306,9 @@ def _restarts(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
     """Split `rows` where the times `t` jump back. Return the rows of each drive.
 
     Only the times of rows with wheel speeds are checked. The times of other rows may jump back
-    within a drive, because a file may list all rows of one sensor after all rows of another.
+    within a drive, because a file may list all rows of one sensor after all rows of another. The
+    rows stay together if there are more than `FEW_RESTARTS` jumps, or if the parts do not overlap
+    in time, because they are then unsorted rows of one drive.
     """
     wheels = rows[np.isfinite(columns["left"][rows]) & np.isfinite(columns["right"][rows])]
     back = np.flatnonzero(np.diff(t[wheels]) < -RESTART_S) + 1
@@ -383,10 +406,10 @@ def _remove_repeats(drives: Iterable[tuple[str, Streams]], notes: Notes) -> None
 
 
 def _repeats(streams: Streams, what: str) -> tuple[Mask, Mask]:
-    """Return a pair of masks of a sensor's samples, in the order of time.
+    """Return two masks of the samples of the sensor `what`, in the order of time.
 
-    The first is true if a sample repeats the sample before it. The second is true if the wheels
-    roll at the time of the sample.
+    The first is true if a sample has the same values as the sample before it. The second is true if
+    the wheels roll at the time of the sample.
     """
     t, *values = streams[what]
     if not len(t):
@@ -421,7 +444,7 @@ def _ordered(stream: list[Floats], what: str, notes: Notes) -> Iterator[Floats]:
     order = np.argsort(t, kind="stable")
     times, first = np.unique(t[order], return_index=True)
     notes.add(
-        f"{{}} rows of {what} repeat a time: the first row of each time is used",
+        f"{{}} rows of {what} are left out, because an earlier row has the same time",
         len(t) - len(times),
     )
     yield times
@@ -440,7 +463,11 @@ class Block(Struct, frozen=True):
 
 
 def gaps(t: Floats) -> Floats:
-    """Return the gaps between the sample times `t`, one row (begin, end) each, in s."""
+    """Return the gaps in the samples with the times `t`, s, one row (begin, end) for each gap.
+
+    A gap is an interval between two samples that is much longer than usual (`GAP_S`,
+    `GAP_PERIODS`).
+    """
     steps = np.diff(t)
     if not len(steps):
         return np.zeros((0, 2))
@@ -449,7 +476,7 @@ def gaps(t: Floats) -> Floats:
 
 
 def inside(begin: Floats, end: Floats, holes: Floats) -> Mask:
-    """Return a mask of the intervals that do not touch any gap.
+    """Return a mask of the intervals that do not overlap a gap.
 
     `begin` and `end` contain the limits of the intervals. `holes` has a row (begin, end) for each
     gap, as `gaps()` returns them.
@@ -465,7 +492,7 @@ def cumulative(steps: Floats) -> Floats:
 
 
 def rests(run: Run, least_s: float, edge_s: float) -> Floats:
-    """Return the intervals in which all wheels stand still, one row (begin, end) each, in s.
+    """Return the intervals in which all wheels stand still, one row (begin, end) for each, s.
 
     Each interval is shortened by `edge_s` s at each end. It is left out if it is then shorter than
     `least_s` s.
@@ -478,7 +505,7 @@ def rests(run: Run, least_s: float, edge_s: float) -> Floats:
 
 
 def blocks(driven: Sequence[Run], shortest_s: float) -> list[Block]:
-    """Return the blocks of all runs, without those in which the robot hardly moved.
+    """Return the blocks of all runs, without the blocks in which the robot hardly moved.
 
     A block is about `shortest_s` long. If the log would then have more than `BLOCKS` blocks, the
     blocks are longer, up to `LONGEST_S`.
@@ -501,9 +528,10 @@ def blocks(driven: Sequence[Run], shortest_s: float) -> list[Block]:
 
 
 def _turned(run: Run, begin: float, end: float, left: Floats, right: Floats) -> bool:
-    """Return whether the wheels of a side rolled by `LEAST_TURN` from `begin` to `end`, s.
+    """Return whether the wheels of a side rolled by at least `LEAST_TURN` from `begin` to `end`, s.
 
-    `left` and `right` contain the rolled angles at both times, rad. Angles back and ahead add up.
+    `left` and `right` contain the rolled angles at both times, rad. Rolling back and rolling ahead
+    are added.
     """
     if max(abs(left[1] - left[0]), abs(right[1] - right[0])) >= LEAST_TURN:
         return True

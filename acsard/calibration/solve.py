@@ -43,20 +43,26 @@ from acsard.core.config.settings import DriveConfig, FeedbackConfig, OdometryCon
 from acsard.core.values import AcsardError
 
 LENGTHS_S = (4.0, 8.0, 16.0, 32.0, 64.0)
-"""Block lengths to try, s. The tool uses the length that improves the odometry most. Short blocks
-suit accurate positions. Long blocks suit coarse positions, and wheels whose errors hide small
-turns. Without positions, the tool tries only the shortest length. With positions but no heading
-sensor, it does not try the shortest length."""
+"""Block lengths to try, s. The tool uses the length that improves the odometry most.
+
+Short blocks suit accurate positions. Long blocks suit coarse positions, and wheels whose errors
+hide small turns. Without positions, the tool tries only the shortest length. With positions but no
+heading sensor, it does not try the shortest length.
+"""
 
 ENOUGH_BLOCKS = 8
-"""Minimum number of blocks. A block length that gives fewer is not tried if a shorter length has
-already given a fit. With six blocks, the standard deviation of the ratio of the radii was up to
-three times too small."""
+"""Minimum number of blocks.
+
+A block length that gives fewer blocks is not tried if a shorter length has already given a fit.
+With six blocks, the standard deviation of the ratio of the radii was up to three times too small.
+"""
 
 # For comparison: on a good floor, motion capture differs from the wheels by less than 1e-3.
 PERFECT = 1e-4
-"""Smallest credible difference between a sensor and the wheels, as a fraction of the motion. A
-sensor with a smaller difference was probably computed from the wheels."""
+"""Smallest credible difference between a sensor and the wheels, as a fraction of the motion.
+
+A sensor with a smaller difference was probably computed from the wheels.
+"""
 
 
 class Drives(Struct, frozen=True):
@@ -64,8 +70,10 @@ class Drives(Struct, frozen=True):
     seconds: float
     metres: float
     turns: float
-    """Sum of all left and right turns of the robot according to the calibrated wheels, in units of
-    360 deg."""
+    """Sum of all left and right turns of the robot, as a number of turns of 360 deg.
+
+    The turns are those of the calibrated wheels.
+    """
     fastest: float
     """Turn rate below which the robot turned 95 % of its total turned angle, rad/s."""
 
@@ -91,32 +99,46 @@ class Calibration(Struct, frozen=True):
     """The result of a calibration. Each standard deviation has the unit of its quantity."""
 
     reference: str
-    """The sensors, or the measuring tool, with which the wheels were compared, in words."""
+    """Names of the sensors, or of the measuring tool, with which the wheels were compared.
+
+    Examples are "yaw_rate and positions" and "a tape".
+    """
     drives: Drives
     configured: Multipliers
     multipliers: Multipliers
     """New multipliers of the wheel separation and of the two wheel radii."""
     scale: str
-    """Measurement that shows the size of the wheels: "positions", "distance" (by tape), "positions
-    and distance", or "" if nothing was measured that shows it."""
+    """Measurements that show the size of the wheels: "positions", "distance" (by tape), or both.
+
+    "positions and distance" means both, and "" means that nothing shows the size.
+    """
     growth: float
     """Fraction by which the effective track grows with each rad/s of turn rate."""
     growth_std: float
     improvement: Improvement
     delays: dict[str, float]
-    """Delay of each sensor's times relative to those of the wheels, s, by the sensor's name."""
+    """Maps the name of each sensor to its delay, s.
+
+    The delay is the time by which the sensor's recorded times are later than those of the wheels
+    for the same event.
+    """
     gyro_bias: float
     """Gyro bias, rad/s; 0 without a gyro."""
     notes: tuple[str, ...]
     odometry: dict[str, float]
-    """New settings of `[odometry]`: the uncertainty of the geometry. They also contain the noise if
-    `Noise.better` is true."""
+    """New settings of `[odometry]`, by name: the uncertainty of the wheel radii and of the track.
+
+    They include the noise settings if `Noise.better` is true.
+    """
     kept: tuple[str, ...] = ()
     """Names of the quantities that stay as configured: `plausibility.TRACK`, `RATIO` or both."""
     feedback: dict[str, float] = {}
-    """New settings of `[feedback]`; empty unless the present ones cause false wheel faults."""
+    """New settings of `[feedback]`, by name.
+
+    It is empty unless the configured settings would cause false wheel faults and better ones exist.
+    """
     noise: Noise | None = None
-    """Noise of the odometry in this log; None if the log does not show it."""
+    """Noise of the odometry that this log shows; None if the log does not show it."""
 
 
 def calibrate(
@@ -155,8 +177,11 @@ class Prepared(Struct, frozen=True):
     base: Base
     parts: list[Block]
     rows: Rows
-    """Motion in intervals of about 1 s. The gyro's bias has been subtracted from the turns, unless
-    the bias is unknown (`Headings.bias_unknown`)."""
+    """Motion in intervals of about 1 s.
+
+    The gyro's bias has been subtracted from the turns, unless the bias is unknown
+    (`Headings.bias_unknown`).
+    """
     segments: list[Segment]
     """The measured positions; empty if the log has none."""
     steps: list[WheelSteps]
@@ -230,7 +255,7 @@ def _check_units(headings: Headings | None, start: Floats, base: Base, sized: bo
 
 
 class Candidate(Struct, frozen=True):
-    """A fit to blocks of one length, and the improvement of the odometry (cross-validated)."""
+    """A fit to blocks of one length, and the improvement that it brings, by cross-validation."""
 
     made: Prepared
     fitted: Fit
@@ -244,8 +269,11 @@ class Candidate(Struct, frozen=True):
     result: Multipliers
     improvement: Improvement
     kept: dict[str, float]
-    """Maps each quantity that stays as configured, `plausibility.TRACK` or `RATIO`, to the relative
-    standard deviation with which the log determines it; inf if this is unknown."""
+    """Maps the name of each quantity that stays as configured to a relative standard deviation.
+
+    The names are `plausibility.TRACK` and `RATIO`. The deviation is the one with which the log
+    determines the quantity; inf if this is unknown.
+    """
 
 
 def _calibrated(
@@ -294,9 +322,10 @@ def _known(best: Candidate, odometry: OdometryConfig) -> Deviations:
 def _noise(
     best: Candidate, known: Deviations, odometry: OdometryConfig, *, present: bool
 ) -> Noise | None:
-    """Return the noise of the odometry in this log, or None if the log does not show the noise.
+    """Return the noise of the odometry that this log shows, or None if the log does not show it.
 
-    If `present` is true, the odometry is computed with the configured geometry, not the fitted one.
+    If `present` is true, the path of the wheels is computed with the configured geometry instead of
+    the fitted one.
     """
     made, fitted = best.made, best.fitted
     held = folds(fitted, made.parts, drives(made.runs), best.rate)
@@ -353,7 +382,7 @@ def _candidates(made: Prepared) -> list[Candidate]:
 
 
 def _held(base: Base) -> dict[str, list[Held]]:
-    """Map each quantity that can stay as configured to the constraints that keep it so.
+    """Map each quantity that a fit can keep as configured to the constraints that keep it.
 
     The name "" stands for a fit without constraints.
     """

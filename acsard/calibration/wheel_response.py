@@ -10,7 +10,7 @@ If a wheel contradicts this for `feedback.fault_time`, the daemon reports a faul
 This module tries several response times, and takes the one that fits best. It assumes that the
 wheels of the log are healthy. With the configured response time, it runs the daemon's own fault
 detection (`core/motion/wheel_witness.py`) on the log. It measures the longest time for which this
-detection takes a wheel for faulty.
+detection considers a wheel faulty.
 """
 
 from __future__ import annotations
@@ -34,34 +34,49 @@ TRIED = np.geomspace(0.01, 5.0, 60)
 """Response times that are tried, s. They cover the range of `feedback.response_time`."""
 
 LEAST_ROWS, MOST_ROWS = 200, 30_000
-"""Minimum number of wheel samples in a log, and the most that are used: 5 minutes at 100 Hz."""
+"""Minimum number of wheel samples in a log, and maximum number that is used.
+
+The maximum is 5 minutes at 100 Hz.
+"""
 
 FOLLOWS = 0.5
 """Largest fraction of the sum of squared wheel speeds that the model may leave unexplained."""
 
 SPARE = 0.5
-"""Longest time for which a wheel may look faulty with the proposed response time, as a fraction of
-`feedback.fault_time`."""
+"""Limit for the time in which a wheel looks faulty, as a fraction of `feedback.fault_time`.
+
+The proposed response time keeps within this limit.
+"""
 
 STEADY_S, REACHED, CONSTANT = 1.0, 0.9, 0.03
-"""A wheel turns as fast as it can if its speed stays below `REACHED` times its command for at least
-2 * `STEADY_S` s, and changes by less than the fraction `CONSTANT` in the last `STEADY_S` s."""
+"""Limits that show that a wheel turns as fast as it can.
+
+Its speed stays below `REACHED` times its command for at least 2 * `STEADY_S` s, and changes by less
+than the fraction `CONSTANT` in the last `STEADY_S` s.
+"""
 
 SAME = 1.5
-"""The fitted and the configured response time count as equal up to this factor."""
+"""Largest factor between the fitted and the configured response time.
+
+Up to this factor, the report says that they agree.
+"""
 
 
 class WheelResponse(Struct, frozen=True):
     seconds: float
     """Response time that fits best, s."""
     proposed: float | None
-    """Response time to configure, s. It is the smallest of the times `TRIED` from `seconds` up that
-    satisfies `SPARE`. None if `false_fault` is false, or if there is no such time."""
+    """Response time to configure, s; None if the configured one must not change or none is good.
+
+    It is the smallest time in `TRIED` that is at least `seconds` and keeps within `SPARE`.
+    """
     present: float
     """Configured response time, s."""
     false_fault: bool
-    """Whether the daemon would report a fault in this log with the configured response time,
-    although the wheels are assumed to be healthy."""
+    """Whether the daemon would report a fault in this log with the configured response time.
+
+    Such a fault would be false, because the wheels are assumed to be healthy.
+    """
     fastest: float
     """Highest speed that the wheels reach, rad/s, or infinity if the log shows no such limit."""
 
@@ -72,7 +87,10 @@ class WheelResponse(Struct, frozen=True):
         return {"response_time": self.proposed}
 
     def sentences(self) -> list[str]:
-        """Return a sentence about the response time. If `fastest` is finite, add one about it."""
+        """Return a sentence about the response time.
+
+        If `fastest` is finite, return a second sentence about `limits.wheel_speed`.
+        """
         follow = f"the wheels follow their commands with a response time of {self.seconds:.2g} s"
         if self.false_fault:
             then = (
@@ -85,8 +103,8 @@ class WheelResponse(Struct, frozen=True):
                 then += "first lower limits.wheel_speed as the next note says"
             else:
                 then += (
-                    "even longer response times leave too little reserve; if the wheels are "
-                    "healthy, raise feedback.fault_time"
+                    "a longer response time would not prevent this with enough reserve; if the "
+                    "wheels are healthy, raise feedback.fault_time"
                 )
         elif max(self.seconds / self.present, self.present / self.seconds) > SAME:
             then = (
@@ -157,7 +175,10 @@ def _commanded(run: Run, drive: DriveConfig) -> tuple[Floats, Floats, Floats]:
 
 
 def _expected(steps: Floats, wanted: Floats, seen: Floats) -> Floats:
-    """Return the expected speeds, rad/s, for each time in `TRIED`; shape (samples, 2, times)."""
+    """Return the speeds of the wheels that each response time in `TRIED` predicts, rad/s.
+
+    The arguments are results of `_commanded`. The shape of the result is (samples, 2, times).
+    """
     expected = np.empty((*wanted.shape, len(TRIED)))
     last = np.zeros((2, len(TRIED)))
     for number, step in enumerate(steps):
@@ -172,7 +193,10 @@ def _expected(steps: Floats, wanted: Floats, seen: Floats) -> Floats:
 def _evidence(
     parts: Sequence[tuple[Floats, Floats, Floats]], response_time: float, fault_time: float
 ) -> float:
-    """Return the longest time, s, for which the daemon's detection takes a wheel for faulty."""
+    """Return the longest time, s, for which the daemon's fault detection considers a wheel faulty.
+
+    `parts` contains the results of `_commanded`.
+    """
     longest, most = 0.0, fault_time / LINES_OF_EVIDENCE
     for steps, wanted, seen in parts:
         sides = [(Expected(), Witness()) for _ in range(2)]
@@ -190,7 +214,10 @@ def _evidence(
 
 
 def _fastest(parts: Sequence[tuple[Floats, Floats, Floats]]) -> float:
-    """Return the highest steady speed of a wheel below its command, rad/s; inf if there is none."""
+    """Return the highest steady speed of a wheel that stays below its command, rad/s.
+
+    Return infinity if there is none. `parts` contains the results of `_commanded`.
+    """
     found: list[float] = []
     for steps, wanted, seen in parts:
         for told, speed in zip(wanted.T, np.abs(seen.T), strict=True):

@@ -17,23 +17,27 @@ STATES = ("refused", "waits", "sends", "drives")
 """States of a command source that is not silent.
 
 In the state `sends`, the robot accepts the source's commands, but the source does not drive. If
-short spans of time are merged, the merged span has the first of their states in this order.
+neighboring spans of time with different states are merged, the merged span has the state that comes
+first in this tuple.
 """
 
 MOVES = ("ready", "driving")
-"""Modes in which the robot follows a source. In the other modes it follows no source."""
+"""Modes in which the robot can follow a source. In the other modes it follows no source."""
 
 OTHERS = "others"
 """Common name of all command sources that are not in the configuration."""
 
 SAMPLE_S = 0.1
-"""Time between two samples of the sources' states, s. A new mode or source is sampled earlier."""
+"""Time between two samples of the sources' states, s.
+
+A change of the mode, its reason, the link or the driving source causes a sample at once.
+"""
 
 MAX_TEXT = 300
-"""Maximum number of characters that are kept of a sentence or a name in a recording."""
+"""Maximum length of a sentence or name from a recording, characters. The rest is cut off."""
 
 MAX_SENDERS = 256
-"""Maximum number of senders whose last command is kept."""
+"""Maximum number of senders of which the last command is kept."""
 
 
 class CommandSources:
@@ -59,7 +63,7 @@ class CommandSources:
     def take_commands(self, step: Step, t: float, robot: Robot) -> bool:
         """Process the commands of a step at time `t`, s. `robot` is the robot after the step.
 
-        Return True if a source was refused, so that the states need a new sample.
+        Return True if a command was refused. The caller then takes a new sample of the states.
         """
         commands, before = step.inputs.commands, dict(self._refused)
         for command in commands:
@@ -77,8 +81,8 @@ class CommandSources:
     def _find_refused(self, step: Step, t: float, robot: Robot) -> None:
         """Find the commands of this step that the robot refused, and mark their sources as refused.
 
-        The robot's counters give the reasons, but not the sources. A source was refused if its last
-        accepted command is older than its command of this step.
+        The robot's counters show the reasons, but not the sources. A source counts as refused if
+        the last command that the robot accepted from it is older than its command in this step.
         """
         counted = Counter({name: robot.counters[f"command_{name}"] for name in REFUSED})
         new, self._counted = counted - self._counted, counted

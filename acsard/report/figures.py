@@ -34,7 +34,7 @@ from acsard.report.plot_elements import (
 from acsard.report.report_data import Mark, Marks, ReportData
 
 ROW_PX, AXIS_PX = 54, 68
-"""Height of each row in the picture of the sources, and additional height for its time axis, px."""
+"""Height of each row in the picture of the sources, px, and additional height for the time axis."""
 
 
 class Line(NamedTuple):
@@ -56,12 +56,16 @@ GAP_PX = 30
 """Height of the gap above each diagram of a picture, px. The gap holds the diagram's title."""
 
 LEAST_LINEAR, LEAST_ANGULAR = 0.1, 0.2
-"""Smallest span of the scale of the forward speed, m/s, and of that of the turn rate, rad/s.
-Otherwise the scale of a robot that never moves would be empty."""
+"""Smallest spans of the scales of the forward speed, m/s, and of the turn rate, rad/s.
+
+Otherwise the scale of a robot that never moves would be empty.
+"""
 
 BENEATH = 3.4
-"""Width of a curve that another curve nearly covers, px. The wide curve stays visible on both sides
-of the other curve."""
+"""Width of a curve that lies under another curve, px.
+
+It is wide, so that it stays visible on both sides of the other curve.
+"""
 
 
 class Clip(NamedTuple):
@@ -76,25 +80,27 @@ class Clip(NamedTuple):
 
 
 MARKS_APART = 0.02
-"""Smallest distance between the triangles of two excursions, as a fraction of the diagram's
-width."""
+"""Smallest distance between two excursions, as a fraction of the diagram's width.
+
+Excursions that are closer count as one and have one triangle.
+"""
 
 HEADROOM = 0.5
 """Space in a diagram above and below the limited and measured speeds, as a fraction of their span.
 
-A commanded speed that the robot reaches after a ramp stays visible in this space, but a command of
-99 m/s does not flatten the other curves.
+It shows a commanded speed that the robot reaches only after a ramp. The scale is limited, so that a
+command of 99 m/s does not flatten the other curves.
 """
 
 
 def clipped(
     points: Sequence[Point], others: Sequence[Sequence[Point]], least: float, gap: float
 ) -> tuple[list[Point], list[Clip]]:
-    """Limit a curve to the scale of a diagram. Return a pair: this curve, and its excursions.
+    """Limit a curve to the scale of a diagram. Return the limited curve, and its excursions.
 
     Args:
         points: the curve; NaN interrupts it.
-        others: the curves that determine the scale; `HEADROOM` is added to their span.
+        others: the curves that determine the scale. `HEADROOM` is added above and below their span.
         least: smallest span of the scale.
         gap: excursions beyond the same edge that are at most this time apart count as one, s.
     """
@@ -116,7 +122,7 @@ def clipped(
 
 
 class Part(NamedTuple):
-    """One of several diagrams in a picture, which share the time axis."""
+    """One of the diagrams in a picture. All diagrams of a picture share the time axis."""
 
     title: str
     lines: list[Line]
@@ -131,7 +137,10 @@ DRIVES = "drives"
 
 
 class BandStyle(NamedTuple):
-    """Appearance of the bands that show one state. The state "drives" has a style per source."""
+    """Appearance of the bands that show one state.
+
+    The state "drives" has a style for each source that drove.
+    """
 
     kind: str
     """State that the bands show, such as "drives"."""
@@ -185,8 +194,10 @@ NOTED = {
     "link_stale": ("▲", "triangle-up", "#e0b400"),
     "link_late": ("⬟", "pentagon", "#8f4f22"),
 }
-"""Events that are drawn on the path, by name. A value contains the symbol, plotly's name for this
-symbol, and the color."""
+"""Events that are drawn on the path, by name.
+
+A value contains the symbol in the legend, plotly's name for this symbol, and the color.
+"""
 
 
 def path_figure(data: ReportData) -> Figure:
@@ -213,7 +224,7 @@ def path_figure(data: ReportData) -> Figure:
         "margin": {"l": 58, "r": 12, "t": 8, "b": 48},
     }
     caption = (
-        "This is the path by odometry. Both axes are in m and have the same scale."
+        "Odometry computed this path. Both axes are in m and have the same scale."
         if places
         else "There is no valid feedback, so the path is unknown."
     )
@@ -395,7 +406,10 @@ class TimeFigures:
         return Figure("sources", title, caption, _keys(styles), height, traces, axes)
 
     def _bars(self, style: BandStyle, spans: list[tuple[int, Span]]) -> Trace:
-        """Draw the spans of one style. Each pair in `spans` is the number of a row and a span."""
+        """Draw the spans of one style.
+
+        Each element of `spans` is a pair: the number of a row, and a span in this row.
+        """
         kind, colour = style.kind, style.colour
         # The border line keeps even a very short band visible.
         marker: dict[str, Any] = {"color": colour, "line": {"color": colour, "width": 1}}
@@ -461,7 +475,7 @@ class TimeFigures:
         return layout() | {"xaxis": axis, "margin": {"l": 44, "r": 12, "t": 8, "b": 44}}
 
     def _stack(self, name: str, title: str, caption: str, parts: list[Part], px: int) -> Figure:
-        """Draw the parts below each other, each `px` high, with one time axis and one legend."""
+        """Draw diagrams below each other, each `px` px high, with one time axis and one legend."""
         traces, notes = list[Trace](), list[dict[str, Any]]()
         axes = self._timed()
         axes["margin"] |= {"t": GAP_PX}
@@ -508,7 +522,7 @@ class TimeFigures:
 
 
 def _hover(name: str, values: Sequence[float]) -> dict[str, Any]:
-    """Return plotly's hover text: the curve's name, the time, and the value at the pointer.
+    """Return plotly's settings for the text at the pointer: the curve's name, a value and the time.
 
     The value is one of `values`, or y if `values` is empty.
     """

@@ -124,7 +124,7 @@ addEventListener("afterprint", () => paper(false));
 
 
 MAX_OPEN = 40
-"""The list of events is unfolded when the page loads if it has at most this number of events."""
+"""Maximum number of events for which the list of events is unfolded when the page loads."""
 
 
 def escaped(text: str) -> str:
@@ -137,7 +137,8 @@ def page(
 ) -> str:
     """Return the report as the text of one HTML file.
 
-    `library` is the code of plotly, and `offset_s` is the offset of the local time from UTC, s.
+    `library` is the code of plotly. `clock` formats times as local time. `offset_s` is the offset
+    of the local time from UTC, s.
     """
     figures = TimeFigures(data, offset_s).all()
     title = escaped(f"{origin.robot}, {clock(data.began or 0.0, True)}")
@@ -263,7 +264,7 @@ def _events(data: ReportData, clock: Clock) -> str:
         for mark in marks
     ]
     more = (
-        f'<p class="soft">{left_out} more events of the same names are left out; '
+        f'<p class="soft">{left_out} more events with these names are left out; '
         "acsard recording show prints all of them.</p>"
         if left_out
         else ""

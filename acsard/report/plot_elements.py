@@ -37,8 +37,11 @@ SOURCE_COLOURS = (
 """Colors of the command sources that drive. Neighbors in this list are easy to distinguish."""
 
 PATTERNS = ("", "/", "x", ".", "-")
-"""Fill patterns of the bands of sources. When all colors are used, they repeat with the next
-pattern."""
+"""Fill patterns of the bands of sources.
+
+The first sources have the first pattern and different colors. When all colors are used, they are
+used again with the next pattern.
+"""
 
 
 def source_style(number: int) -> tuple[str, str]:
@@ -51,7 +54,7 @@ def source_style(number: int) -> tuple[str, str]:
 
 
 WRAP = 42
-"""Maximum length of a line of hover text, characters. Such a line fits on a phone."""
+"""Maximum length of a line of text at the pointer, characters. It fits on a phone."""
 
 Trace = dict[str, Any]
 """Plotly's description of one curve, or of one set of marks or bars."""
@@ -80,7 +83,10 @@ class Figure(NamedTuple):
     layout: dict[str, Any]
     """Plotly's description of axes, margins and notes."""
     timed: bool = True
-    """True if the x axis is the time. The page zooms all pictures with a time axis together."""
+    """True if the x axis is the time.
+
+    If the user zooms one picture with a time axis, the page zooms all of them.
+    """
 
 
 def label(text: str) -> str:
@@ -122,7 +128,10 @@ def layout() -> dict[str, Any]:
 
 
 def note(text: str, x: float, y: float) -> dict[str, Any]:
-    """Return a title. `x` is a fraction of the picture's width, and `y` a value on the y axis."""
+    """Return a title in a picture.
+
+    `x` is a fraction of the picture's width, and `y` is a value on the y axis.
+    """
     return {
         "text": label(text), "x": x, "y": y, "xref": "paper", "yref": "y", "xanchor": "left",
         "yanchor": "middle", "showarrow": False, "font": {"size": 13},

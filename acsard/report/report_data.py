@@ -26,19 +26,30 @@ from acsard.report.command_sources import MAX_TEXT, SAMPLE_S, CommandSources
 NS_PER_MS = 1_000_000
 
 MODES = ("fault", "stopped", "shutdown", "waiting", "inactive", "driving", "ready")
-"""Modes of the robot. If short spans are merged, the merged span has the first of their modes in
-this order."""
+"""Modes of the robot.
+
+If neighboring spans of time with different modes are merged, the merged span has the mode that
+comes first in this tuple.
+"""
 
 LINKS = ("down", "stale", "booting", "up")
-"""States of the serial link. If short spans are merged, the merged span has the first of their
-states in this order."""
+"""States of the serial link.
+
+If neighboring spans of time with different states are merged, the merged span has the state that
+comes first in this tuple.
+"""
 
 MAX_EVENT_TEXT = 1000
-"""Maximum number of characters that are kept of an event's text. The daemon's longest text has
-308."""
+"""Maximum length of the text of an event, characters. The rest is cut off.
+
+The daemon's longest text has 308 characters.
+"""
 
 FIRST, LAST = 30, 30
-"""Numbers of events of each name that are kept: `FIRST` from the beginning, `LAST` from the end."""
+"""Numbers of events of each name that are kept.
+
+`FIRST` events from the beginning of the recording and `LAST` events from its end are kept.
+"""
 
 
 class Mark(Struct, frozen=True):
@@ -56,7 +67,7 @@ class Mark(Struct, frozen=True):
     place: Place | None
     """Place of the robot according to odometry; None before the first pose."""
     seconds: float
-    """Time of the event on the robot's clock at that moment, s since 1970."""
+    """Time of the event, s since 1970, as the robot's clock showed it when the event happened."""
 
     @property
     def words(self) -> str:
@@ -69,14 +80,24 @@ class Marks:
     def __init__(self) -> None:
         self._first: dict[str, list[tuple[int, Mark]]] = {}
         self._last: dict[str, deque[tuple[int, Mark]]] = {}
-        """The last events with each name. Each event has its number in the order of all events."""
+        """The last events with each name.
+
+        Each is a pair: the number of the event in the order of all events, and the event.
+        """
         self._count = 0
         self.counts: Counter[str] = Counter()
-        """Number of events with each name. A mark for several equal events counts several times."""
+        """Number of events with each name.
+
+        A mark that stands for several equal events is counted as several.
+        """
         self.left_out = 0
 
     def add(self, mark: Mark) -> None:
-        """Add an event. If `FIRST` + `LAST` events of its name are kept, drop one in the middle."""
+        """Add an event.
+
+        If `FIRST` + `LAST` events of its name are already kept, the oldest of the last `LAST`
+        events is dropped.
+        """
         self.counts[mark.name] += mark.count
         self._count += 1
         row = (self._count, mark)
@@ -103,7 +124,7 @@ class Driven(Struct):
 class Lateness:
     """Measures how late the daemon ran the step of each control period.
 
-    The recording states how many periods were missed, which gives the number of each period. The
+    The recording states how many periods were missed, so each step has a known period number. The
     times at which the periods were due follow from these numbers, except for a constant offset. The
     offset is chosen so that the smallest delay is 0.
     """
@@ -113,7 +134,7 @@ class Lateness:
         self._curve = Curve()
         self._number = 0
         self._ahead = 0
-        """Number of lines that `at_once` has counted since the last period."""
+        """Number of lines that `at_once` has counted since the last step of a control period."""
         self._began_ns: int | None = None
         self._earliest = math.inf
         """Smallest delay of a step so far, relative to the delay of the first step, ns."""
@@ -121,7 +142,10 @@ class Lateness:
         """Number of periods without a step."""
 
     def at_once(self) -> None:
-        """Count a line that the daemon sent for a fresh command instead of in the next period."""
+        """Count a line that the daemon sent at once for a fresh command.
+
+        This line replaces the line of the next control period.
+        """
         self._ahead += 1
 
     def tick(self, t: float, now_ns: int, missed: int, known: bool) -> None:
@@ -130,7 +154,7 @@ class Lateness:
         Args:
             t: the time of the step in the report, s.
             now_ns: the monotonic time of the step, ns.
-            missed: the number of periods without a step since the last tick.
+            missed: the number of periods without a step since the last call.
             known: False if the recording lacks the steps just before this step. The number of the
                 period is then computed from `now_ns`.
         """
@@ -163,13 +187,19 @@ class Lateness:
 
 
 class LineCount:
-    """Number of serial lines of one kind, in each second (`curve`) and in total (`total`)."""
+    """Number of serial lines of one kind.
+
+    `curve` contains the number in each second, and `total` the number in all seconds.
+    """
 
     def __init__(self) -> None:
         self.curve, self.total = Curve(), 0
 
     def add(self, t: float, count: int) -> None:
-        """Add the number of lines in one second. `t` is the middle of that second, s."""
+        """Add the number of lines in one second.
+
+        `t` is the time in the middle of that second, s.
+        """
         self.curve.add(t, count)
         self.total += count
 
@@ -182,22 +212,30 @@ class SerialCounts:
         self.dropped, self.unanswered = LineCount(), LineCount()
         self._second: int | None = None
         self._sent = 0
-        """Number of lines sent in the present second."""
+        """Number of lines that the daemon has sent in the present second."""
         self._base = 0
-        """Number of lines received up to the first step of the report."""
+        """Number of lines that the daemon had received at the first step of the report."""
         self._before = (0, 0)
-        """Numbers of good and of dropped lines from the daemon's start to the beginning of this
-        second."""
-        self._now = (0, 0)
-        """Numbers of good and of dropped lines from the daemon's start to the last step."""
-        self._outstanding: int | None = None
-        """Smallest number of unanswered lines at any step of this second.
+        """Numbers of good and of dropped lines when the present second began.
 
-        At the other steps, the answer to the newest line may not have arrived yet.
+        They count from the daemon's start.
+        """
+        self._now = (0, 0)
+        """Numbers of good and of dropped lines at the last step.
+
+        They count from the daemon's start.
+        """
+        self._outstanding: int | None = None
+        """Number of sent lines without an answer: the smallest number at any step of this second.
+
+        At other steps, the number is larger because the answer to the newest line has not arrived
+        yet.
         """
         self._lost: int | None = None
-        """Number of answers that were lost before this second, that is, the largest `_outstanding`
-        of the earlier seconds."""
+        """Number of answers that were lost before this second.
+
+        It is the largest `_outstanding` of the earlier seconds.
+        """
 
     def step(self, t: float, sent: bool, counters: Mapping[str, int]) -> None:
         """Process a step at time `t`, s; `counters` are the robot's counters after the step."""
@@ -213,7 +251,10 @@ class SerialCounts:
         self._sent += sent
 
     def _end(self, received: tuple[int, int]) -> None:
-        """Finish the present second. The next step may be many seconds later."""
+        """Store the counts of the present second. The next step may be many seconds later.
+
+        `received` contains the numbers of good and of dropped lines since the daemon's start.
+        """
         t = float(self._second or 0) + 0.5
         good, dropped = (now - then for now, then in zip(received, self._before, strict=True))
         outstanding = self._outstanding or 0
@@ -231,7 +272,10 @@ class SerialCounts:
 
 
 def _received(counters: Mapping[str, int]) -> tuple[int, int]:
-    """Return a pair: the numbers of accepted and of dropped lines. Implausible ones are dropped."""
+    """Return a pair: the numbers of accepted and of dropped lines.
+
+    Implausible lines count as dropped.
+    """
     bad = sum(count for name, count in counters.items() if name.startswith("line_"))
     return counters.get("lines", 0) - counters.get("line_implausible", 0), bad
 
@@ -263,8 +307,10 @@ class ReportData:
         self.lateness = Lateness(config.rate_hz)
         self.marks = Marks()
         self.began: float | None = None
-        """Wall-clock time of the first collected step, s since 1970; None before this step. All
-        times `t` count from it."""
+        """Wall-clock time of the first collected step, s since 1970; None before this step.
+
+        All times `t` are in s since this time.
+        """
         self.ended = 0.0
         """Wall-clock time of the last collected step, s since 1970."""
         self.seconds = self.metres = 0.0
@@ -272,21 +318,25 @@ class ReportData:
         self.driven: dict[str, Driven] = {}
         """Maps each source to the time and the distance that it drove the robot."""
         self.fastest = Twist()
-        """Largest absolute values of the measured speed, m/s, and of the measured turn rate,
-        rad/s."""
+        """Maximum absolute values of the measured speed, m/s, and the measured turn rate, rad/s."""
         self.steps = self.missing = 0
         """Number of collected steps, and number of steps that are missing between them."""
         self._timeline = TimelineWriter(config)
         self._mono_ns = self._wall_ns = 0
         """Monotonic and wall-clock time of the first step of the recording, ns."""
         self._wall = -math.inf
-        """Time of the last step, s since 1970: the wall-clock time of the first step plus the
-        monotonic time since then."""
+        """Time of the last step, s since 1970.
+
+        It is the wall-clock time of the first step plus the monotonic time since then, so it
+        ignores a change of the clock.
+        """
         self._number: int | None = None
         self._place: Place | None = None
         self._jumps = True
-        """True if the next pose does not continue the path: it is the first pose, or a request set
-        the pose."""
+        """True if the next pose does not continue the path.
+
+        It is then the first pose, or a request has set the pose.
+        """
         self._sampled = self._sent = -math.inf
         """Time of the last sample of the status, and time of the last sent line, s."""
         self._status: tuple[str, ...] = ()
@@ -323,7 +373,10 @@ class ReportData:
         self._number = step.number
 
     def end(self, ending: str = "") -> None:
-        """Finish the data. `ending` says how the recording ends, as in `TimelineWriter.end`."""
+        """Finish the data. Call this method after the last step.
+
+        `ending` says how the recording ends, as in `TimelineWriter.end`.
+        """
         t = self.seconds
         for entry in self._timeline.end(ending) if self.began is not None else ():
             self.marks.add(self._mark(entry, t))
@@ -338,7 +391,11 @@ class ReportData:
     # Distance and speeds.
 
     def _drive(self, step: Step, t: float, inside: bool) -> None:
-        """Process the poses of a step. If `inside` is true, add them to the path and distance."""
+        """Process the poses of a step at the time `t`, s.
+
+        If `inside` is true, they are added to the path, and to the time and distance of the driving
+        source.
+        """
         mode, _, _, source = step.recorded.status
         driven = self._driven(source) if mode == "driving" and inside else None
         if driven is not None and t > self.seconds:
@@ -407,7 +464,11 @@ class ReportData:
             self.lateness.at_once()
 
     def _sample(self, step: Step, t: float, robot: Robot, refused: bool) -> None:
-        """Sample mode, link and sources every `SAMPLE_S`, and also after a change or a refusal."""
+        """Sample the mode, the link and the sources if a sample is due.
+
+        A sample is due every `SAMPLE_S`, after a change of the status, and if `refused` is true
+        because a command was refused.
+        """
         mode, reason, link, _ = status = step.recorded.status
         if status == self._status and t - self._sampled < SAMPLE_S and not refused:
             return

@@ -20,7 +20,10 @@ from acsard.daemon.late_causes import cause_in
 from acsard.report.report_data import Mark, ReportData
 
 Clock = Callable[[float, bool], str]
-"""Formats a time in s since 1970 as local time, with the date if the second argument is true."""
+"""Function that formats a time in s since 1970 as local time.
+
+The date is included if its second argument is true.
+"""
 
 MAX_REASONS = 8
 """Maximum number of rows in the table of reasons."""
@@ -28,8 +31,7 @@ MAX_REASONS = 8
 NUMBER = re.compile(r"\d+(\.\d+)?")
 
 FINE_S = 0.05
-"""Longest time that one point of a picture may cover, s. If points cover a longer time, a note in
-the report says so."""
+"""Longest time that one point of a picture may cover without a note in the report, s."""
 
 MAX_NAMES = 5
 """Maximum number of names or texts that are listed in one sentence."""
@@ -61,7 +63,7 @@ OF_THE_BOARD = {
     "bumper_pressed": "bumper hit",
     "battery_stop": "battery stop",
 }
-"""Words for the events in which the board caused a stop. The keys are the names of the events."""
+"""Words for the events in which the board caused a stop, by the name of the event."""
 
 
 def differences(config: Config) -> list[Setting]:
@@ -139,7 +141,10 @@ def reasons(data: ReportData) -> list[tuple[str, str, str, float]]:
 
 
 def _first_of_each(marks: list[Mark], clock: Clock) -> str:
-    """Return a list, in words, of the different texts of the marks, each with its first time."""
+    """Return the different texts of the marks, each with the time at which it first occurred.
+
+    They are joined to one text, with at most `MAX_NAMES` of them.
+    """
     first: dict[str, Mark] = {}
     for mark in marks:
         first.setdefault(mark.text, mark)
@@ -148,7 +153,10 @@ def _first_of_each(marks: list[Mark], clock: Clock) -> str:
 
 
 def _late(marks: Iterable[Mark], clock: Clock) -> str:
-    """Return the causes of late control periods and their times, or "" if no event names one."""
+    """Return the causes of late control periods, each with its first time.
+
+    Return "" if no event names a cause.
+    """
     late = [
         replace(mark, text=cause)
         for mark in marks
@@ -187,7 +195,7 @@ def rows(data: ReportData, origin: Origin, clock: Clock) -> Iterator[tuple[str, 
     began, config = data.began or 0.0, data.config
     yield "When", f"{clock(began, True)} to {clock(data.ended, True)}"
     yield "Duration", f"{lasting(data.seconds)}, {data.steps} steps"
-    yield "Distance", f"{data.metres:.2f} m, forward and backward"
+    yield "Distance", f"{data.metres:.2f} m, the sum of forward and backward driving"
     fast = data.fastest
     yield "Top speed", f"{fast.linear:.2f} m/s, {fast.angular:.2f} rad/s (measured)"
     drivers = [

@@ -5,9 +5,10 @@ The errors of one cause are propagated alone through the error model of the odom
 until the robot has driven 100 m. For the heading error, it makes all turns left turns, and repeats
 the drive until the robot has turned by 360 deg.
 
-Feedback lines show the errors of stamps, quantization, gaps and contradicting wheels. A gyro shows
-the error of the track. The variance that the odometry publishes shows the noise of the gyro. All
-other errors are those that `[odometry]` declares.
+The errors of stamps, quantization, gaps and contradicting wheels are measured with feedback lines.
+The error of the track is measured with a gyro. The noise of the gyro follows from the variance of
+the heading that the odometry publishes. All other errors are taken from the settings in
+`[odometry]`.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from acsard.core.values import REST, PoseCovariance
 Cause = Literal["time", "quantization", "gaps", "slip", "parameters", "gyro"]
 
 Basis = Literal["measured", "settings", "unknown"]
-"""The source from which the size of an error is known; "unknown" if there is none."""
+"""How the size of an error is known: measured, from the settings in `[odometry]`, or not at all."""
 
 METRES = 100.0
 """Distance after which the position error is given, m."""
@@ -51,9 +52,9 @@ MOST_STEPS = 20_000
 
 STRAIGHT = Steps(np.array([[0.05, 0.0] + [0.0] * 7]))
 SPIN = Steps(np.array([[0.0, 0.05] + [0.0] * 7]))
-"""A step of 0.05 m ahead (`STRAIGHT`) and a step of 0.05 rad in place (`SPIN`), without errors.
+"""A step of 0.05 rad in place (`SPIN`), and a step of 0.05 m ahead (`STRAIGHT`), without errors.
 
-If the robot stood still, its budget is computed for repetitions of these steps.
+The budget of a robot that stood still is computed for a drive that repeats these steps.
 """
 
 
@@ -71,7 +72,7 @@ PARAMETERS = (
 
 
 class Share(Struct, frozen=True):
-    """The odometry errors that one cause alone makes, as standard deviations; None if unknown."""
+    """The odometry errors of one cause alone, as standard deviations; None for unknown errors."""
 
     cause: Cause
     mm_per_100_m: float | None
@@ -80,7 +81,7 @@ class Share(Struct, frozen=True):
 
 
 class Budget(Struct, frozen=True):
-    """The errors of all causes, and facts about the drive."""
+    """The error budget of a drive: the errors of each cause, and facts about the drive."""
 
     seconds: float
     metres: float
@@ -92,7 +93,7 @@ class Budget(Struct, frozen=True):
     unseen: float
     """Total duration of the gaps in the feedback, s."""
     lateness: float
-    """RMS error of the stamps of feedback lines, s."""
+    """RMS error of the time stamps of feedback lines, s."""
     quantum: float
     """Quantization step of the wheel speeds in feedback lines, rad/s."""
     counts: int
@@ -100,22 +101,28 @@ class Budget(Struct, frozen=True):
     gyro: bool
     """True if the heading comes from a gyro."""
     still: bool
-    """True if the robot hardly moved. `shares` then contains only errors known from settings."""
+    """True if the robot hardly moved.
+
+    `shares` then contains only two causes: skidding, and the errors of wheel radii and track.
+    """
     at_rest: tuple[float, float]
-    """Standard deviations of linear (m/s) and angular (rad/s) speed due to rounding, at rest."""
+    """Standard deviations of the speed, m/s, and of the turn rate, rad/s, of a robot at rest.
+
+    The cause is the rounding of the wheel speeds in feedback lines.
+    """
     shares: tuple[Share, ...]
     multiplier: float = 1.0
     """Configured ratio of effective track to wheel separation."""
     learned: float | None = None
-    """Mean ratio of effective track to wheel separation that the gyro implies; None if unknown."""
+    """Mean ratio of effective track to wheel separation according to the gyro; None if unknown."""
     learned_std: float = 0.0
     learned_used: bool = False
-    """True if the odometry uses `learned` for turns that only the wheels, not a gyro, measure."""
+    """True if the odometry uses `learned` for the turns that the gyro does not measure."""
     coarse: bool = False
-    """True if the wheel speeds jump as with coarse encoders, and the encoder counts are unknown."""
+    """True if the encoders are coarse and the daemon does not know their counts per wheel turn."""
 
     def largest(self, *bases: Basis) -> Share | None:
-        """Return the share with the largest position error, among the shares with one of `bases`.
+        """Return the share with the largest position error among those whose `basis` is in `bases`.
 
         If all position errors are 0, return the share with the largest heading error. If the
         heading errors are 0 as well, return None.
@@ -128,9 +135,10 @@ class Budget(Struct, frozen=True):
         return None
 
     def total(self) -> tuple[float | None, float | None]:
-        """Return a pair: the total error in mm after 100 m, and that in deg after a full turn.
+        """Return a pair of total errors: of the position, mm, and of the heading, deg.
 
-        The causes are independent, so each total is the root of the sum of the squared errors. It
+        The position error is that after 100 m, and the heading error that after one full turn. The
+        causes are independent, so each total is the root of the sum of the squared errors. A total
         is None if this error is unknown for all causes.
         """
         return _squares([share.mm_per_100_m for share in self.shares]), _squares(
@@ -151,13 +159,13 @@ class Received(Struct, frozen=True):
     gyro: bool = False
     """True if the heading comes from a gyro."""
     learned: float | None = None
-    """Effective track that the gyro implies, divided by the configured one; None if unknown."""
+    """Effective track according to the gyro, divided by the configured track; None if unknown."""
     deviation: float = 0.0
     """Relative standard deviation of `learned`."""
     used: bool = False
-    """True if the odometry uses `learned` for turns that only the wheels, not a gyro, measure."""
+    """True if the odometry uses `learned` for the turns that the gyro does not measure."""
     coarse: bool = False
-    """True if the wheel speeds jump as with coarse encoders, and the encoder counts are unknown."""
+    """True if the encoders are coarse and the daemon does not know their counts per wheel turn."""
 
 
 def budget(received: Received, config: Config, metres: float = METRES) -> Budget:
@@ -205,9 +213,9 @@ def _standing(received: Received, config: Config, model: _Model) -> Budget:
 
 
 def _causes(received: Received, model: _Model, driving: Driving, counts: int) -> Iterator[Share]:
-    """Yield the errors of each cause. `counts` is the number of encoder counts per wheel turn.
+    """Yield the errors of each cause.
 
-    It is 0 if the number is unknown.
+    `counts` is the number of encoder counts per wheel turn, or 0 if it is unknown.
     """
     odometry, plain = model.odometry, driving.plain()
 
@@ -264,10 +272,10 @@ class _Model:
         """Return the errors that one cause makes.
 
         Args:
-            basis: the source of the errors' size. If it is "unknown", the errors are None.
+            basis: how the size of the errors is known. If it is "unknown", the errors are None.
             ahead: the steps to repeat for the position error.
             left: the steps to repeat for the heading error, with all turns to the left.
-            only: the settings without the errors of other causes.
+            only: the settings of `[odometry]`, with the errors of all other causes set to 0.
             counts: encoder counts per wheel turn; 0 if the encoders are not the cause.
             scale: relative standard deviation of the gyro's scale; 0 if the gyro is not the cause.
         """
@@ -286,7 +294,11 @@ class _Model:
         self, steps: Steps, only: OdometryConfig, counts: int, scale: float, metres: float,
         angle: float,
     ) -> PoseCovariance:  # fmt: skip
-        """Repeat the steps up to `metres` m or `angle` rad, and return the pose's covariance."""
+        """Return the covariance of the pose at the end of a drive that repeats `steps`.
+
+        The drive ends after `metres` m or after turns of `angle` rad, whichever comes first.
+        `only`, `counts` and `scale` are those of `share()`.
+        """
         pose, path = PoseUncertainty(ErrorModel(only, self.kinematics), counts), Path()
         rolled = turned = 0.0
         for distance, turn, along, yaw, *missed, by_gyro in cycle(steps.rows.tolist()):
@@ -304,7 +316,7 @@ class _Model:
 
 
 def _only(odometry: OdometryConfig, *kept: str) -> OdometryConfig:
-    """Return the settings with every declared error set to 0, except the settings in `kept`."""
+    """Return the settings with all error settings set to 0, except the settings named in `kept`."""
     zeros = {name: 0.0 for name in (*NOISE, *PARAMETERS) if name not in kept}
     return replace(odometry, pose_covariance_diagonal=(0.0,) * 6, **zeros)
 

@@ -44,8 +44,8 @@ BASIS: dict[Basis, str] = {
 
 COARSE = (
     "the encoders are coarse and the daemon does not know how many counts they have per wheel "
-    "turn, so an error in the time of a feedback line becomes an error of the heading: write this "
-    "number as mcu.encoder_counts (`acsard mcu check` estimates it)"
+    "turn, so an error in the time of a feedback line becomes an error of the heading: write the "
+    "counts per wheel turn as mcu.encoder_counts (`acsard mcu check` estimates them)"
 )
 
 CALIBRATE = (
@@ -118,8 +118,8 @@ def _track(budget: Budget, learned: float) -> str:
     if budget.learned_used:
         return (
             f"According to the gyro, drive.wheel_separation_multiplier should be {implied}. "
-            "Odometry uses this value while only the wheels measure the turn; the configured value "
-            f"is {budget.multiplier:.3f}."
+            "Odometry uses this value while the gyro is silent; the configured value is "
+            f"{budget.multiplier:.3f}."
         )
     return (
         f"According to the gyro, drive.wheel_separation_multiplier should be {implied}. Odometry "

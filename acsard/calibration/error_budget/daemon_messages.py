@@ -30,20 +30,26 @@ KEYS = ("odom", "wheel_states", "cmd_vel_out")
 """Zenoh keys of the messages that an error budget needs."""
 
 MOST = 60_000
-"""Maximum number of feedback lines that are kept: ten minutes at 100 Hz."""
+"""Number of feedback lines that are kept, ten minutes at 100 Hz. Older lines are dropped."""
 
 SHARE_COARSE = 0.1
-"""If more than this fraction of the feedback lines show coarse encoders, the report says so."""
+"""Limit for the fraction of the feedback lines that show coarse encoders.
+
+Above this limit, the report says that the encoders are coarse.
+"""
 
 LEAST_LOST, SHARE_LOST = 3, 0.01
-"""Number and fraction of feedback lines that this program may miss. The larger limit applies.
+"""Limits for the feedback lines that this program missed: a number, and a fraction of all lines.
 
-This program always seems to miss a few lines, because it reads the daemon's counters and messages
-at different moments.
+The larger of the two limits applies. This program always seems to miss a few lines, because it
+reads the daemon's counters and messages at different moments.
 """
 
 SAMPLED = "checked with samples"
-"""Value of `check` in the message `diagnostics` if feedback lines carry encoder counts."""
+"""Value of `check` in the message `diagnostics`.
+
+It means that feedback lines carry encoder counts and the microcontroller's time.
+"""
 
 LOOK_S = 0.05
 """Interval at which the message queues are polled, s."""
@@ -63,7 +69,10 @@ def budgets(robot: Client, config: Config, seconds: float) -> Iterator[Budget]:
 
 
 def _await_line(robot: Client, lines: Subscription) -> None:
-    """Wait for the first feedback line. After it, messages on all of `KEYS` arrive."""
+    """Wait for the first feedback line. From then on, messages on all of `KEYS` arrive.
+
+    Raises `ReplyError` if no feedback line arrives within `FIRST_S`.
+    """
     end = time.monotonic() + FIRST_S
     while lines.try_recv() is None:
         if time.monotonic() > end:

@@ -16,8 +16,9 @@ speed of one count per period. An edge that comes too late for one period is cou
 period, so errors of the count do not accumulate. The errors from rounding the multiples to two
 decimals do accumulate, but they can be computed.
 
-Errors that are independent from step to step are given as variances. Errors that have the same sign
-in each step add up, so they are given as motion that the pose missed.
+Some errors of a step are independent of the errors of other steps. They are given as variances.
+Other errors have the same sign in each step and add up. They are given as motion that the pose
+missed.
 """
 
 from __future__ import annotations
@@ -40,9 +41,9 @@ from acsard.core.values import Twist, WheelSpeeds
 Counts = npt.NDArray[np.int64]
 
 AHEAD = 30
-"""Number of consecutive feedback lines of which at least one is not delayed.
+"""Number of consecutive feedback lines, of which at least one is assumed not to be delayed.
 
-At 100 Hz they take 0.3 s, the longest time for which a busy host does not run the daemon.
+At 100 Hz they take 0.3 s. A busy host does not keep the daemon from running for longer.
 """
 
 MISSING = 0.6
@@ -57,9 +58,9 @@ This delay drifts because the period is at first known only to about 1 %.
 CLUSTERED, ALIKE_TIMES = 0.4, 0.25
 """Limits that decide whether the period of lines is their median or their mean interval.
 
-The period is the median if more than the fraction `CLUSTERED` of the intervals differ from the
-median by less than the fraction `ALIKE_TIMES` of the median. Otherwise the lines arrive in bursts,
-and the period is the mean.
+An interval is near the median if it differs from the median by less than the fraction
+`ALIKE_TIMES`. The period is the median if more than the fraction `CLUSTERED` of the intervals are
+near it. Otherwise the lines arrive in bursts, and the period is the mean.
 """
 
 
@@ -124,7 +125,8 @@ def _asked(t: Floats, sent: Floats) -> LineTimes | None:
 def _missing(at: Floats) -> Counts:
     """Return for each line the number of lines that were lost just before it.
 
-    `at` contains the times of the lines, in periods since any origin.
+    `at` contains the time of each line divided by the period of the lines. These times may count
+    from any moment.
     """
     count = len(at)
     ahead = at - np.arange(count)
@@ -143,7 +145,10 @@ def _missing(at: Floats) -> Counts:
 
 
 BLOCK_S = 0.5
-"""Time, s, within which the errors of stamps are correlated, because one stall delays all lines."""
+"""Length of the intervals in which the errors of stamps are correlated, s.
+
+They are correlated because one stall of the computer delays all lines that arrive during it.
+"""
 
 LEAST_LINES, ALIKE = 20, 0.99
 """Limits for the fit that separates the noise of the gyro from its scale error.
@@ -155,8 +160,8 @@ proportional to time (cosine above `ALIKE`), the fit cannot separate noise and s
 LATEST_S = 0.1
 """Largest delay of a feedback line, s, that counts as an error of its stamp.
 
-If two successive lines are at least `LATEST_S` apart and the pose did not move between them, there
-is a gap in the feedback between them.
+There is a gap between two successive lines if they are at least `LATEST_S` apart, the wheel
+positions did not change between them, and the later line reports a speed.
 """
 
 Wheels = tuple[float, float, float, float]
@@ -198,9 +203,15 @@ class Motion(Struct, frozen=True):
     lateness: float
     """RMS error of the time stamps of feedback lines, s."""
     filled: Floats
-    """Variances (m2, rad2) of the motion that the odometry assumed for lost lines; 0 elsewhere."""
+    """Errors of the motion that the odometry assumed for lost lines, as variances (m2, rad2).
+
+    The rows of all other lines are 0.
+    """
     unfilled: Floats
-    """Motion that the pose missed during gaps, and its variances: rows of (m, rad, m2, rad2)."""
+    """Motion that the pose missed during a gap, and its variances: rows of (m, rad, m2, rad2).
+
+    The rows without a gap are 0.
+    """
     missing: int
     unseen: float
     """Total duration of the gaps in the feedback, s."""
@@ -236,13 +247,16 @@ def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool)
 
 
 def _noise(t: Floats, speeds: Floats, turns: Floats, variances: Floats) -> Floats | None:
-    """Return the variance, rad2, that the gyro's noise adds to the heading from line to line.
+    """Return the variance, rad2, that the gyro's noise adds to the heading between two lines.
 
-    The gyro's scale error adds to the variance as well: S^2 A^2, where S is the relative standard
-    deviation of the scale and A the turn since the pose was set. A line with the turn dA adds
-    2 S^2 A dA. A is unknown at the first line, so a least-squares fit estimates A and the noise.
-    The result is None if the fit cannot separate the noise from A. The variance is 0 for lines at
-    which the wheels stand still.
+    `t` contains the times of the lines, s, `speeds` the speeds of the wheels, `turns` the turn from
+    each line to the next, rad, and `variances` the variance of the heading at each line, rad2.
+
+    The gyro's scale error also adds to the variance of the heading: S^2 A^2, where S is the
+    relative standard deviation of the scale, and A is the turn since the pose was last set. A
+    further turn dA adds 2 S^2 A dA. A is unknown at the first line, so a least-squares fit
+    estimates A and the noise together. The result is None if the fit cannot separate the two. It is
+    0 for lines at which the wheels stand still.
     """
     # Leave out the lines in which the variance falls, because the pose was set there.
     dt, moves = np.diff(t), speeds[1:].any(axis=1) & (variances[1:] > variances[:-1] / 2)
@@ -280,8 +294,9 @@ def _gaps(
 ) -> tuple[Floats, Floats, int, float]:
     """Return four values: `filled`, `unfilled`, `missing` and `unseen` of `Motion`.
 
-    `twists` come from the speeds in the lines, and `rolled`, the motion from each line to the next,
-    comes from the wheel positions.
+    `twists` are computed from the wheel speeds in the lines. `rolled` is the motion from each line
+    to the next, computed from the wheel positions. `found` tells which lines were lost. If `whole`
+    is false, these lines are ignored.
     """
     filled, unfilled = np.zeros((len(rolled), 2)), np.zeros((len(rolled), 4))
     lost, unseen = 0, 0.0
@@ -328,15 +343,15 @@ class Rounding(Struct, frozen=True):
     """
 
     variance: Floats
-    """Variance of the angle that a wheel rolled since the previous line, rad2."""
+    """Variance of the error of the angle that a wheel rolled since the previous line, rad2."""
     offset: Floats
-    """Known error of the angle that a wheel rolled from line to line, rad."""
+    """Computed error of the angle that a wheel rolled since the previous line, rad."""
     alike: Floats
     """Matrix that is 1 for each pair of wheels with equal rounding errors, else 0; shape (4, 4)."""
     quantum: float
     """Quantization step, rad/s."""
     count: float
-    """Wheel rotation per encoder count, rad; 0 if the feedback lines do not show it."""
+    """Angle by which a wheel turns in one encoder count, rad; 0 if the lines do not show it."""
 
 
 def rounding(speeds: Floats, period: float) -> Rounding:
@@ -358,11 +373,12 @@ def rounding(speeds: Floats, period: float) -> Rounding:
 
 
 def _runs(values: Floats) -> Floats:
-    """Return the variances of a wheel's rounding errors, divided by (quantization step)^2 / 12.
+    """Return the variance of a wheel's rounding error in each line, divided by q^2 / 12.
 
-    `values` contains the wheel's speed in each line. The last of n equal speeds in a row has the
-    variance n^2, and the others have 0. If the wheel passed through this speed while it became
-    faster or slower, the last one has the variance 1.
+    q is the quantization step. `values` contains the wheel's speed in each line. Of n equal speeds
+    in a row, the last one has the variance n^2, and the others have 0. If the wheel passed through
+    this speed while it became faster or slower, the last one has the variance 1. Speeds of 0 have
+    the variance 0.
     """
     found = np.zeros(len(values))
     ends = np.append(np.flatnonzero(np.diff(values)), len(values) - 1)
@@ -422,7 +438,10 @@ class Driving:
         self._each = max(1, round(step_s / motion.period))
         twists = [kinematics.twist(WheelSpeeds(*row)) for row in np.eye(4).tolist()]
         self._weights = np.array([[t.linear for t in twists], [t.angular for t in twists]])
-        """Distance (row 0, m) and turn (row 1, rad) of the robot if one wheel rolls 1 rad."""
+        """Motion of the robot if only one wheel rolls, by 1 rad, with a column for each wheel.
+
+        Row 0 contains the distance, m, and row 1 the turn, rad.
+        """
 
     def plain(self) -> Steps:
         """Return the steps without errors."""
@@ -430,7 +449,7 @@ class Driving:
 
     @property
     def tells_gyro(self) -> bool:
-        """Whether the feedback lines show the noise of the gyro."""
+        """Whether the feedback lines show how large the noise of the gyro is."""
         return self._motion.yaw_variance is not None
 
     def turned_by_gyro(self) -> Steps:
@@ -472,7 +491,11 @@ class Driving:
         return self._steps(missed=self._of_wheels(np.column_stack([right, left, left, right])))
 
     def _of_wheels(self, off: Floats) -> Floats:
-        """Return the missed motion (m, rad, 0, 0) if the rolled angles are wrong by `off`, rad."""
+        """Return the motion that the pose missed because of errors of the rolled angles.
+
+        `off` contains these errors, rad, with a column for each wheel. The result has rows of (m,
+        rad, 0, 0).
+        """
         moved = off @ self._weights.T
         return np.hstack([moved, np.zeros_like(moved)])
 
@@ -480,7 +503,7 @@ class Driving:
         self, variances: Floats | None = None, missed: Floats | None = None,
         gyro: Floats | None = None,
     ) -> Steps:  # fmt: skip
-        """Return the steps with these errors; None means no errors of this kind.
+        """Return the steps of the drive with these errors; None means no errors of this kind.
 
         Each array has a row for every line but the first. In `Steps.rows`, `variances` fills the
         columns 2 and 3, `missed` the columns 4 to 7, and `gyro` the column 8.

@@ -26,7 +26,7 @@ DEVIATION = 0.01 / math.sqrt(12)
 """Standard deviation of the error of rounding to two decimals, rad/s."""
 
 STRAYS = 0.005
-"""Fraction of the speeds that need not be multiples of the step, because of damaged lines."""
+"""Fraction of the speeds that may differ from all multiples of the step, due to damaged lines."""
 
 BY_CHANCE = 1e-5
 """A step is rejected if its probability of fitting all speeds by chance exceeds this value."""
@@ -56,14 +56,18 @@ def quantization_step(speeds: Floats) -> float:
 
 
 def _strays(speeds: Floats, step: float, doubt: float) -> int:
-    """Count the speeds that are not multiples of `step`, whose relative error is up to `doubt`."""
+    """Count the speeds that are not multiples of `step`, except for rounding.
+
+    `doubt` is the largest relative error of `step`.
+    """
     off = np.abs(speeds - step * np.round(speeds / step))
     return int(np.count_nonzero(off > ROUNDING + doubt * speeds))
 
 
 def _fitted(speeds: Floats, rough: float, spare: int, tries: int) -> float:
-    """Fit the step near `rough` by least squares, rad/s. Return 0 if a closer test rejects it.
+    """Fit the quantization step near `rough` by least squares, and return it, rad/s.
 
+    Return 0 if the step is finer than `FINEST`, does not fit the speeds, or may fit only by chance.
     `spare` is the number of speeds that need not be multiples of the step. `tries` is the number of
     candidates tried so far, each of which could fit by chance.
     """

@@ -4,12 +4,12 @@
 does not import numpy, so that both start quickly.
 
 A guided drive keeps the robot within its limits and on a floor of 3 m x 3 m. Before the calibration
-it is unknown how far the robot turns for a command. The plan must therefore work for an effective
-track of 1 to 2.5 times the wheel separation. Each drive has one of these forms, so that the robot
-stays on the floor:
+the turn that a command causes is unknown, because the robot may skid. The plan must therefore work
+for an effective track of 1 to 2.5 times the wheel separation. Each drive has one of these forms, so
+that the robot stays on the floor:
 
-- It goes there and back.
-- It follows a line that a person set the robot on.
+- It goes out and comes back on the same path.
+- It is straight, and a person placed the robot in the right direction.
 - It comes after a turn that a person measured, which shows the effective track.
 """
 
@@ -89,7 +89,7 @@ class Mean(Struct, frozen=True):
 
     quantity: Quantity
     answers: tuple[str, ...]
-    """Names of the answers of which the mean is computed."""
+    """Names of the answers from which the mean is computed."""
     deviation: float
     """Standard deviation of the measurement, m or rad."""
     plus: float = 0.0
@@ -118,7 +118,7 @@ class Slant(Struct, frozen=True):
     The tool asks for this distance once, before the first leg.
     """
     since: str = ""
-    """Name of the leg after which the start angle to the line was measured.
+    """Name of the earlier leg after which the person measured the robot's start angle to the line.
 
     "" means that the robot started parallel to the line.
     """
@@ -136,7 +136,7 @@ class Leg(Struct, frozen=True):
 
     name: str
     words: str
-    """Instructions to the person, and an announcement of the moves."""
+    """Text for the person before the leg: what to do, and which moves the robot will make."""
     moves: tuple[Move, ...]
     asks: tuple[Ask, ...] = ()
     """Questions that the person answers after the moves."""
@@ -193,7 +193,7 @@ class Setup(Struct, frozen=True):
     reach: float
     """Distance from the robot's middle to its outermost point, m."""
     turning: float
-    """Largest angular command that the limits allow, rad/s."""
+    """Largest turn rate that a command may have within the limits, rad/s."""
     wheel: float
     """Largest rolling speed of the wheels in a turn, m/s."""
     odometry: OdometryConfig = OdometryConfig()
@@ -201,7 +201,10 @@ class Setup(Struct, frozen=True):
 
     @property
     def from_edge(self) -> float:
-        """Distance of the robot's middle from the floor's edge before the straight drive, m."""
+        """Distance of the robot's middle from the edge behind it before the straight drive, m.
+
+        The edge is that of the free floor.
+        """
         return self.reach + EDGE
 
     @property
@@ -223,13 +226,13 @@ class Setup(Struct, frozen=True):
     def arc(self, rate: float, metres: float) -> Move:
         """Return a curve of the length `metres`, m; a negative length goes backwards.
 
-        `rate` is the turn rate without skidding, rad/s, positive to the left.
+        `rate` is the turn rate of a robot without skidding, rad/s, positive to the left.
         """
         straight = self.ahead(metres)
         return Move(straight.seconds, straight.linear, self.command(rate))
 
     def turn(self, angle: float, rate: float, track: float) -> Move:
-        """Return a turn in place by a true angle. Its command compensates for skidding.
+        """Return a turn in place by `angle`, with a command that compensates for skidding.
 
         `angle` is in rad, positive to the left. `rate` is the true turn rate, rad/s, which the
         limits may reduce. `track` is the ratio of effective track to wheel separation.
@@ -239,9 +242,10 @@ class Setup(Struct, frozen=True):
         return Move(seconds, 0.0, math.copysign(command, angle))
 
     def command(self, rate: float) -> float:
-        """Return the angular command, rad/s, that turns a robot without skidding at `rate`, rad/s.
+        """Return the turn rate to command, rad/s, for a true turn rate of `rate`, rad/s.
 
-        The command is reduced to the limits.
+        It is right for a robot without skidding. If it would exceed the limits, it is reduced to
+        them.
         """
         per_command = self.rate_per_command
         most = min(2 * self.wheel / self.drive.wheel_separation, self.turning * per_command)
@@ -249,7 +253,7 @@ class Setup(Struct, frozen=True):
 
     @property
     def rate_per_command(self) -> float:
-        """Turn rate without skidding, rad/s, for an angular command of 1 rad/s.
+        """Turn rate of a robot without skidding, rad/s, for a commanded turn rate of 1 rad/s.
 
         It differs from 1 because the configured multipliers compensate for skidding.
         """
@@ -262,17 +266,17 @@ class Setup(Struct, frozen=True):
 
 
 Legs = Callable[[Setup, float], tuple[Leg, ...]]
-"""Function that returns the legs for a setup and a ratio of effective track to separation.
+"""Function that returns the legs of a method.
 
-The first `turned` measurement shows the ratio. The legs up to that measurement must not depend on
-the ratio.
+Its arguments are the robot's setup, and the ratio of effective track to wheel separation. The first
+`turned` measurement shows the ratio. The legs up to that measurement must not depend on the ratio.
 """
 
 TRACKS = [1.0 + 0.05 * step for step in range(round((WIDEST - 1.0) / 0.05) + 1)]
-"""Ratios of effective track to wheel separation for which the driving time is computed.
+"""Ratios of effective track to wheel separation for which the driving time is checked.
 
-The largest ratio does not always need the longest time. With a smaller ratio, a leg may have one
-more full turn.
+All are checked, because the largest ratio does not always need the longest time. With a smaller
+ratio, a leg may have one more full turn.
 """
 
 
@@ -281,10 +285,16 @@ class Method(Struct, frozen=True):
     asks: tuple[Ask, ...] = ()
     """Questions that the person answers before the first leg."""
     tool: str = ""
-    """Measuring tool that the person uses, in words; "" if a sensor measures instead."""
+    """Name of the measuring tool that the person uses, such as "a tape".
+
+    It is "" if a sensor measures instead.
+    """
 
     def longest_s(self, setup: Setup) -> float:
-        """Return the total driving time of all legs, s, for the worst of the ratios in `TRACKS`."""
+        """Return the total driving time of all legs, s.
+
+        It is the longest of the times for the ratios in `TRACKS`.
+        """
         return max(sum(leg.seconds for leg in self.legs(setup, track)) for track in TRACKS)
 
 

@@ -1,7 +1,7 @@
 """Decides the commands of one leg from the daemon's messages and from key presses.
 
-A leg is one drive of a guided calibration. The driver goes through the phases of `Phase`. An
-unexpected condition halts the leg for good, and `LegDriver.halted` then contains the reason.
+A leg is one drive of a guided calibration. `LegDriver` goes through the phases of `Phase`. An
+unexpected condition ends the leg, and `LegDriver.halted` then contains the reason.
 """
 
 from __future__ import annotations
@@ -62,7 +62,8 @@ class Phase(StrEnum):
 class LegDriver:
     """Decides the commands of one leg.
 
-    Every `now` is in s of the same monotonic clock, which also advances during a suspend.
+    Every argument `now` is the present time, s, on one monotonic clock, which also advances during
+    a suspend.
     """
 
     def __init__(self, leg: Leg, source: str, drive: DriveConfig, now: float, sender: str) -> None:
@@ -85,7 +86,7 @@ class LegDriver:
         self._waits = "no message with the daemon's state has arrived"
         """The reason why the daemon does not accept the commands yet; "" if it accepts them."""
         self._starved = f"the daemon has received no command of source {source} for {OPENING_S:g} s"
-        """The reason to give if this computer was too busy to send commands."""
+        """The reason for halting the leg if this computer was too busy to send commands."""
         self._still_since: float | None = None
         self._deviates_since: float | None = None
 
@@ -105,9 +106,9 @@ class LegDriver:
     def key(self, pressed: str, now: float) -> None:
         """Handle a key press, which halts the leg except in two cases.
 
-        In a leg with `Leg.by_key`, a key ends the last move, and further keys are ignored. In phase
-        OPENING, Enter is ignored, because the person may still hold the Enter key that started the
-        leg.
+        In the last move of a leg with `Leg.by_key`, a key ends this move as planned, and further
+        keys are ignored. In the phase OPENING, Enter is ignored, because the person may still hold
+        the Enter key that started the leg.
         """
         if self.phase is Phase.OPENING and pressed in ENTER:
             return
@@ -209,10 +210,11 @@ class LegDriver:
             )
 
     def _tolerate_briefly(self, why: str, now: float, *, disturbed: bool) -> None:
-        """Halt the leg if there has been a reason for `DEVIATES_S`; `why` is "" for no reason.
+        """Halt the leg if the daemon or the robot has deviated from its commands for `DEVIATES_S`.
 
-        A shorter deviation is harmless: if this computer is busy for a moment, it sends commands
-        late, and the robot only slows down. `disturbed` is true if the leg can be repeated.
+        `why` says how it deviates now, or is "" if it does not. A shorter deviation is harmless: if
+        this computer is busy for a moment, it sends commands late, and the robot only slows down.
+        `disturbed` is true if the leg can be repeated.
         """
         if not why:
             self._deviates_since = None
@@ -222,7 +224,10 @@ class LegDriver:
             self._halt(why, disturbed=disturbed)
 
     def _objection(self, state: RobotState) -> str:
-        """Return why the daemon does not obey the commands of this leg, or "" if it obeys them."""
+        """Return the reason why the robot does not follow the commands of this leg.
+
+        Return "" if it follows them.
+        """
         if why := objection(state, self._source, self._sender):
             return why
         # A source with a long timeout still drives the robot after its commands stop arriving.

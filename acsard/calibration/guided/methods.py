@@ -33,19 +33,22 @@ BY_EYE = 0.07
 """Standard deviation of a heading that a person judges by eye, rad."""
 
 END_M = 0.003
-"""Standard deviation of the measured distance between robot and marks after a square, m.
+"""Standard deviation of a measured distance between the robot and its marks after a square, m.
 
 It includes the error with which the person made the marks beside the robot.
 """
 
 FIRST_TURN = 1.2
-"""Turn rate that the first turn in place would have without skidding, rad/s."""
+"""Turn rate of the first turn in place, rad/s, for a robot without skidding."""
 
 MISSED = 1.1
-"""Timeout of the first turn, as a multiple of the time for a full turn with the ratio `WIDEST`."""
+"""Timeout of the first turn, as a multiple of the time for a full turn.
+
+This time is that of a robot with the ratio `WIDEST` of effective track to wheel separation.
+"""
 
 MOST_SPIN_S = 24.0
-"""Longest total time of several full turns in place in one leg, s."""
+"""Longest time that several full turns in place may take together in one leg, s."""
 
 STOP, SETTLE = Move(0.6), Move(1.0)
 """Pauses between moves. In `STOP` the robot comes to rest; in `SETTLE` it also stops shaking."""
@@ -62,15 +65,16 @@ DISTANCE = Mean("distance", ("metres",), TAPE_M)
 
 def _at_the_edge(setup: Setup) -> str:
     return (
-        f"Place the middle of the robot {setup.from_edge:.2f} m from the near edge of a free floor "
-        f"of {ROOM:g} m x {ROOM:g} m, {ROOM / 2:g} m from both sides, facing the far edge."
+        f"Place the robot so that its middle is {setup.from_edge:.2f} m from the edge behind it, "
+        f"on a free floor of {ROOM:g} m x {ROOM:g} m, and {ROOM / 2:g} m from the edges to its "
+        "left and right."
     )
 
 
 def once_round(setup: Setup, until: str, asks: tuple[Ask, ...] = (), *measures: Measure) -> Leg:
     """Return the leg of one left turn in place, which the person ends with a key.
 
-    `until` completes the instruction "Press SPACE ...".
+    `until` completes the instruction "Press SPACE ...". `asks` and `measures` are those of the leg.
     """
     longest = MISSED * 2 * math.pi * WIDEST
     rate = abs(setup.command(FIRST_TURN)) * setup.rate_per_command
@@ -80,9 +84,10 @@ def once_round(setup: Setup, until: str, asks: tuple[Ask, ...] = (), *measures: 
 
 
 def turns(setup: Setup, rate: float, track: float, most: int) -> int:
-    """Return the number of full turns in place that fit into `MOST_SPIN_S`: 1 to `most`.
+    """Return the number of full turns in place that fit into `MOST_SPIN_S`, from 1 to `most`.
 
-    `rate` is the true turn rate, rad/s. `track` is the ratio of effective track to separation.
+    `rate` is the true turn rate, rad/s. `track` is the ratio of effective track to wheel
+    separation.
     """
     one = setup.turn(2 * math.pi, rate, track).seconds
     return max(1, min(most, int(MOST_SPIN_S / one)))
@@ -92,16 +97,25 @@ def turns(setup: Setup, rate: float, track: float, most: int) -> int:
 
 TO_LINE = (
     Ask(
-        "How far is the front left wheel from the line, at a right angle?",
+        "How far is the front left wheel from the line, measured at a right angle to the line?",
         "mm",
         0,
         1500,
         name="front",
     ),
-    Ask("How far is the rear left wheel from the line?", "mm", 0, 1500, name="rear"),
+    Ask(
+        "How far is the rear left wheel from the line, measured in the same way?",
+        "mm",
+        0,
+        1500,
+        name="rear",
+    ),
 )
 LINE = "front", "rear", "wheelbase"
-"""Values of `Slant.near`, `Slant.far` and `Slant.apart` for a line on the robot's left."""
+"""Names of the answers for `Slant.near`, `Slant.far` and `Slant.apart`.
+
+They are for a line on the robot's left.
+"""
 
 
 def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
@@ -126,10 +140,10 @@ def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
             "ahead",
             f"On a free floor of {ROOM:g} m x {ROOM:g} m, find or draw a straight line across its "
             "middle (a joint of tiles, a board, chalk). Place the robot to the right of the line, "
-            f"about 300 mm away, its middle {setup.from_edge:.2f} m from the near edge, facing "
-            "along the line, so that its front left and rear left wheel have the same distance "
-            "from the line, to the millimetre. Mark where one wheel stands. Do not move the robot "
-            "by hand until the calibration is done. The robot drives "
+            f"about 300 mm away, its middle {setup.from_edge:.2f} m from the edge behind it, "
+            "facing along the line. Its front left and its rear left wheel must have the same "
+            "distance from the line, to the millimetre. Mark on the floor where one wheel stands. "
+            "Do not move the robot by hand until the calibration is done. The robot drives "
             f"{setup.length:.2f} m straight ahead.",
             (SETTLE, setup.ahead(setup.length), SETTLE),
             (FROM_MARK, *TO_LINE),
@@ -198,7 +212,7 @@ def _wall(setup: Setup, track: float) -> tuple[Leg, ...]:
         Leg(
             "out",
             f"Along a straight wall, {ROOM:g} m x {ROOM:g} m must be free. {SQUARE}, in the "
-            "middle of the free floor. The robot drives straight away from the wall for "
+            "middle of the free part of the wall. The robot drives straight away from the wall for "
             f"{setup.length:.2f} m.",
             (STOP, out, STOP),
             (
@@ -243,7 +257,10 @@ CORNER_RATE = 0.9
 
 
 def side_of_square(setup: Setup) -> float:
-    """Return the side of the square in the method "umbmark": 1.2 m, or less for a large robot."""
+    """Return the side length of the square in the method "umbmark", m.
+
+    It is 1.2 m, or less for a large robot.
+    """
     return min(1.2, ROOM - 2 * (setup.from_edge + 2 * EDGE))
 
 
@@ -265,11 +282,11 @@ def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
         corner = setup.turn(side * math.pi / 2, CORNER_RATE, track)
         return Leg(
             f"square to the {to}",
-            f"Place the robot's middle {(ROOM - edge) / 2:.2f} m from the near edge of the floor "
-            f"and the same distance from its {other} edge, facing the far edge. Make two marks on "
-            "the floor: one exactly beside the middle of the robot's left side, one exactly beside "
-            f"the middle of its right side. The robot drives a square with sides of {edge:.2f} m "
-            f"and all turns to the {to}, and ends about where it started.",
+            f"Place the robot so that its middle is {(ROOM - edge) / 2:.2f} m from the edge of the "
+            f"floor behind it, and the same distance from the edge on its {other}. Make two marks "
+            "on the floor: one exactly beside the middle of the robot's left side, one exactly "
+            f"beside the middle of its right side. The robot drives a square with sides of "
+            f"{edge:.2f} m and all turns to the {to}, and ends about where it started.",
             (STOP, *(setup.ahead(edge), STOP, corner, STOP) * 4),
             ends,
             (
@@ -283,7 +300,7 @@ def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
     return (
         Leg(
             "ahead",
-            f"{_at_the_edge(setup)} Mark where one wheel stands. The robot drives "
+            f"{_at_the_edge(setup)} Mark on the floor where one wheel stands. The robot drives "
             f"{setup.length:.2f} m straight ahead.",
             (STOP, setup.ahead(setup.length), STOP),
             (FROM_MARK,),
@@ -311,7 +328,7 @@ def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
 # floor although its effective track is unknown.
 
 FAST, SLOW, CURVE = 1.5, 0.75, 0.8
-"""Turn rates that fast turns, slow turns and curves would have without skidding, rad/s."""
+"""Turn rates of fast turns, slow turns and curves, rad/s, for a robot without skidding."""
 
 SPIN_S, CURVE_M, TURN_RAD = 7.5, 1.2, 5.0
 """Sizes of moves in the methods "gyro" and "positions".
@@ -322,9 +339,10 @@ SPIN_S, CURVE_M, TURN_RAD = 7.5, 1.2, 5.0
 """
 
 PETALS = ((FAST, CURVE), (-FAST, -CURVE), (SLOW, 0.0), (-SLOW, CURVE), (FAST, -CURVE))
-"""Moves of the method "positions": each pair is a turn in place and the curve after it.
+"""Moves of the method "positions": each pair is a turn in place, and a curve there and back.
 
-The numbers are the turn rates that these moves have without skidding, rad/s.
+The two numbers are the turn rates of the turn and of the curve without skidding, rad/s. A curve
+with the rate 0 is straight.
 """
 
 STANDING, PAUSE, SHORT = Move(2.5), Move(1.4), Move(0.7)

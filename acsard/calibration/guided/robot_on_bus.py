@@ -54,7 +54,10 @@ Take = Callable[[Any, float], object]
 
 
 class Sensor:
-    """A subscription to one Zenoh key. Messages are decoded as the first of `types` that fits."""
+    """A subscription to one Zenoh key.
+
+    The first message that can be decoded as one of `types` fixes the type of all later messages.
+    """
 
     def __init__(self, session: zenoh.Session, key: str, types: tuple[type, ...]) -> None:
         self.key = key
@@ -105,7 +108,7 @@ class Sensor:
 STREAMS = {
     "wheels": FOUR, "gyro": ("yaw_rate",), "places": ("x", "y"), "commands": APPLIED,
 }  # fmt: skip
-"""The kinds of recorded messages, each with the columns of a log that its values fill."""
+"""Maps each kind of recorded message to the columns of a log that its values fill."""
 
 
 class Sample(Struct, frozen=True):
@@ -120,9 +123,10 @@ class Sample(Struct, frozen=True):
 
 
 class Recorder:
-    """Collects the samples of one leg. Each `came` is the time of arrival of a message, s.
+    """Collects the samples of one leg.
 
-    `joints` names the wheel joints: front right, front left, rear left, rear right.
+    Every argument `came` is the time of arrival of the message, s. `joints` names the wheel joints:
+    front right, front left, rear left, rear right.
     """
 
     def __init__(self, joints: Sequence[str]) -> None:
@@ -154,9 +158,10 @@ class Recorder:
         self.samples[stream].append(Sample(came, made, values))
 
     def log(self) -> Log:
-        """Return the leg as a log.
+        """Return the samples of the leg as a log.
 
-        Raises `LogError` if wheel samples are too few or if two wheels of a side disagree.
+        Raises `LogError` if there are too few wheel samples, or if two wheels of a side contradict
+        each other.
         """
         sensors: list[dict[str, Floats]] = []
         for stream, names in STREAMS.items():
@@ -167,10 +172,10 @@ class Recorder:
 
 
 def times(samples: Sequence[Sample]) -> Floats:
-    """Return the times of samples on this computer's clock, s.
+    """Return the times at which the samples were made, s, on this computer's clock.
 
-    The times come from the stamps (`on_arrival_clock`). If any stamp is missing, they are the times
-    of arrival.
+    They are computed from the stamps (`on_arrival_clock`). If any stamp is missing, they are the
+    times of arrival.
     """
     came = np.array([sample.came for sample in samples])
     made = np.array([math.nan if s.made is None else s.made for s in samples])
@@ -210,7 +215,8 @@ class RobotOnBus:
         Raises:
             DisturbedError: the leg was halted, and can be repeated.
             GuideError: the leg was halted for another reason.
-            LogError: wheel samples are too few, or two wheels of a side disagree.
+            LogError: there are too few wheel samples, or two wheels of a side contradict each
+                other.
         """
         recorder = Recorder(self._joints)
         self._drain()
@@ -280,5 +286,8 @@ class RobotOnBus:
         self._watch.look(clock.steady_s())
 
     def _full(self, key: str) -> str:
-        """Return the Zenoh key, with this robot's id in front if `acsard topics` lists the key."""
+        """Return the full Zenoh key for `key`.
+
+        If `acsard topics` lists the key, this robot's id is put in front of it.
+        """
         return self._client.key(key) if by_key(key) is not None else key

@@ -32,17 +32,21 @@ MOST_REPEATS = 2
 """Maximum number of times that a disturbed leg is repeated on a real robot."""
 
 MOST_SIMULATED_REPEATS = 20
-"""Maximum repeats of a disturbed leg on the simulator, where no person sets the robot back."""
+"""Maximum number of times that a disturbed leg is repeated on the simulator.
+
+It is large because no person has to put the simulated robot back.
+"""
 
 
 def begins_again(legs: Sequence[Leg], number: int, *, sensor: bool) -> int:
-    """Return the index of the leg to drive next after the disturbed leg `number`.
+    """Return the index of the leg with which the drive continues after the disturbed leg `number`.
 
     If `sensor` is true, a sensor measures the motion, and only the disturbed leg is repeated.
     Otherwise a person measures by tape, relative to the place where the person put the robot. The
-    drive then returns to the last leg before which the person placed the robot. The exception is a
-    leg that needs only the robot's angle at its start (`angle_before`). The person measures this
-    angle again, and only that leg is repeated.
+    drive then returns to the last leg before which the person placed the robot.
+
+    Some legs need only the robot's angle at their start (`angle_before`). Such a leg is repeated
+    alone, after the person has measured this angle again.
     """
     if sensor or angle_before(legs[number]):
         return number
@@ -66,6 +70,8 @@ def guide(
 
     Args:
         name: the name of the method, as in `METHODS`.
+        setup: the robot, and the speeds and lengths of its drive.
+        prompt: shows texts to the person, and asks the questions.
         ride: the function that drives one leg and returns the recording of this leg.
         simulated: whether the robot is the built-in simulator, which allows more repeats.
         true_positions: whether the recorded positions are the simulator's true ones.
@@ -97,7 +103,10 @@ def guide(
             answers[leg, ask.name] = UNITS[ask.unit] * prompt.number(ask)
 
     def repeat(disturbed: DisturbedError) -> int:
-        """Return the index of the leg to drive next. Raise `disturbed` after too many repeats."""
+        """Return the index of the leg with which the drive continues.
+
+        Raise `disturbed` after too many repeats.
+        """
         leg = legs[number]
         repeats[leg.name] = repeats.get(leg.name, 0) + 1
         if repeats[leg.name] > most:

@@ -48,9 +48,10 @@ UNKNOWN = 1.0
 """Prior standard deviation of the mean wheel radius, as a fraction."""
 
 PRIOR_FREE = 4.0
-"""Degrees of freedom of the assumed noise of the readings.
+"""Weight of the assumed noise of the readings, in degrees of freedom.
 
-The fit averages the assumed noise with the noise that the readings show. This is its weight.
+The fit averages the assumed noise with the noise that the scatter of the readings shows. The weight
+of the latter is the number of surplus readings.
 """
 
 MOST_STEPS = 50
@@ -63,7 +64,10 @@ WORST_CONDITION = 1e8
 ACTIVE = [P.LEFT, P.RIGHT, P.INVERSE_TRACK, P.TRACK_GROWTH]
 
 PRECISE = 0.2
-"""Largest relative standard deviation of a reading of a turn from which the fit may start."""
+"""Largest relative standard deviation of a `turned` reading from which the fit may start.
+
+The first value for the effective track is computed from this reading.
+"""
 
 
 class Reading(Struct, frozen=True, dict=True):
@@ -81,19 +85,22 @@ class Reading(Struct, frozen=True, dict=True):
         return joined(self.rides)
 
     def residual(self, prediction: float) -> float:
-        """Return the measured value minus `prediction`. For an `angle`, whole turns are removed."""
+        """Return the measured value minus `prediction`.
+
+        For an `angle`, the result is reduced by whole turns to a value from -pi to pi.
+        """
         off = self.value - prediction
         return math.remainder(off, 2 * math.pi) if self.quantity == "angle" else off
 
 
 class Predicted(Struct, frozen=True):
-    """The value of a reading, in rad or m, that the rolling of the wheels predicts."""
+    """A prediction of a reading from the rolling of the wheels."""
 
     value: float
     derivatives: Floats
-    """Derivatives of the value with respect to the parameters, shape (COUNT,)."""
+    """Derivatives of `value` with respect to the parameters, shape (COUNT,)."""
     variance: float
-    """Variance of the value due to skidding, rad2 or m2."""
+    """Variance of `value` due to skidding, rad2 or m2."""
 
 
 class TapeFit(Struct, frozen=True):
@@ -116,7 +123,10 @@ def joined(rides: Sequence[Run]) -> WheelSteps:
 
 
 def predicted(steps: WheelSteps, quantity: Quantity, base: Base, parameters: Floats) -> Predicted:
-    """Return the prediction of a reading of `quantity` from the wheels and these parameters."""
+    """Return a prediction of a reading of `quantity`.
+
+    It is computed from the rolling of the wheels in `steps`, with these parameters.
+    """
     driven = path(steps, base, parameters)
     rolled = base.radius * float(np.abs(steps.left).sum() + np.abs(steps.right).sum()) / 2
     derivatives = np.zeros(COUNT)
@@ -161,7 +171,10 @@ def fit_readings(readings: Sequence[Reading], base: Base) -> TapeFit:
 
 
 def _starting_parameters(readings: Sequence[Reading], base: Base) -> Floats:
-    """Return parameters accurate enough to find the whole turns of each `angle` reading."""
+    """Return parameters from which the fit can start.
+
+    They are accurate enough to find the number of whole turns in each `angle` reading.
+    """
     start = base.start()
     for reading in readings:
         if reading.quantity == "turned" and reading.deviation < PRECISE * abs(reading.value):
@@ -234,7 +247,10 @@ def _held_out_residual(
 
 
 READ_M = 0.002
-"""Standard deviation of a distance by tape, m, and of the placement of a robot on a line, m."""
+"""Standard deviation of a distance by tape, m.
+
+It is also that of the place of a robot that a person puts on a line.
+"""
 
 CREDIBLE = 0.85, 3.0
 """Range of credible ratios of effective track to wheel separation."""
@@ -246,7 +262,8 @@ Answers = dict[tuple[str, str], float]
 def reading(measure: Measure, leg: str, rides: Mapping[str, Run], answers: Answers) -> Reading:
     """Return the reading that `measure` defines, from a person's answers after the leg `leg`.
 
-    Raises `RefusedError` if the answers are impossible.
+    `rides` contains the recording of each leg, by the leg's name. Raises `RefusedError` if the
+    answers are impossible.
     """
     driven = tuple(rides[name] for name in measure.over or (leg,))
     if isinstance(measure, Mean):
@@ -265,9 +282,10 @@ def reading(measure: Measure, leg: str, rides: Mapping[str, Run], answers: Answe
 
 
 def track_ratio(reading: Reading, drive: DriveConfig) -> float:
-    """Return the approximate ratio of effective track to wheel separation, from a full turn.
+    """Return the approximate ratio of effective track to wheel separation.
 
-    The next legs are planned with this ratio. Raises `GuideError` if the ratio is not credible.
+    `reading` is that of one full turn. The next legs are planned with this ratio. Raises
+    `GuideError` if the ratio is not credible.
     """
     # Use the measured radius and separation without the configured multipliers.
     base = Base(drive.wheel_radius, drive.wheel_separation, 1.0, 1.0, 1.0)
@@ -318,7 +336,7 @@ Above `TURNED`, the drive counts as a turn; below `STRAIGHT`, it counts as strai
 def calibrated(
     tool: str, readings: Sequence[Reading], drive: DriveConfig, odometry: OdometryConfig
 ) -> Calibration:
-    """Return the calibration from readings with `tool`, such as "a tape".
+    """Return the calibration from readings that a person made with `tool`, such as "a tape".
 
     Raises `RefusedError` if the readings contradict each other or are too inaccurate.
     """
@@ -354,8 +372,8 @@ def calibrated(
 def _improvement(readings: Sequence[Reading], base: Base, fit: TapeFit, rate: Rates) -> Improvement:
     """Return the odometry errors with the configured and with the new parameters.
 
-    Each reading shows one error. For the error with the new parameters, these come from a fit
-    without this reading. If that fit fails, they come from the fit to all readings.
+    Each reading shows one error. To measure the error with the new parameters, they are fitted to
+    all other readings. If that fit fails, the parameters that fit all readings are used.
     """
     sums = {name: np.zeros(3) for name in ("turn", "straight", "place")}
     present = fit.parameters.copy()

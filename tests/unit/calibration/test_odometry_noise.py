@@ -366,8 +366,10 @@ def test_noise_is_written_beside_the_geometry_and_told(found: Calibration) -> No
     assert after.distance_variance_per_metre < before.distance_variance_per_metre
     made = report("a.csv", found, DriveConfig(), "")
     told = plain(*parts(made, found, "f", guided=False), width=SENTENCES)
-    assert "random heading error that the odometry messages state after 10 m of driving: " in told
-    assert "random distance error that the odometry messages state after 10 m" in told
+    assert (
+        "random heading error after 10 m of driving, according to the odometry messages: " in told
+    )
+    assert "random distance error after 10 m of driving, according to the odometry" in told
 
 
 @pytest.mark.slow

@@ -32,7 +32,7 @@ def test_rows_in_no_order_are_sorted_and_told() -> None:
 def test_repeated_times_are_taken_once_and_told() -> None:
     log = runs(read((HEADER + "\n".join(rows(0) + rows(0))).encode()))
     assert len(log.runs[0].t) == 100
-    assert any("repeat a time" in note for note in log.notes)
+    assert any("an earlier row has the same time" in note for note in log.notes)
 
 
 def test_a_time_that_begins_anew_begins_a_run() -> None:
