@@ -172,7 +172,8 @@ class Guide:
         if self._errand is None or self._task is None:
             return Ending()
         self._errand.leave()
-        what = f"the job {self._errand.name} started by {self._errand.by}"
+        name = {"calibrate": "calibration"}.get(self._errand.name, self._errand.name)
+        what = f"the {name} started by {self._errand.by}"
         done, _ = await asyncio.wait([self._task], timeout=1.0)
         return Ending(f"{what} has ended" if done else f"{what} is being ended", bool(done))
 
