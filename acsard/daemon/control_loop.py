@@ -71,8 +71,8 @@ NOT_STORED = (
     "the new state is not stored on the disk yet; if the daemon restarts before it is stored, it "
     "may lose a stop"
 )
-"""Text added to an answer that is sent before its latches are in the latch file, because the disk
-is slow."""
+"""If the disk is slow, an answer is sent before its latches are in the latch file. This text is
+then added to the answer."""
 
 BUS_STUCK = Event(
     "bus_stuck",

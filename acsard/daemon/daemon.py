@@ -208,7 +208,10 @@ async def run(
 def _recorder(
     config: Config, log: Callable[[Event], None], wall_ns: int, stack: AsyncExitStack
 ) -> Recorder | None:
-    """Return the black box, which `stack` closes; None if `[record] directory` is empty."""
+    """Return the recorder of the black box, or None if `[record] directory` is empty.
+
+    `wall_ns` is the wall-clock time at which the daemon started, ns. `stack` closes the recorder.
+    """
     if not config.record.directory:
         return None
     recorder = Recorder(config, log, wall_ns)

@@ -118,8 +118,7 @@ class LatchFile:
         self._disk = threading.Lock()
         """Held by the thread that uses the disk. The control loop never takes it."""
         self._abandoned = False
-        """True if the time limit of the first read and write has passed. `start` has then returned
-        without their results."""
+        """True if `start` has stopped waiting for the first read and write of the file."""
         self._found: Latches | None = None
         """The latches that the file contained when the daemon started; None before it is read."""
         self._blind = False

@@ -183,7 +183,7 @@ class Handover:
     """
 
     def __init__(self, latches: Latches, keeper: LatchKeeper | None) -> None:
-        """Start with `latches`, which `keeper` has stored already.
+        """Begin with the latches with which the robot starts. The keeper has them already.
 
         If `keeper` is None, latches are not stored.
         """

@@ -179,9 +179,10 @@ def memory(late: Lateness) -> str:
 def disk(late: Lateness) -> str:
     """Return the cause in words if the loop's thread waited for a disk, else "".
 
-    Some kernels measure how long the loop's own thread waited. Otherwise the time in which any
-    program waited for a disk is used, but only if the loop's thread itself read from a disk or
-    wrote to one, because other programs may wait for a disk at any time.
+    One of two times must be long enough. The first is the time for which the loop's own thread
+    waited for a disk, which not every kernel measures. The second is the time in which any program
+    waited for a disk. It counts only if the loop's thread itself read from a disk or wrote to one,
+    because other programs may wait for a disk at any time.
     """
     before, after = late.before, late.after
     own_ns, all_ns = after.own_disk_ns - before.own_disk_ns, after.disk_ns - before.disk_ns

@@ -59,8 +59,8 @@ LOOK_AGAIN_NS = 10 * NS_PER_S
 process."""
 
 NEWS_NS = 60 * NS_PER_S
-"""If an event has the same causes as an event in the time before it, ns, it is not logged
-immediately. It waits for the next log line about missed periods (`Event.news`)."""
+"""For this time after an event, ns, further events with the same causes are not logged immediately.
+They wait for the next log line about missed periods (`Event.news`)."""
 
 MOST = 16
 """Size of two queues: the late periods that wait for the thread, and the events that wait for a
@@ -137,7 +137,8 @@ class LateWatch:
 
         Args:
             now_ns: monotonic time at which the step began, ns.
-            late_ns: time from the due time of the first missed period to `now_ns`, ns.
+            late_ns: time from the due time of this period, or of the first missed period, to
+                `now_ns`, ns.
             missed: number of periods just before this one that got no step.
         """
         before, times = self._times, b""

@@ -176,7 +176,8 @@ class Stopwatch:
 
         Args:
             now_ns: monotonic time at which the step began, ns.
-            late_ns: time from the due time of the first of these periods to `now_ns`, ns.
+            late_ns: time from the due time of this period, or of the first missed period, to
+                `now_ns`, ns.
             missed: number of periods just before this one that got no step.
         """
         self.figures["period_lateness"].add(now_ns, late_ns)

@@ -25,8 +25,8 @@ NO_PERIOD = Period(0, 0)
 
 
 BREATH_NS = 1_000_000
-"""Time between the end of a line on the wire and the next line, ns. In this time the board can
-reply."""
+"""Shortest time from the end of a line on the wire to an early line after it, ns. In this time the
+board can reply."""
 
 IDLE_WAKES = 3
 """Input from the bus can run extra steps in a period. After more than this number of them without
@@ -70,7 +70,8 @@ class Pace:
         """Record the result of a step.
 
         Args:
-            tick: Whether the line of a period was due in the step. If not, a line is an early line.
+            tick: Whether the step had to write the line of a period. The line of any other step is
+                an early line.
             due: Whether the step had a line to write.
             went: Whether the line was written.
             news: Whether the command or the mode has changed since the last line that was due, or
@@ -89,7 +90,7 @@ class Pace:
 
     @property
     def waits(self) -> bool:
-        """Whether a new command waits for an early line because it came too soon after the last."""
+        """Whether a new command waits because it came too soon after the last line."""
         return self._waiting and self._possible and not self._tried
 
     def retry_ns(self, sent_ns: int) -> int | None:

@@ -73,8 +73,8 @@ class _Pending(Struct):
 
     request: Request
     due_ns: int
-    """Monotonic time after which the request gets a reply that it has failed, ns. If the robot is
-    just deciding about the request, the reply waits for the robot's answer."""
+    """Monotonic time after which the client gets a reply that the request has failed, ns. This
+    limit does not apply while the robot is deciding about the request."""
     edit: Edit | None = None
     """The prepared change of the file. None until the thread has checked the request."""
     answer: Answer | None = None

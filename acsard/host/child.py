@@ -35,7 +35,7 @@ OUR_UNIT = ("NOTIFY_SOCKET", "INVOCATION_ID")
 could send notifications to systemd in its parent's name."""
 
 BEAT_S = 0.5
-"""A child sends a sign of life at least this often, and its parent checks for one as often, s."""
+"""At least once in this time, s, a child sends a sign of life and its parent looks for one."""
 
 SILENT_NS = 3 * NS_PER_S
 """If a child gives no sign of life for this time, ns, its parent kills it. The TLS gateway already

@@ -180,7 +180,7 @@ WRONG_MODE = "wrong mode or owner"
 
 
 class Write(Struct, frozen=True):
-    """Step that writes a file. `why` is the reason for the user, or ""."""
+    """Step that writes a file. `why` is the reason, which the user sees, or ""."""
 
     file: File
     why: str = ""
@@ -191,7 +191,7 @@ class Write(Struct, frozen=True):
         return f"write   {self.file.path}  ({size} bytes, mode {mode:o}{why})"
 
     def do(self) -> None:
-        """Write the file, and create missing directories that the service's user may enter."""
+        """Write the file, and create missing directories, which all users may enter."""
         path = self.file.path
         made = [place for place in path.parents if not place.exists()]
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -230,7 +230,7 @@ class Remove(Struct, frozen=True):
 
 
 class Keep(Struct, frozen=True):
-    """Step that leaves a file or directory as it is. `why` is the reason for the user, or ""."""
+    """Step that leaves a file or directory as it is. `why` is the reason, or ""."""
 
     path: Path
     why: str = ""
@@ -418,7 +418,7 @@ def own_places() -> list[Path]:
 
 
 def strangers(files: Iterable[File], places: Iterable[Path]) -> list[Path]:
-    """Return the paths in the directories `places` that are not in the list `files`."""
+    """Return the entries of the directories `places` that are not files of the installation."""
     ours = {file.path for file in files}
     inside = (path for place in places if place.is_dir() for path in sorted(place.iterdir()))
     return [path for path in inside if path not in ours]
@@ -442,8 +442,8 @@ def uninstalling(
         force: whether to remove changed files too, except those with `File.kept`.
         purge: whether to remove everything.
         stateful: the units that have a state directory. Only `purge` removes these directories. If
-            such a unit is missing then, the steps first install it again, because only systemd can
-            remove the directory.
+            such a unit is missing, a purge first installs it again, because only systemd can remove
+            the directory.
     """
     wanted, stateful = list(wanted), list(stateful)
     # Only systemd knows the real path of a state directory, and only while the unit is installed.

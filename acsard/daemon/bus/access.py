@@ -39,8 +39,8 @@ from acsard.core.ros.transports import PARAMETERS, Endpoint, claims, endpoints, 
 from acsard.core.values import ROLES, ROOT, Role
 
 LOCAL_LINKS = ("tcp",)
-"""Protocols of links without a certificate. Such links connect programs of one machine, unless
-`bus.insecure` allows others."""
+"""Link protocols that use no certificate. Such a link connects two programs on the same machine,
+unless `bus.insecure` permits links to other machines."""
 
 TOKENS = ("@ros2_lv/**", "@/*/@ros2_lv/**")
 """Key expressions of the liveliness tokens of ROS."""

@@ -46,7 +46,8 @@ class Replies:
         self._queries: dict[int, tuple[zenoh.Query, str]] = {}
         self._tickets = count(1)
         self._queue: queue.SimpleQueue[Reply | int | None] = queue.SimpleQueue()
-        """Replies and retired tickets, in order. None ends the thread."""
+        """Replies to send, and tickets (numbers) of queries to end, in the order of their arrival.
+        None ends the thread."""
         self._thread: BusThread | None = None
 
     def issue(self, query: zenoh.Query, key: str) -> int | None:
@@ -114,8 +115,8 @@ class Replies:
 
 
 ARRIVALS = 16
-"""Size of the buffer of each command key, in samples. A newer sample displaces the oldest one. A
-sender at the limit of 1000 Hz puts 10 samples into one step at 100 Hz."""
+"""Size of the buffer of each command key, in samples. A newer sample displaces the oldest one. At
+100 steps a second, a sender at the limit of 1000 Hz puts 10 samples between two steps."""
 
 SAMPLES = 64
 """Size of the buffer for gyro samples. A gyro at 400 Hz fills it if the control loop takes no
@@ -138,8 +139,8 @@ full, further queries are refused with `BUSY`. One slow query is answered per st
 
 ATTACHMENT_BYTES = 256
 """Largest size of an attachment, bytes. An attachment of rmw_zenoh has 33 bytes, and an attachment
-of acsard has up to 140. A longer attachment is cut off, so that no sender can be decoded from
-it."""
+of acsard has up to 140. The rest of a longer attachment is cut off. Such an attachment cannot be
+decoded, so it names no sender."""
 
 STOP, SET = service_key("stop"), service_key("set")
 STOP_ALL = full_key("*", "stop")

@@ -104,10 +104,10 @@ def certificate_trouble(authority: Path, certificate: Path, key: Path) -> str:
 
 
 def reachable(endpoint: str) -> str:
-    """Return the endpoint to which a program on this machine can connect.
+    """Return the endpoint with which a program on this machine can connect to a listening program.
 
-    This is `endpoint` with the loopback address in place of 0.0.0.0 or [::], which stand for all
-    addresses of the machine.
+    `endpoint` is the endpoint at which that program listens. If its address is 0.0.0.0 or [::],
+    which stand for all addresses of the machine, the loopback address replaces it.
     """
     return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 

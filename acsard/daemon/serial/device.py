@@ -104,10 +104,10 @@ def unsent(fd: int) -> int:
 
 
 def draining(fd: int, deadline_ns: int) -> Iterator[float]:
-    """Yield a pause in seconds until the driver has sent all bytes.
+    """Yield the length of each pause, in seconds, until the driver has sent all bytes.
 
-    The caller must sleep for each pause. The iteration also ends at the monotonic time
-    `deadline_ns`.
+    The caller must sleep for this time after each step of the iteration. The iteration also ends at
+    the monotonic time `deadline_ns`.
     """
     while unsent(fd) and clock.mono_ns() < deadline_ns:
         yield DRAIN_STEP_S

@@ -31,8 +31,8 @@ OPEN_TIMEOUT_S = 5.0
 does not try to open the same device again until the hung call returns."""
 
 BACK_OFF_S = (0.05, 0.1, 0.2)
-"""Pauses between the attempts to reopen the port, s. After the third attempt, the last pause
-repeats. The first pauses are short, because udev soon sets the group of a new device."""
+"""Pauses between the attempts to reopen the port, s. All further pauses are as long as the third
+one. The first pauses are short, because udev soon sets the group of a new device."""
 
 PERMISSION_PATIENCE_S = 2.0
 """Time for which the starting daemon waits until udev grants access to the device, s. If the daemon
