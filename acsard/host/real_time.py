@@ -17,7 +17,8 @@ PRIORITY = 10
 SPIN_S = 1
 """If the control loop runs for longer than this without a pause, s, the kernel ends the process.
 Otherwise a loop that hangs would block all ordinary programs, because it has priority over them. A
-step takes a thousandth of this time."""
+step takes a thousandth of this time. The systemd service has no such limit: systemd's watchdog ends
+a daemon that hangs."""
 
 DOZE = "/dev/cpu_dma_latency"
 """Device file through which a process limits the time that a processor takes to wake up."""
