@@ -64,14 +64,15 @@ QUERIES_PER_STEP = 8
 a flood of queries does not make the control loop miss a period."""
 
 LATE_NS = 1_000_000
-"""Shortest delay from the start of a step to the write of its line that counts, ns. A shorter delay
-is passed to the robot as 0, because the estimated sample times are less accurate than that."""
+"""The delay from the start of a step to the write of its line is passed to the robot as 0 if it is
+shorter than this time, ns. The estimated sample times are less accurate than that."""
 
 NOT_STORED = (
-    "the new state is not stored on the disk yet; if the daemon restarts before that, it may lose "
-    "a stop"
+    "the new state is not stored on the disk yet; if the daemon restarts before it is stored, it "
+    "may lose a stop"
 )
-"""Text added to an answer that no longer waits for the latch file, because the disk is slow."""
+"""If the disk is slow, an answer is sent before its latches are in the latch file. This text is
+then added to the answer."""
 
 BUS_STUCK = Event(
     "bus_stuck",
@@ -102,25 +103,36 @@ class ControlLoop:
         settings_file: SettingsFile | None = None,
         late_watch: LateWatch | None = None,
     ) -> None:
-        """Create the robot.
+        """Create the robot and the parts that convert its inputs and outputs.
 
         Args:
+            config: the configuration at the start of the daemon.
+            info: the answer to queries of the key `info`.
+            port: the serial port to the board.
+            bus: the robot's keys on the Zenoh bus.
+            start: the time at which the daemon started.
+            log: function that writes an event to the log.
+            mono_ns: function that returns the monotonic time, ns.
             certificate_ends: wall-clock time at which each certificate expires, ns since 1970, by
                 the name of the certificate. None or empty without TLS.
-            others: events of the daemon's other parts. Each step takes them and empties the list.
+            others: list to which other parts of the daemon append events. Each step passes these
+                events to the robot and empties the list.
             beside: function that returns the present value of a key that another part of the
                 daemon publishes, or None for any other key.
-            adopted: function that is called with each configuration that comes into force after
-                the start.
+            adopted: function that is called with each new configuration that comes into force
+                after the start.
+            recorder: records each step. With None nothing is recorded.
             latches: the latches with which the robot starts.
             keeper: stores the latches, so that they survive a restart. With None the latches are
                 not stored.
+            settings_file: writes settings to the configuration file. With None a `set` with `keep`
+                is refused.
             late_watch: finds the causes of late periods. With None no causes are reported.
         """
         self.robot = Robot(config, latches)
         self.report = Report(config, start, certificate_ends)
         self.shutting_down = False
-        """True from the start of the shutdown. The robot then ramps to zero and stays there."""
+        """True once the shutdown has begun. The robot then ramps to zero and stays at rest."""
         self.outputs: Outputs | None = None
         self._start_ns = start.mono_ns
         self._others = [] if others is None else others
@@ -131,10 +143,12 @@ class ControlLoop:
         """`_started` has the limits at the daemon's start. `_speed` handles the key
         `speed_limit`."""
         self._kept: tuple[Latches, LimitsConfig, LimitsConfig, Latches] | None = None
-        """Cache of `_to_keep`: the latches and limits of its last computation, and the result."""
+        """Cache of `_to_keep`: the latches, the two sets of limits that it last compared, and the
+        result."""
         self._step_answers: tuple[Answer, ...] = ()
         self._answers: deque[tuple[int, Answer]] = deque()
-        """Answers that wait for the latch file, and the monotonic times of their queueing, ns."""
+        """Answers that wait for the latch file. Each is paired with the monotonic time at which it
+        was queued, ns."""
         self._got = NOTHING
         """The input that the present step has taken from the bus."""
         stop = self.robot.session.codec.stop
@@ -150,9 +164,10 @@ class ControlLoop:
         """Gyro samples that have arrived since the last step."""
         self._port, self._bus, self._log, self._mono_ns = port, bus, log, mono_ns
         self._superseded, self._trip, self._late_ns = False, "", 0
-        """Three facts about the last line. `_superseded` says whether a newer line must replace it.
-        `_trip` says why the guard replaced it; "" if the guard did not. `_late_ns` is its delay
-        from the start of its step, ns; 0 if that is below `LATE_NS`."""
+        """Three facts about the last line to the board. `_superseded` is true if the port did not
+        send it, and a newer line must replace it. `_trip` is the reason why the guard sent zeros
+        instead, or "". `_late_ns` is the delay from the start of the step to the write of the line,
+        ns, or 0 if that is below `LATE_NS`."""
         # Use the longest line of both directions, because answers must not queue in the MCU either.
         period_ns = int(NS_PER_S / config.rate_hz)
         self._pace = Pace(wire_ns(config.mcu.line_bytes, config.mcu.baud_rate), period_ns)
@@ -160,31 +175,36 @@ class ControlLoop:
 
     @property
     def at_rest(self) -> bool:
-        """True if the last step commanded zero speed, as every step without a link does."""
+        """True if the last step commanded zero speed. Every step without a link does so."""
         outputs = self.outputs
         return outputs is not None and not any(outputs.speeds.as_tuple())
 
     def totals(self, now_ns: int) -> dict[str, float]:
-        """Return the values of the log line `ended`: run time in s, distance in m, counters."""
+        """Return the fields of the log event `ended`: run time in s, distance in m, counters."""
         seconds, metres = (now_ns - self._start_ns) / NS_PER_S, self.robot.travelled
         shot = self.robot.snapshot(now_ns)
         return {"seconds": round(seconds, 1), "metres": round(metres, 2), **shot.counters}
 
     @property
     def retry_ns(self) -> int | None:
-        """Monotonic time of the extra step for a waiting command, ns; None if no command waits.
+        """Monotonic time at which an extra step can send a waiting command, ns.
 
-        A command waits if it came too soon after a line.
+        A command waits if it came too soon after the last line to the board. None if no command
+        waits.
         """
         return self._pace.retry_ns(self._port.sent_ns) if self._pace.waits else None
 
     @property
     def listens(self) -> bool:
-        """Whether a command that arrives now gets a step of its own, before the next period."""
+        """Whether a command that arrives now gets a step at once, not only in the next period."""
         return self._pace.listens
 
     def step(self, now: Instant, period: Period = NO_PERIOD) -> Outputs:
-        """Run one control step. `period` is `NO_PERIOD` for a step between two periods."""
+        """Run one control step.
+
+        `period` says how many periods have ended since the last step. It is `NO_PERIOD` for an
+        extra step between the ends of two periods.
+        """
         self._got = NOTHING
         try:
             return self._step(now, period)
@@ -255,9 +275,10 @@ class ControlLoop:
         return outputs
 
     def _decided(self, inputs: Inputs) -> tuple[Outputs, bool]:
-        """Run the step and send its line. Return a pair: the outputs, and whether a line was sent.
+        """Run the robot's step, send its line, and record the step.
 
-        The recorder gets the step even if this method raises.
+        Return the outputs, and whether a line was sent. The step is recorded even if this method
+        raises.
         """
         try:
             outputs = self.outputs = self.robot.step(inputs)
@@ -279,8 +300,9 @@ class ControlLoop:
     def _to_keep(self, latches: Latches) -> Latches:
         """Return the robot's latches as the latch file stores them for the next start.
 
-        A limit that a `set` has lowered stays in force over a restart. A limit from a message on
-        the key `speed_limit` does not, because the program that would lift it may be gone.
+        A limit that a `set` request has lowered stays in force over a restart. A limit from a
+        message on the key `speed_limit` does not stay in force, because the program that would
+        lift it may have ended by then.
         """
         now, file = self._speed.settings.limits, self._settings_file
         if file is not None:
@@ -376,7 +398,7 @@ class ControlLoop:
         return tuple(commands), tuple(refusals), tuple(requests)
 
     def _note(self, got: BusInput) -> None:
-        """Count and report losses and blockages of the bus, and changes of its connections."""
+        """Count and report lost samples and messages, a blocked bus, and new router connections."""
         if got.overrun:
             self.robot.counters["bus_overrun"] += got.overrun
         if got.dropped:
@@ -388,9 +410,10 @@ class ControlLoop:
             self._others.append(BUS_STUCK)
 
     def _served(self, query: Query, now: Instant, refusals: list[Refusal]) -> Request | None:
-        """Answer a query and return None, or return the request about which the robot decides.
+        """Answer a query, or return the request that the robot must answer.
 
-        A `set` with `keep` goes to the settings file first. A refusal is added to `refusals`.
+        Return None if the query was answered, or if it is a `set` with `keep`, which waits for the
+        settings file. If the query cannot be decoded, add the reason to `refusals`.
         """
         try:
             served = self._queries.serve(query, self._current, self.outputs)
@@ -410,7 +433,7 @@ class ControlLoop:
         return None
 
     def _keep(self, request: Request, now: Instant) -> None:
-        """Pass a `set` with `keep` to the settings file. Refuse it if there is no settings file."""
+        """Pass a `set` with `keep` to the settings file, or refuse it if there is no such file."""
         if self._settings_file is None:
             text = (
                 "nothing is set: this daemon has no configuration file in which to keep settings; "
@@ -421,9 +444,10 @@ class ControlLoop:
             self._settings_file.keep(request, now.mono_ns)
 
     def _keepable(self, now: Instant) -> tuple[Request, ...]:
-        """Return each `set` with `keep` that the robot may obey now.
+        """Return the `set` requests with `keep` whose settings the robot must use now.
 
-        Also queue the answers to the requests that were written to the file, refused or overdue.
+        Also queue the answers to those requests whose settings were written to the file, and to
+        those that were refused or took too long.
         """
         if self._settings_file is None:
             return ()
@@ -432,9 +456,10 @@ class ControlLoop:
         return tuple([one for one in results if isinstance(one, Request)])
 
     def _send(self, outputs: Outputs, now: Instant, tick: bool) -> bytes | None:
-        """Let the guard check the line, and offer it to the port.
+        """Let the guard check the line in `outputs`, and offer it to the port.
 
-        Return the line if the port wrote it, else None.
+        `now` is the time of the step. `tick` is true for the line of a period, and false for a line
+        between two periods. Return the line if the port wrote it, else None.
         """
         line, self._trip = self._guard.check(outputs)
         self._superseded, self._late_ns = False, 0
@@ -477,10 +502,10 @@ class ControlLoop:
             self._log(event)
 
     def _answer(self, now: Instant, *, last: bool = False) -> None:
-        """Send the queued answers.
+        """Send the queued answers that need not wait any longer.
 
-        An answer waits until the latches are stored, but at most `ANSWER_NS`. If `last` is true, no
-        answer waits any longer.
+        An answer waits until the latches are stored, but at most `ANSWER_NS`. If `last` is true,
+        all queued answers are sent now. `now` is the time of the step.
         """
         held, before_ns = self._handover.held, now.mono_ns - ANSWER_NS
         trouble = "" if held else self._handover.trouble or NOT_STORED
@@ -514,7 +539,7 @@ class ControlLoop:
 
 
 def _stops(got: BusInput) -> list[str]:
-    """Return the name of the client for each stop in this input."""
+    """Return the names of the clients that sent the stops in `got`, one name for each stop."""
     puts = [one for one in got.arrivals if one.key == "stop" and one.put]
     calls = [query for query in got.queries if query.topic == "srv/stop"]
     names = [caller_name(put.via, put.attachment, put.sender) for put in puts]

@@ -44,11 +44,14 @@ from acsard.host.version import version
 from acsard.recording.recorder import Recorder
 
 EXIT_RAMP_S = 0.6
-"""Time limit of the ramp to zero at the shutdown, s. After this time, STOP is sent in any case."""
+"""Longest duration of the ramp to zero speed at the shutdown, s. Then STOP is sent in any case."""
 
 
 class Departure:
-    """The shutdown. The first signal begins a ramp to zero, and the second cuts the ramp short."""
+    """State of the daemon's shutdown.
+
+    The first signal begins a ramp to zero speed, and a second signal cuts the ramp short.
+    """
 
     def __init__(self, log: Log, wake: Callable[[], None], manager: Systemd) -> None:
         self._log, self._wake, self._manager = log, wake, manager
@@ -64,7 +67,7 @@ class Departure:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> bool:
-        """Suppress the cancellation if a signal ended the start, because that is not an error."""
+        """Suppress the `CancelledError` of a start that a signal ended. That is not an error."""
         return kind is asyncio.CancelledError and self.begun_ns is not None
 
     def started(self) -> None:
@@ -82,7 +85,11 @@ class Departure:
         self._wake()
 
     def over(self, now_ns: int, at_rest: bool) -> bool:
-        """Return whether the shutdown's ramp has ended, was cut short or has taken too long."""
+        """Return whether the daemon may end now.
+
+        It may end when the robot is at rest, after a second signal, or when the ramp has taken
+        `EXIT_RAMP_S`. `at_rest` says whether the last step commanded zero speed.
+        """
         if self.begun_ns is None:
             return False
         return at_rest or self.hurried or now_ns - self.begun_ns > EXIT_RAMP_S * NS_PER_S
@@ -93,8 +100,8 @@ SWITCH_INTERVAL_S = 0.0005
 5 ms is half a control period."""
 
 LATCHED_PERIOD_S = 5.0
-"""Interval at which the latched topic `tf_static` is published again, s. Some subscribers cannot
-query the last sample of a latched topic."""
+"""Interval at which the topic `tf_static` is published again, s. The topic is latched, but some
+subscribers cannot query the last sample of a latched topic."""
 
 Announce = Callable[[str, str], None]
 """Callback that runs when the start is complete. Its arguments are the path of the serial device,
@@ -114,7 +121,8 @@ async def run(
     Raises a `MendableError` if the daemon cannot start.
 
     Args:
-        announce: called once, when the start is complete.
+        log: the daemon's log.
+        announce: function that is called once, when the start is complete.
         gateway: arguments of the `acsard gateway` process, which this daemon starts if
             `bus.outside` names endpoints. None if the gateway is a service of its own.
         page: arguments of the `acsard web` process, or None for no page.
@@ -200,7 +208,10 @@ async def run(
 def _recorder(
     config: Config, log: Callable[[Event], None], wall_ns: int, stack: AsyncExitStack
 ) -> Recorder | None:
-    """Return the black box, which `stack` closes; None if `[record] directory` is empty."""
+    """Return the recorder of the black box, or None if `[record] directory` is empty.
+
+    `wall_ns` is the wall-clock time at which the daemon started, ns. `stack` closes the recorder.
+    """
     if not config.record.directory:
         return None
     recorder = Recorder(config, log, wall_ns)
@@ -227,7 +238,7 @@ def _port(config: Config, path: str, wake: Wakeup, tell: Callable[[Event], None]
 
 @asynccontextmanager
 async def _beside(helpers: Iterable[Coroutine[Any, Any, object]]) -> AsyncIterator[None]:
-    """Run the coroutines as tasks during the block, and cancel them when the block ends."""
+    """Run the coroutines as tasks during the `async with` block, and cancel them at its end."""
     async with asyncio.TaskGroup() as group:
         tasks = [group.create_task(helper) for helper in helpers]
         yield
@@ -238,8 +249,9 @@ async def _beside(helpers: Iterable[Coroutine[Any, Any, object]]) -> AsyncIterat
 def _certificates(config: Config, ours: bool) -> dict[str, int]:
     """Return the expiry time of each certificate that the daemon uses, ns since 1970.
 
-    The keys are those of `ends`. Returns {} if the daemon uses no certificate. `ours` is true if
-    the daemon runs the TLS gateway. Raises a `MendableError` if the certificates cannot be used.
+    The dict key "" stands for the daemon's own certificate, and `tls.AUTHORITY` for that of its
+    authority. Returns {} if the daemon uses no certificate. `ours` is true if the daemon itself
+    starts the TLS gateway. Raises a `MendableError` if the certificates cannot be used.
     """
     bus = config.bus
     if not (any(e.startswith(TLS) for e in bus.connect) or (ours and bus.outside)):
@@ -278,7 +290,10 @@ async def _control(
 
 @asynccontextmanager
 async def _patience(config: Config, log: Log, manager: Systemd) -> AsyncIterator[None]:
-    """In client mode, report to the log and to systemd while the block waits for the router."""
+    """Report that the daemon waits for its router, while the `async with` block runs.
+
+    The reports go to the log and to systemd. In peer mode there is no such wait and no report.
+    """
     if config.bus.mode == "peer":
         yield
         return

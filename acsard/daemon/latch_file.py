@@ -44,19 +44,19 @@ from acsard.host.mailbox import Mailbox
 from acsard.host.threads import NoThreadError, in_thread
 
 START_S = 2.0
-"""Time limit of a write of the file, and of a sync, s. At the start of the daemon, the first read
-and the first write together have this limit. If the disk takes longer, the daemon reports that the
-disk hangs."""
+"""If a write or a sync of the file takes longer than this time, s, the daemon reports that the disk
+hangs. At the start of the daemon, this is the limit for the first read and the first write
+together."""
 
 PACE_S = 0.05
-"""Pause after each successful write, s. A flood of stops, each of which is a new latch, must not
-wear out an SD card."""
+"""Pause after each successful write, s. Each stop is a new latch, so without this pause a flood of
+stops would wear out an SD card."""
 
 RETRY_S = 1.0
 """Pause between two attempts to write a file that could not be written, s."""
 
 CLOSE_S = 0.3
-"""Longest time that the daemon waits at its end for the last write, s."""
+"""Longest time that the daemon waits at its end for the last write and its sync, s."""
 
 HANGS = f"the disk did not answer within {START_S:g} s"
 
@@ -64,14 +64,14 @@ EVENTS = 64
 """Largest number of events that wait until the control loop takes them in its next step."""
 
 NO_PLACE = "no directory"
-"""Text in messages instead of the path, if no directory for the file can be found."""
+"""Messages show this text in place of the file's path if no directory for the file can be found."""
 
 
 def place(config: Config, environ: Mapping[str, str]) -> Path:
     """Return the path of this robot's latch file.
 
-    Raises `OSError` if no directory can be found, for example because the user has no home
-    directory.
+    `environ` contains the environment variables, which may name the directory. Raises `OSError` if
+    no directory can be found, for example because the user has no home directory.
     """
     name = f"{config.robot.id}.latches.json"
     try:
@@ -103,11 +103,11 @@ class LatchFile:
 
     def __init__(self, config: Config, environ: Mapping[str, str]) -> None:
         self.where = NO_PLACE
-        """Path of the file for messages, or `NO_PLACE`."""
+        """The path of the file as messages show it, or `NO_PLACE`."""
         self._path: Path | None = None
         self._robot = config.robot.id
         self._barred = ""
-        """Why the file must not be written at all; "" if it may be written."""
+        """The reason why the daemon must never write the file; "" if it may write it."""
         try:
             self._path = place(config, environ)
             self.where = str(self._path)
@@ -118,16 +118,17 @@ class LatchFile:
         self._disk = threading.Lock()
         """Held by the thread that uses the disk. The control loop never takes it."""
         self._abandoned = False
-        """True if `start` has given up waiting for the first read of the file."""
+        """True if `start` has stopped waiting for the first read and write of the file."""
         self._found: Latches | None = None
-        """The latches in the file when the daemon started; None until the file has been read."""
+        """The latches that the file contained when the daemon started; None before it is read."""
         self._blind = False
-        """True if the writing thread must still read the file, which `start()` failed to read."""
+        """True if `start()` could not read the file in time. The writing thread must then read it
+        before its first write."""
         self._missed = Latches()
-        """Latches in the file that the robot does not have, because `start()` could not read the
-        file in time."""
+        """Latches that the file contained, but that the robot did not get, because `start()` could
+        not read the file in time. Each write adds them to the file again."""
         self._box = Mailbox[Latches](1)
-        """The latches of the last call of `keep`, until the writing thread takes them."""
+        """Passes the latches of the last call of `keep` to the writing thread."""
         self._news = Mailbox[Event](EVENTS)
         self._held: Latches | None = None
         """The latches that this process wrote last. None before the first write."""
@@ -139,18 +140,20 @@ class LatchFile:
         self._syncing_ns: int | None = None
         """Monotonic time at which the present sync began, ns; None between two syncs."""
         self._hung = False
-        """True if the last event about the disk reported that the disk hangs. `news` sets this."""
+        """True if `news` has reported that the disk hangs, and has not yet reported that it works
+        again."""
         self._renamed = Mailbox[Latches](1)
-        """The newest latches in the file, until the syncing thread takes them."""
+        """Passes the newest latches in the file to the syncing thread."""
         self._threads: tuple[threading.Thread, ...] = ()
-        """The threads that write and sync the file, in this order. Empty until both run."""
+        """The thread that writes the file and the thread that syncs it. Empty until both run."""
 
     # The start of the daemon calls the methods below.
 
     async def start(self, now: Instant) -> Latches:
         """Read the file, try to write it, and return the latches with which the robot starts.
 
-        Raises `InUseError` if another daemon uses this file for a robot with the same id.
+        If the file cannot be read or written, these latches contain a stop. `now` is the time of
+        that stop. Raises `InUseError` if another daemon uses this file.
         """
         try:
             latches = await in_thread(lambda: self._look(now), START_S)
@@ -194,7 +197,11 @@ class LatchFile:
             return latches
 
     def _read(self, now: Instant) -> Latches:
-        """Lock and read the file; raise `InUseError` if another daemon has locked it."""
+        """Lock the file, and return its latches.
+
+        If the file cannot be read, return a stop that was set at `now`. Raises `InUseError` if
+        another daemon has locked the file.
+        """
         path = self._path
         if path is None:
             return Latches()
@@ -243,16 +250,19 @@ class LatchFile:
     # The control loop calls the methods below.
 
     def keep(self, latches: Latches) -> None:
-        """Hand the latches in force to the writing thread, which writes only the newest ones."""
+        """Pass the latches in force to the writing thread.
+
+        If they change again before the thread has written them, it writes only the newest ones.
+        """
         self._handed = latches
         self._box.put(latches)
 
     def holds(self, latches: Latches) -> bool:
-        """Return whether the file has these latches, so that they survive a kill of the process."""
+        """Return whether these latches are in the file. They then survive a kill of the process."""
         return self._held is latches
 
     def wait(self, latches: Latches, seconds: float) -> None:
-        """Wait until `holds(latches)` is true or writing fails, but at most `seconds`."""
+        """Block until the file contains these latches or a write fails, but at most `seconds` s."""
         end_ns = clock.mono_ns() + seconds * NS_PER_S
         while not self.holds(latches) and not self._failed and clock.mono_ns() < end_ns:
             time.sleep(0.001)
@@ -269,7 +279,7 @@ class LatchFile:
 
     @property
     def trouble(self) -> str:
-        """Why the latches in force would not survive a restart, in words; "" if they would."""
+        """The reason why the latches would not survive a restart, in words; "" if they would."""
         if not all(thread.is_alive() for thread in self._threads):
             return "the thread that writes stops to the latch file has ended; restart the daemon"
         failed = self._failed or (HANGS if self._hangs else "")
@@ -318,7 +328,11 @@ class LatchFile:
             self._box.wait(None if latches is None else RETRY_S)
 
     def _try(self, latches: Latches, now: Instant) -> str:
-        """Write these latches. Report a failure and return its reason; return "" on success."""
+        """Write these latches, and return "" on success.
+
+        If the write fails, report the reason as an event and return it. `now` is the time at which
+        the daemon started.
+        """
         self._busy_ns = clock.mono_ns()
         with self._disk:
             if self._blind:
@@ -330,9 +344,9 @@ class LatchFile:
         return trouble
 
     def _read_late(self, now: Instant) -> None:
-        """Read the file that `start()` could not read in time.
+        """Read the file that `start()` could not read in time, and keep its latches in `_missed`.
 
-        Without this call, the next write would overwrite the latches in the file.
+        Without this call, the next write would overwrite these latches.
         """
         self._blind = False
         if self._found is None:
@@ -398,10 +412,10 @@ class LatchFile:
         return ""
 
     def _with_missed(self, latches: Latches) -> Latches:
-        """Return `latches` together with the latches in `self._missed`, for the next start.
+        """Return `latches` together with the latches in `self._missed`.
 
-        A missed stop is left out. The robot has a stop of its own instead, because `start()`
-        could not read the file.
+        If `latches` has a fault or "inactive" itself, the missed one is dropped. A missed stop is
+        not added either: the robot already has a stop, because `start()` could not read the file.
         """
         missed = self._missed
         if latches.fault is not None:
@@ -430,7 +444,10 @@ class LatchFile:
 
 
 def _content(path: Path) -> bytes:
-    """Return the bytes of a small regular file; raise `OSError` for anything else."""
+    """Return the content of a regular file.
+
+    Raises `OSError` if it is not a regular file or has more than `MAX_BYTES` bytes.
+    """
     # Without O_NONBLOCK, opening a named pipe at this path would block the start.
     handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     with os.fdopen(handle, "rb") as file:

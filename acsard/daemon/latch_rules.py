@@ -20,17 +20,18 @@ FORMAT = 1
 """Version of the latch file's format. A file with another version counts as unreadable."""
 
 MAX_BYTES = 65_536
-"""Largest size of a file that is read, bytes. Three latches and all limits take about 1 kB."""
+"""Largest size of a latch file, bytes. A larger file counts as unreadable. Three latches and all
+limits take about 1 kB."""
 
 MAX_TEXT = 500
-"""Largest number of characters of a name or a reason in the file. A longer text is cut off."""
+"""Largest number of characters of a name or a reason in the latch file. The rest is cut off."""
 
 ANSWER_NS = NS_PER_S // 5
 """Longest time for which the answer to a stop waits for the latch file, ns. A longer wait would
 make a client believe that the robot did not receive the stop."""
 
 BY = "acsard"
-"""Name in place of a client's name in a stop that the daemon itself sets."""
+"""Stands in place of a client's name in a stop that the daemon itself sets."""
 
 
 EMPTY = ("earlier", ())
@@ -39,7 +40,7 @@ one, so the file leaves this field out."""
 
 
 class LatchFileError(AcsardError):
-    """The bytes are not a latch file of this version and of this robot."""
+    """The content of a latch file is damaged, of another version or of another robot."""
 
 
 class _Content(Struct, frozen=True):
@@ -59,12 +60,12 @@ def encode(robot: str, latches: Latches) -> bytes:
 
 
 def decode(robot: str, data: bytes) -> Latches:
-    """Return the latches in the content of a robot's latch file, each marked as kept.
+    """Return the latches in `data`, the content of the robot's latch file.
 
-    Raises `LatchFileError` for content that is damaged, of another version or of another robot.
-    Every prefix of a valid file is refused, because a power cut may leave a part of a file. A
-    missing or unknown field name is refused too, because a damaged name must not make a stop
-    disappear.
+    Each latch is marked as kept over a restart. Raises `LatchFileError` for content that is
+    damaged, of another version or of another robot. Every incomplete file counts as damaged,
+    because a power cut may leave only a part of the file. A file with a missing or unknown field
+    name counts as damaged too: otherwise one wrong letter in a name could make a stop disappear.
     """
     if not data.strip(b"\0 \r\n"):
         raise LatchFileError("it is empty")
@@ -92,27 +93,39 @@ def decode(robot: str, data: bytes) -> Latches:
 
 
 def at_start(why: str) -> str:
-    """Return the reason text of a stop that the daemon itself sets at its start."""
+    """Return the reason of a stop that the daemon itself sets at its start, in words.
+
+    `why` is the cause, for example that the latch file cannot be read.
+    """
     return f"stopped when the daemon started, because {why}"
 
 
 def unreadable(where: str, reason: str) -> str:
-    """Return the reason text of the stop that the daemon sets if it cannot read the latch file."""
+    """Return the reason of the stop that the daemon sets if it cannot read the latch file.
+
+    `where` is the path of the file. `reason` says why it cannot be read.
+    """
     return at_start(f"{where} cannot be read: {reason}; a stop may have been lost")
 
 
 def unwritable(where: str, reason: str) -> str:
-    """Return the message for a latch file that cannot be written."""
+    """Return the message for a latch file that cannot be written.
+
+    `where` is the path of the file. `reason` says why it cannot be written.
+    """
     return (
         f"a stop would not survive a restart: the latch file ({where}) cannot be written: {reason}"
     )
 
 
 def stopped(latches: Latches, why: str, now: Instant, by: str = BY, before: int = -1) -> Latches:
-    """Return `latches` with a stop. If `latches` has a stop already, return it unchanged.
+    """Return `latches` with a stop added. If they have a stop already, return them unchanged.
 
-    `by` is the client that asked for the stop, or `BY` for the daemon itself. `before` is the
-    number of the last stop before this one, or -1 if there was none.
+    Args:
+        why: the reason of the stop.
+        now: the time of the stop.
+        by: the client that requested the stop, or `BY` for the daemon itself.
+        before: the number of the previous stop, or -1 if there was none. The new number is higher.
     """
     if latches.stop is not None:
         return latches
@@ -124,9 +137,10 @@ def stopped(latches: Latches, why: str, now: Instant, by: str = BY, before: int 
 def doubted(latches: Latches, why: str, now: Instant) -> Latches:
     """Return the latches with which the robot starts if the latch file cannot be written.
 
-    The previous process may have set latches that the file lacks. So the robot starts stopped, and
-    each latch of the file gets a new number. A `clear` or `activate` that names an old number has
-    no effect then, because its sender may not know of the lost latches.
+    `latches` are those in the file, and `why` is the reason of the added stop. The previous process
+    may have set latches that are not in the file. So the robot starts stopped, and each latch of
+    the file gets a new number. A `clear` or `activate` with an old number then has no effect,
+    because its sender may not know of the lost latches.
     """
     found = latches.fault, latches.inactive, latches.stop
     kept = max((latch.number for latch in found if latch), default=-1)
@@ -138,23 +152,26 @@ def doubted(latches: Latches, why: str, now: Instant) -> Latches:
 
 
 class LatchKeeper(Protocol):
-    """The storage that keeps the latches over a restart. Only `wait` waits for the disk."""
+    """The storage that keeps the latches over a restart.
+
+    Of its methods, only `wait` waits for the disk.
+    """
 
     def keep(self, latches: Latches) -> None:
-        """Store these latches, which are in force from now on. Only the newest ones are written."""
+        """Store these latches, which are now in force, in place of all earlier ones."""
 
     def holds(self, latches: Latches) -> bool:
-        """Return whether these latches are stored, so that they survive a kill of the process."""
+        """Return whether these latches are stored. They then survive a kill of the process."""
 
     def wait(self, latches: Latches, seconds: float) -> None:
-        """Wait until `holds(latches)` is true, but at most `seconds`."""
+        """Block until these latches are stored, but at most `seconds` s."""
 
     def news(self) -> list[Event]:
         """Return the events of the storage since the last call, such as a failed write."""
 
     @property
     def trouble(self) -> str:
-        """Why the latches in force would not survive a restart, in words; "" if they would."""
+        """The reason why the latches would not survive a restart, in words; "" if they would."""
 
 
 class Handover:
@@ -166,23 +183,26 @@ class Handover:
     """
 
     def __init__(self, latches: Latches, keeper: LatchKeeper | None) -> None:
-        """Start with the latches that the keeper has read. With no keeper nothing is stored."""
+        """Begin with the latches with which the robot starts. The keeper has them already.
+
+        If `keeper` is None, latches are not stored.
+        """
         self.latches = latches
         self._keeper = keeper
 
     def take(self, latches: Latches) -> None:
-        """Hand these latches to the keeper, unless this object is the last one handed over."""
+        """Pass these latches to the keeper, unless the last call passed the same object."""
         if latches is not self.latches:
             self.latches = latches
             if self._keeper is not None:
                 self._keeper.keep(latches)
 
     def take_stops(self, latches: Latches, by: list[str], now: Instant) -> None:
-        """Hand these latches to the keeper, with a stop if `by` is not empty.
+        """Pass these latches to the keeper, with a new stop if `by` is not empty.
 
-        `by` names the clients of the stops that no control step has processed. The new stop names
-        all these clients. It has a new number, so that a `clear` of an earlier stop does not
-        release it.
+        `by` contains the names of the clients whose stops no control step has processed, one name
+        for each stop. The new stop names all these clients. Its number is new, so a `clear` of an
+        earlier stop does not release it.
         """
         for name in reversed(by):
             last, text = latches.stop, f"stopped by {name or 'request'}"
@@ -201,9 +221,9 @@ class Handover:
         return self._keeper is None or self._keeper.holds(self.latches)
 
     def wait(self) -> None:
-        """Block until the latches are stored, at most `ANSWER_NS`.
+        """Block until the latches are stored, but at most `ANSWER_NS`.
 
-        Call this only when the control loop has ended, because the call would delay a step.
+        Call this only after the last control step, because it would delay a step.
         """
         if self._keeper is not None:
             self._keeper.wait(self.latches, ANSWER_NS / NS_PER_S)
@@ -213,15 +233,15 @@ class Handover:
 
     @property
     def trouble(self) -> str | None:
-        """Why the latches would not survive a restart, in words; "" if they would.
+        """The reason why the latches would not survive a restart, in words; "" if they would.
 
-        None without a keeper, which means that latches are not stored.
+        None if there is no keeper, so that latches are never stored.
         """
         return None if self._keeper is None else self._keeper.trouble
 
 
 def _plain(content: Any) -> Any:
-    """Return the content as JSON data. Only a latch with several causes has the field `earlier`."""
+    """Return the content as JSON data, without the field `earlier` of latches with one cause."""
     match msgspec.to_builtins(content):
         case dict() as fields:
             pairs = fields.items()

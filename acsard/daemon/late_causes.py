@@ -22,8 +22,8 @@ from acsard.core.values import NS_PER_S, Event
 from acsard.host.kernel_counters import Conditions, Program, Reading, Scheduled
 
 SHARE = 0.5
-"""Smallest share of a lateness that a cause must explain. Some causes have a constant of their own,
-such as `DISK_SHARE`."""
+"""A delay counts as a cause only if it lasted for at least this share of the lateness. Some causes
+have another share, such as `DISK_SHARE`."""
 
 SLEPT_SHARE = 0.3
 """A disk counts as the cause only if the loop's thread slept for at least this share of the
@@ -31,9 +31,9 @@ lateness. The share is low, because in a test with a fast virtual disk, a thread
 from the disk ran on the processor for as long as it slept."""
 
 DISK_SHARE = 0.25
-"""Smallest share of a lateness at which a wait for a disk by any program counts as a cause. The
-share is low, because in a test a thread wrote to a disk all the time, and the kernel counted only
-0.28 to 0.45 of this time as waiting."""
+"""The time in which any program waited for a disk counts as a cause only if it is at least this
+share of the lateness. The share is low, because in a test a thread wrote to a disk all the time,
+and the kernel counted only 0.28 to 0.45 of this time as waiting."""
 
 LEAST_STOLEN_NS = 3 * NS_PER_S // 100
 """Shortest steal time that counts as a cause, ns: three of the kernel's ticks. Steal time is time
@@ -52,30 +52,30 @@ class Lateness(Struct, frozen=True, omit_defaults=True):
     late_ns: int
     """Time from the due time of the first missed period to the late step, ns."""
     loop: Scheduled
-    """For how long the loop's thread ran, and for how long it was ready but waited for a processor.
-    Both times are measured from the last period before the lateness to the late step."""
+    """Two durations: how long the loop's thread ran, and how long it was ready but waited for a
+    processor. Both are measured from the last period before the lateness to the late step."""
     before: Reading
     after: Reading
     busiest: Program | None = None
-    """The process that used the processor most; None if no process was searched for, or if no
-    process used much."""
+    """The process that used the most processor time. None if no process used much, or if nothing
+    searched for it."""
 
     def explains(self, duration_ns: int, share: float = SHARE) -> bool:
         return duration_ns >= share * self.late_ns
 
     @property
     def computed(self) -> bool:
-        """Whether the loop's thread ran, or was ready to run, for `SHARE` of the lateness."""
+        """Whether the loop's thread ran or was ready to run for at least half of the lateness."""
         return self.explains(self.loop.ran_ns + self.loop.waited_ns)
 
     @property
     def slept(self) -> bool:
-        """Whether the loop's thread slept for `SLEPT_SHARE` of the lateness."""
+        """Whether the loop's thread slept for at least `SLEPT_SHARE` of the lateness."""
         return self.explains(self.late_ns - self.loop.ran_ns - self.loop.waited_ns, SLEPT_SHARE)
 
 
 class Cause(Struct, frozen=True):
-    """A cause of lateness, with its rule and the advice against it."""
+    """A possible cause of lateness, with the rule that detects it and advice how to remove it."""
 
     name: str
     rule: Callable[[Lateness], str]
@@ -106,8 +106,8 @@ def low_voltage(now: Conditions) -> str:
 def heat(late: Lateness) -> str:
     """Return the cause in words if a hot processor slowed the loop down, else "".
 
-    The signs of heat are a `thermal_throttle` count that has risen, and an active cooling device.
-    On a Raspberry Pi, the bits 1 to 3 of `get_throttled` are signs too.
+    Three signs show heat: a `thermal_throttle` count that has risen, a cooling device that slows
+    the processor, and on a Raspberry Pi one of the bits 1 to 3 of `get_throttled`.
     """
     hotter = late.after.conditions.throttled > late.before.conditions.throttled
     return hot(late.after.conditions, hotter) if late.computed else ""
@@ -116,8 +116,8 @@ def heat(late: Lateness) -> str:
 def hot(now: Conditions, hotter: bool = False) -> str:
     """Return the cause in words if heat slows the processor down, else "".
 
-    Heat is the cause if `now` says so, or if `hotter` is true: the processor's count of slow-downs
-    by heat has then risen.
+    `now.hot` says that heat slows it down at this moment. `hotter` says that the kernel's count of
+    such slow-downs has risen since an earlier reading. One of the two is enough.
     """
     return "the processor is too hot and runs slower" if now.hot or hotter else ""
 
@@ -125,9 +125,9 @@ def hot(now: Conditions, hotter: bool = False) -> str:
 def governor(late: Lateness) -> str:
     """Return the cause in words if a limited clock frequency slowed the loop down, else "".
 
-    The limit of the clock frequency (`scaling_max_freq`) is compared with the full frequency
-    (`cpuinfo_max_freq`). For a governor that keeps the lowest frequency, the limit is
-    `scaling_min_freq`.
+    The rule compares the frequency limit (`scaling_max_freq`) with the processor's full frequency
+    (`cpuinfo_max_freq`). If the governor keeps the lowest frequency, it compares `scaling_min_freq`
+    instead.
     """
     return slow(late.after.conditions) if late.computed and not heat(late) else ""
 
@@ -160,7 +160,10 @@ def stolen(late: Lateness) -> str:
 
 
 def most_stolen(before: Reading, after: Reading) -> int:
-    """Return the longest time that the host took one processor away between two readings, ns."""
+    """Return the steal time between two readings, ns, of the processor with the most steal time.
+
+    Steal time is time in which the host of a virtual machine took the processor away.
+    """
     pairs = zip(before.steal_ns, after.steal_ns, strict=False)
     return max((new - old for old, new in pairs), default=0)
 
@@ -176,8 +179,9 @@ def memory(late: Lateness) -> str:
 def disk(late: Lateness) -> str:
     """Return the cause in words if the loop's thread waited for a disk, else "".
 
-    The wait of the loop's own thread counts, if the kernel measures that wait. The time in which
-    any program waited counts only if the loop's thread itself read from a disk or wrote to a disk,
+    One of two times must be long enough. The first is the time for which the loop's own thread
+    waited for a disk, which not every kernel measures. The second is the time in which any program
+    waited for a disk. It counts only if the loop's thread itself read from a disk or wrote to one,
     because other programs may wait for a disk at any time.
     """
     before, after = late.before, late.after
@@ -222,13 +226,13 @@ CAUSES = (
         "run acsard as its systemd service, and give other real-time programs a priority below 10",
     ),
 )
-"""The causes in the order in which an event names them, the rarer ones first."""
+"""All causes, in the order in which an event names them. Rare causes come first."""
 
 
 def causes(late: Lateness) -> tuple[tuple[str, ...], str]:
-    """Return a pair: the names of the causes of a lateness, and a text with causes and advice.
+    """Return the names of the causes of a lateness, and a text with these causes and advice.
 
-    Both are empty if the counters show no cause.
+    Both results are empty if the counters show no cause.
     """
     found = [(cause, clause) for cause in CAUSES if (clause := cause.rule(late))]
     clauses = [f"{clause} ({cause.advice})" for cause, clause in found]
@@ -236,32 +240,35 @@ def causes(late: Lateness) -> tuple[tuple[str, ...], str]:
 
 
 BECAUSE = ", because "
-"""The words in the text of an event that separate the lateness from its causes."""
+"""Stands in the text of an event between the duration of the lateness and its causes."""
 
 
 def event_of(late: Lateness, clause: str, *, news: bool) -> Event:
-    """Return the event that reports a lateness.
+    """Return the log event that reports a lateness.
 
-    `clause` is the text from `causes`. `news` is explained at `Event.news`.
+    `clause` is the text from `causes`. `news` is False if a recent event had the same causes. The
+    log may then delay the event.
     """
     text = f"by {late.late_ns / NS_PER_S:.2f} s{BECAUSE}{clause}"
     return Event("missed_periods", text, "warning", kind="late", news=news)
 
 
 def cause_in(text: str) -> str:
-    """Return the part of an event's text with lateness and causes; "" if it names no cause."""
+    """Return the lateness and its causes from the text of an event; "" if it names no cause."""
     begin, because, clause = text.partition(BECAUSE)
     return begin.rpartition(": ")[2] + because + clause if because else ""
 
 
 STOLEN_SHARE = 0.02
-"""Smallest share of the time between two readings at which `present` reports steal time."""
+"""The function `present` reports steal time if it is more than this share of the time between the
+two readings."""
 
 
 def present(before: Reading, after: Reading, within_ns: int) -> list[tuple[str, str]]:
-    """Return pairs (cause, advice) for the causes that delay every program on this computer now.
+    """Return the causes that delay every program on this computer now, each with advice.
 
-    `within_ns` is the time between the two readings, ns.
+    The causes are found in two readings of the kernel's counters, which are `within_ns` ns apart.
+    Each pair in the result is a cause in words and the advice how to remove it.
     """
     now = after.conditions
     stolen_ns = most_stolen(before, after)

@@ -31,12 +31,12 @@ OWN_TIMES = "/proc/thread-self/schedstat"
 """File with the processor times of the thread that opens it."""
 
 EVERY_S = 0.25
-"""Time between two readings of the kernel's counters while no period is late, s. With longer gaps,
-the difference between two readings would include more delays from before the lateness."""
+"""Time between two readings of the kernel's counters while no period is late, s. If it were longer,
+the counters would also include delays from long before a lateness."""
 
 HISTORY = 12
-"""Number of readings that are kept. Together they cover 3 s, so that one reading is from before the
-lateness even if the lateness was long."""
+"""Number of readings that are kept. Together they cover 3 s. So one of them is from before the
+lateness, unless the lateness was longer than that."""
 
 SETTLE_S = 0.03
 """Time from a late period to the reading after it, s. The kernel updates some counters only at its
@@ -47,30 +47,31 @@ PAUSE_NS = NS_PER_S
 each event name."""
 
 CONDITIONS_NS = 10 * NS_PER_S
-"""Age at which the conditions of the processor, such as its voltage, are read again, ns. On some
-computers each reading is a request to the firmware."""
+"""Time after which the conditions of the processor, such as its voltage, are read again, ns. They
+are not read more often, because on some computers each reading is a request to the firmware."""
 
 LOOK_S = 0.2
-"""Time between the two readings of all processes in one search for the busiest process, s."""
+"""A search for the busiest process reads the processor times of all processes twice. This is the
+time between the two readings, s."""
 
 LOOK_AGAIN_NS = 10 * NS_PER_S
 """Shortest time between two searches for the busiest process, ns. A search takes 20 us per
 process."""
 
 NEWS_NS = 60 * NS_PER_S
-"""Shortest time between two events with the same causes that are logged immediately, ns. An event
-that comes earlier waits for the next log line about missed periods (`Event.news`)."""
+"""For this time after an event, ns, further events with the same causes are not logged immediately.
+They wait for the next log line about missed periods (`Event.news`)."""
 
 MOST = 16
-"""Largest number of late periods that wait for the thread, and of events that wait for `news`. A
-newer item displaces the oldest one."""
+"""Size of two queues: the late periods that wait for the thread, and the events that wait for a
+call of `news`. A newer item displaces the oldest one."""
 
 
 class Late(Struct, frozen=True):
     """A late period, which the control loop passes to the thread of `LateWatch`."""
 
     now_ns: int
-    """Monotonic time of the step of the late period, ns."""
+    """Monotonic time at which the step of the late period began, ns."""
     late_ns: int
     before: bytes
     """Content of `OWN_TIMES` in the period before the late period; b"" if it is unknown."""
@@ -79,16 +80,19 @@ class Late(Struct, frozen=True):
 
     @property
     def loop(self) -> Scheduled:
-        """Times that the loop's thread ran and waited for a processor, from `before` to `after`."""
+        """How long the loop's thread ran, and how long it waited for a processor.
+
+        Both are measured from the period before the late period to the late period.
+        """
         before, after = scheduled(self.before), scheduled(self.after)
         return Scheduled(after.ran_ns - before.ran_ns, after.waited_ns - before.waited_ns)
 
 
 class LateWatch:
-    """Observer of the periods of one control loop. The loop's thread must create this object.
+    """Detects late periods of one control loop, and finds their causes, as a context manager.
 
-    The loop's thread also calls `period` and `news`. A second thread, which reads the kernel's
-    files, runs while this context manager is entered.
+    The control loop's own thread must create this object, and call `period` and `news`. A second
+    thread reads the kernel's files. It runs from the entry of the context to its exit.
     """
 
     def __init__(self, kernel: Kernel | None = None) -> None:
@@ -106,8 +110,8 @@ class LateWatch:
         self._readings: deque[tuple[int, Reading]] = deque(maxlen=HISTORY)
         """The last readings, each with the monotonic time at which it was complete, ns."""
         self._reported: dict[tuple[str, ...], int] = {}
-        """For each combination of causes, the monotonic time, ns, of its last event that was logged
-        immediately (`Event.news`)."""
+        """Maps each combination of causes to the monotonic time, ns, of its last event that was
+        logged immediately (`Event.news`)."""
         self._busiest: Program | None = None
         self._searched_ns: int | None = None
 
@@ -129,10 +133,13 @@ class LateWatch:
     # The control loop's thread calls these methods.
 
     def period(self, now_ns: int, late_ns: int, missed: int) -> None:
-        """Process a period. If periods were missed, pass the lateness to the thread.
+        """Process the step of a period. If periods were missed, pass the lateness to the thread.
 
-        The step of this period began `late_ns` ns late, at the monotonic time `now_ns`. The
-        `missed` periods before this period got no step.
+        Args:
+            now_ns: monotonic time at which the step began, ns.
+            late_ns: time from the due time of this period, or of the first missed period, to
+                `now_ns`, ns.
+            missed: number of periods just before this one that got no step.
         """
         before, times = self._times, b""
         # Without these times, the thread still finds some of the causes.
@@ -143,7 +150,7 @@ class LateWatch:
             self._box.put(Late(now_ns, late_ns, before, times))
 
     def news(self) -> list[Event]:
-        """Return the events that the thread has made since the last call."""
+        """Return the events about causes of lateness since the last call."""
         return self._news.take() if self._news.waiting else []
 
     # The other methods run in the watch's thread.
@@ -173,7 +180,10 @@ class LateWatch:
         self._readings.append((clock.mono_ns(), reading))
 
     def _before(self, now_ns: int) -> Reading | None:
-        """Return the newest reading that was complete at monotonic `now_ns`, or None."""
+        """Return the newest reading that was complete at the monotonic time `now_ns`.
+
+        Return None if all readings are newer.
+        """
         older = [reading for read_ns, reading in self._readings if read_ns <= now_ns]
         return older[-1] if older else None
 
@@ -192,9 +202,9 @@ class LateWatch:
         self._news.put(event_of(late, clause, news=news))
 
     def _busiest_of(self, kernel: Kernel) -> Program | None:
-        """Return the busiest process, or None if no process is busy.
+        """Return the process that uses the most processor time, or None if no process uses much.
 
-        Search again only if the last search is older than `LOOK_AGAIN_NS`.
+        If the last search is not older than `LOOK_AGAIN_NS`, return its result again.
         """
         now_ns = clock.mono_ns()
         if self._searched_ns is None or now_ns - self._searched_ns >= LOOK_AGAIN_NS:

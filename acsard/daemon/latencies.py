@@ -16,18 +16,22 @@ from typing import Literal, get_args
 from acsard.core.values import NS_PER_S, Estimate, Measured, Outputs, Spread
 
 PER_DECADE = 20
-"""Number of buckets of a histogram per factor of ten. A percentile is accurate to 12 %."""
+"""Number of buckets of a histogram for each factor of ten. The error of a percentile is at most
+12 %."""
 
 DECADES = 7
-"""Number of factors of ten that the buckets cover, starting at 1 us. The first bucket also holds
-shorter durations, and the last bucket also holds longer durations."""
+"""The buckets of a histogram cover this number of factors of ten, from 1 us to 10 s. The first
+bucket also counts shorter durations, and the last bucket also counts longer ones."""
 
 LAST = PER_DECADE * DECADES
 """Index of the last bucket."""
 
 
 class Histogram:
-    """A histogram with logarithmic buckets: percentiles of an endless stream in fixed memory."""
+    """A histogram with logarithmic buckets.
+
+    It gives the percentiles of any number of values in fixed memory.
+    """
 
     def __init__(self) -> None:
         self._buckets = [0] * (LAST + 1)
@@ -47,7 +51,7 @@ class Histogram:
     def spread(self) -> Spread:
         """Return the median, the 99th percentile and the maximum of all values.
 
-        A percentile is the upper end of its bucket, but at most the maximum.
+        A percentile is rounded up to the upper end of its bucket, but not above the maximum.
         """
         totals = list(accumulate(self._buckets))
         p50, p99 = (self._percentile(totals, share) for share in (0.50, 0.99))
@@ -87,8 +91,8 @@ SLOT_NS = 10 * NS_PER_S
 SLOTS = 6
 
 FRESH_NS = NS_PER_S
-"""Age up to which `Stopwatch.measured` returns cached values, ns. Values are cached, because adding
-up the slots of a minute takes longer than a control step."""
+"""`Stopwatch.measured` returns cached values until they are this old, ns. It does not compute them
+at each call, because adding up the slots of a minute takes longer than a control step."""
 
 
 class Figure:
@@ -99,7 +103,7 @@ class Figure:
         self._slots = [Histogram() for _ in range(SLOTS)]
         self._number = -SLOTS
         self._slot, self._ends_ns = self._slots[0], 0
-        """The newest slot, and the monotonic time at which it ends, ns."""
+        """`_slot` is the newest slot. `_ends_ns` is the monotonic time at which it ends, ns."""
 
     def add(self, now_ns: int, duration_ns: int) -> None:
         if now_ns >= self._ends_ns:
@@ -151,27 +155,40 @@ class Stopwatch:
         self._cached_ns = -FRESH_NS
 
     def measured(self, now_ns: int) -> dict[str, Measured]:
-        """Return all latencies by name, computed at most 1 s before monotonic `now_ns`."""
+        """Return all latencies by name. The values are at most 1 s old.
+
+        `now_ns` is the present monotonic time, ns.
+        """
         if now_ns - self._cached_ns >= FRESH_NS:
             self._cached_ns = now_ns
             self._cached = {name: figure.measured(now_ns) for name, figure in self.figures.items()}
         return self._cached
 
     def missed(self, now_ns: int) -> int:
-        """Return the number of periods without a step in the minute before monotonic `now_ns`."""
+        """Return how many periods got no step in the last minute.
+
+        `now_ns` is the present monotonic time, ns.
+        """
         return self._missed.count(now_ns)
 
     def period(self, now_ns: int, late_ns: int, missed: int = 0) -> None:
-        """Record the lateness of a step, and the number of periods `missed` just before it."""
+        """Record how late a step began, and how many periods before it were missed.
+
+        Args:
+            now_ns: monotonic time at which the step began, ns.
+            late_ns: time from the due time of this period, or of the first missed period, to
+                `now_ns`, ns.
+            missed: number of periods just before this one that got no step.
+        """
         self.figures["period_lateness"].add(now_ns, late_ns)
         if missed:
             self._missed.add(now_ns, missed)
 
     def line(self, outputs: Outputs, sent_ns: int, before_ns: int) -> None:
-        """Record the age that the command in a line had when the line was written.
+        """Record how old the command in a line was when the line was written.
 
-        `sent_ns` is the time at which the line was written, and `before_ns` that of the previous
-        line.
+        `outputs` are those of the step that made the line. `sent_ns` is the monotonic time at which
+        the line was written, and `before_ns` the time at which the previous line was written, ns.
         """
         command_ns = outputs.command_ns
         if command_ns is None or outputs.mode != "driving":
@@ -182,10 +199,10 @@ class Stopwatch:
             self.figures["command_to_wire"].add(sent_ns, sent_ns - command_ns)
 
     def feedback(self, estimate: Estimate, told_ns: int | None) -> None:
-        """Record the delays of a feedback line.
+        """Record the round trip of a feedback line, and its delay to the bus.
 
-        `told_ns` is the time at which the line's messages were queued for the bus. It is None if no
-        client subscribes to these messages.
+        `estimate` is computed from the line. `told_ns` is the monotonic time at which the line's
+        messages were queued for the bus, ns. It is None if no client subscribes to them.
         """
         at_ns, asked_ns = estimate.heard_ns, estimate.asked_ns
         if asked_ns is not None:

@@ -12,7 +12,10 @@ from msgspec import Struct
 
 
 class Period(Struct, frozen=True):
-    """Number of periods that ended since the last step, and due time of the first of them, ns."""
+    """The periods that have ended since the last step.
+
+    `expired` is their number. `due_ns` is the monotonic time at which the first of them ended, ns.
+    """
 
     expired: int
     due_ns: int
@@ -22,12 +25,13 @@ NO_PERIOD = Period(0, 0)
 
 
 BREATH_NS = 1_000_000
-"""Time that the board has for its reply between two lines, in addition to the wire time of a line,
-ns."""
+"""Shortest time from the end of a line on the wire to an early line after it, ns. In this time the
+board can reply."""
 
 IDLE_WAKES = 3
-"""If more than this number of steps in a period had input but no new command or mode, further input
-waits for the next period. This limit bounds the cost of a flood of messages."""
+"""Input from the bus can run extra steps in a period. After more than this number of them without
+a new command or mode, further input waits for the next period. So a flood of messages costs
+little."""
 
 
 class Pace:
@@ -39,7 +43,7 @@ class Pace:
     def __init__(self, line_ns: int, period_ns: int) -> None:
         self._gap_ns = line_ns + BREATH_NS
         self._possible = self._gap_ns < period_ns
-        """Whether a period is long enough for a line between two periods."""
+        """Whether a period is long enough for an early line besides the line of a period."""
         self._ahead = False
         """Whether an early line was written in place of the next period's line."""
         self._tried = False
@@ -49,24 +53,25 @@ class Pace:
         self._idle = 0
 
     def period_ended(self, missed: int) -> bool:
-        """Record the end of a period. Return whether a line must be written for this period.
+        """Record the end of a period, and return whether a line must be written for it.
 
-        If an early line has replaced the line of this period, a line must be written only if
-        periods were `missed`.
+        `missed` is the number of periods just before it that got no step. If an early line has
+        replaced the line of this period, no line is needed unless periods were missed.
         """
         ahead, self._ahead, self._tried = self._ahead, False, False
         self._idle = 0
         return missed > 0 or not ahead
 
     def at_once(self, now_ns: int, sent_ns: int) -> bool:
-        """Return whether an early line may be written now for a new command."""
+        """Return whether an early line may be written now, for example for a new command."""
         return self._possible and not self._tried and now_ns - sent_ns >= self._gap_ns
 
     def note(self, tick: bool, due: bool, went: bool, news: bool, heard: bool) -> None:
         """Record the result of a step.
 
         Args:
-            tick: Whether the step was to write the line of a period.
+            tick: Whether the step had to write the line of a period. The line of any other step is
+                an early line.
             due: Whether the step had a line to write.
             went: Whether the line was written.
             news: Whether the command or the mode has changed since the last line that was due, or
@@ -80,7 +85,7 @@ class Pace:
 
     @property
     def listens(self) -> bool:
-        """Whether a command that arrives now gets a step of its own, before the next period."""
+        """Whether a command that arrives now gets a step at once, not only in the next period."""
         return self._possible and not (self._tried or self._waiting or self._idle > IDLE_WAKES)
 
     @property
@@ -89,5 +94,8 @@ class Pace:
         return self._waiting and self._possible and not self._tried
 
     def retry_ns(self, sent_ns: int) -> int | None:
-        """Return the monotonic time, ns, at which the waiting command may be written, or None."""
+        """Return the monotonic time at which a waiting command may be sent, ns.
+
+        Return None if no command waits.
+        """
         return sent_ns + self._gap_ns if self.waits else None

@@ -19,21 +19,23 @@ MAX_BYTES = 50_000
 bytes for each quotation mark and each line end."""
 
 MAX_JSON = MESSAGE_BYTES - 1024
-"""Largest size of the description as JSON, bytes. The remaining 1024 bytes of a message are for the
-Zenoh key and Zenoh's headers."""
+"""Largest size of the URDF as a JSON message, bytes. The 1024 bytes up to `MESSAGE_BYTES` are for
+the Zenoh key and Zenoh's headers."""
 
 XACRO = "/xacro}"
-"""Text by which the tag of a xacro element is found. ElementTree writes such a tag as
-"{NAMESPACE}NAME", and the namespace is http://www.ros.org/wiki/xacro, http://ros.org/wiki/xacro or
-similar."""
+"""An element whose tag contains this text is a xacro element. ElementTree writes the tag as
+"{NAMESPACE}NAME", with a namespace such as http://www.ros.org/wiki/xacro."""
 
 DOCUMENT_TYPE = "<!DOCTYPE"
-"""Beginning of a document type. A URDF file with one is refused, because the entities of a document
-type could expand to any length."""
+"""Beginning of an XML document type. A URDF file that has a document type is refused, because the
+entities in it could expand to any length."""
 
 
 def robot_description(path: str) -> str:
-    """Return the URDF at `path`, or "" if `path` is "". Raises `ExitError` for an unusable file."""
+    """Return the text of the URDF file at `path`, or "" if `path` is "".
+
+    Raises `ExitError` if the file cannot be read or published.
+    """
     if not path:
         return ""
     file = Path(path)

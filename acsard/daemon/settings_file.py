@@ -34,13 +34,14 @@ LOOK_S = 2.0
 """Time between two checks whether the file has changed, s."""
 
 NAMED = 3
-"""Largest number of settings that `SettingsFile.differ` names, so that `state` stays short."""
+"""Largest number of settings that `SettingsFile.differ` names. The message `state` contains this
+text, and must stay short."""
 
 MAX_TEXT = 200
 
 PATIENCE_NS = 5 * NS_PER_S // 2
-"""Longest time from a `set` request with `keep` to the daemon's reply, ns. A client waits for 3
-s."""
+"""Longest time from the arrival of a `set` request with `keep` to the daemon's reply, ns. It is
+shorter than the 3 s for which a client waits."""
 
 JOBS = 32
 """Largest number of `set` requests with `keep` that wait for their reply. Further requests are
@@ -53,7 +54,10 @@ _decoder = Decoder(Settings)
 
 
 def keeps(encoding: str, payload: bytes) -> bool:
-    """Return whether a valid `set` request also asks to change the configuration file."""
+    """Return whether a valid `set` request also asks to change the configuration file.
+
+    `payload` is the payload of the request, and `encoding` is Zenoh's name of its encoding.
+    """
     return _decoder.decode(encoding, payload).keep
 
 
@@ -69,12 +73,12 @@ class _Pending(Struct):
 
     request: Request
     due_ns: int
-    """Monotonic time after which the request is answered with a failure, ns. This does not apply
-    while the robot is deciding about the request."""
+    """Monotonic time after which the client gets a reply that the request has failed, ns. This
+    limit does not apply while the robot is deciding about the request."""
     edit: Edit | None = None
-    """The change of the file, once the thread has checked it; None before."""
+    """The prepared change of the file. None until the thread has checked the request."""
     answer: Answer | None = None
-    """The robot's answer, once the robot has used the settings; None before."""
+    """The robot's answer. None until the robot has used the settings."""
 
 
 class SettingsFile:
@@ -83,12 +87,12 @@ class SettingsFile:
     def __init__(
         self, file: Path | None, parse: Callable[[bytes], Config], started: Config
     ) -> None:
-        """Prepare the comparison, which begins when `start` is called.
+        """Prepare the comparison of the file with the settings. `start` begins it.
 
         Args:
-            file: the file that the daemon has read, or None for the built-in defaults.
-            parse: function that returns the configuration of a daemon that starts with the given
-                content of the file.
+            file: the configuration file that the daemon has read, or None if it has read no file.
+            parse: function that takes the content of a file, and returns the configuration with
+                which the daemon would start with this content.
             started: the configuration with which the daemon has started.
         """
         self.differ = ""
@@ -98,18 +102,19 @@ class SettingsFile:
         self._in_force = self._written = started
         self._signature: Signature | None = None
         self._box = Mailbox[Request | Literal["look"]](JOBS)
-        """The requests whose settings the thread must check. The item "look" only wakes the
-        thread."""
+        """The requests that the thread must check. The item "look" only wakes the thread, which
+        then writes the changes and compares the file."""
         self._changes = deque[tuple[Edit, Answer]]()
-        """The changes to write to the file before the next check, each with the robot's answer."""
+        """The changes that the thread must write to the file before it checks another request. Each
+        is paired with the robot's answer."""
         self._results = Mailbox[_Checked | Answer](JOBS)
         self._pending: dict[int, _Pending] = {}
         self._started = self._limits = started.limits
         """`_started` has the limits at the start of the daemon. `_limits` has the same limits, but
         with the new value of each limit that the daemon has written to the file since then."""
         self._kept: tuple[Latches, LimitsConfig, LimitsConfig, Latches] | None = None
-        """Cache of the method `latches`: the arguments of the last call, the `_limits` at that
-        time, and the result."""
+        """Cache of the method `latches`: the two arguments of its last computation, the value of
+        `_limits` at that time, and the result."""
 
     # The control loop calls the methods below.
 
@@ -122,16 +127,20 @@ class SettingsFile:
             self.differ = f"the daemon cannot compare its settings with its file ({error})"
 
     def use(self, config: Config) -> None:
-        """Compare the file with `config` from now on, also after later changes of the file.
+        """Compare the file with `config` from now on, and again whenever the file changes.
 
-        `config` has the settings in force, except the limit that clients set by the Zenoh key
-        `speed_limit`.
+        `config` contains the settings in force, but not the lower speed limit that a client may
+        have set with the Zenoh key `speed_limit`.
         """
         self._in_force = config
         self._look()
 
     def keep(self, request: Request, now_ns: int) -> None:
-        """Queue a `set` request with `keep` for the thread. `results` returns the outcome."""
+        """Queue a `set` request with `keep`, so that the thread checks it.
+
+        `results` later returns either the request for the robot or an answer for the client.
+        `now_ns` is the present monotonic time, ns.
+        """
         full = len(self._pending) >= JOBS
         # A request beyond the limit is overdue from the start, so that `results` refuses it in this
         # step.
@@ -140,17 +149,19 @@ class SettingsFile:
             self._box.put(request)
 
     def _look(self) -> None:
-        """Wake the thread, unless requests wait for it: the item "look" could displace a
-        request."""
+        """Wake the thread. Do nothing if it has requests to check, because it is awake then.
+
+        Another item in the queue could displace a request.
+        """
         if not self._box.waiting:
             self._box.put("look")
 
     def obeyed(self, answer: Answer) -> bool:
-        """Process the robot's answer to any request. Return whether the answer must wait.
+        """Process the robot's answer to a request, and return whether the answer must wait.
 
-        An answer waits if its request is a `set` with `keep` whose settings the robot has used. The
-        thread then writes the file, and `results` returns the answer. The caller sends all other
-        answers to the clients.
+        If the robot has used the settings of a `set` with `keep`, return True. The thread then
+        writes the file, and `results` returns the answer. For any other answer, return False: the
+        caller must send it to the client now.
         """
         pending = self._pending.get(answer.id)
         if pending is None or pending.edit is None:
@@ -164,9 +175,10 @@ class SettingsFile:
         return True
 
     def results(self, now_ns: int, events: list[Event]) -> list[Request | Answer]:
-        """Return the requests that the robot may obey now, and the answers for clients.
+        """Return the requests whose settings the robot must use now, and the answers for clients.
 
-        Adds an event to `events` for each request whose settings were written to the file.
+        Append an event to `events` for each request whose settings were written to the file.
+        `now_ns` is the present monotonic time, ns.
         """
         if not self._pending:
             return []
@@ -202,16 +214,19 @@ class SettingsFile:
 
     @property
     def limits(self) -> LimitsConfig:
-        """The limits at the daemon's start, with the values written to the file since then."""
+        """The limits at the daemon's start, with the values that it has since written to the file.
+
+        Those values replace the values at the start.
+        """
         return self._limits
 
     def latches(self, latches: Latches, now: LimitsConfig) -> Latches:
         """Return the robot's latches as they must be stored for the next start of the daemon.
 
         The next start reads the limits from the configuration file. So if the daemon has written
-        limits to the file, `lowered` in the result has the limits that are lower in `now` than in
-        the file. `now` has the limits in force, except the limit that clients set by the Zenoh key
-        `speed_limit`.
+        limits to the file, the field `lowered` of the result contains those limits that are lower
+        in `now` than in the file. `now` contains the limits in force, but not the lower speed limit
+        that a client may have set with the Zenoh key `speed_limit`.
         """
         file = self._limits
         if file is self._started:
@@ -281,7 +296,10 @@ class SettingsFile:
             return f"the configuration file cannot be read: {error.strerror or error}"
         except ConfigError as error:
             self._signature = None
-            return f"the daemon could not start again with its present file: {error.problems[0]}"
+            return (
+                "the daemon could not start with the present content of its file: "
+                f"{error.problems[0]}"
+            )
         found = differences(self._in_force, self._written)
         told = [one.words(key) for key, one in found.items()]
         return listed(told, NAMED)
@@ -300,7 +318,7 @@ class SettingsFile:
 
 
 def _overdue(pending: _Pending) -> Answer:
-    """Return the answer to a request that took too long, or that exceeded the limit `JOBS`."""
+    """Return the answer to a request that took too long, or that came when `JOBS` others waited."""
     why = (
         f"the disk did not answer within {PATIENCE_NS / NS_PER_S:g} s, or too many changes came at "
         "once"

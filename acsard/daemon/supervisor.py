@@ -18,7 +18,7 @@ from acsard.host.errors import Exit
 from acsard.host.threads import in_thread
 
 AGAIN_S = 0.1
-"""Pause before a process that has ended is started again, s."""
+"""Usual pause between the end of a process and its restart, s."""
 
 LATER_S = 2.0
 """Pause before a restart after an exit code above 1, or after a failure to start the process, s."""
@@ -32,8 +32,8 @@ class Kind(Struct, frozen=True):
     again_s: float = AGAIN_S
     """Pause before a restart, s. After an exit code above 1 the pause is `LATER_S` instead."""
     final_at_first: frozenset[int] = frozenset()
-    """Exit codes that are final for the first process only. A later process may have read files
-    while a person was changing them."""
+    """Exit codes after which only the first process is not started again. If a later process ends
+    with such a code, a person may just have been changing its files, so it is started again."""
 
 
 GATEWAY = Kind("the TLS gateway", "gateway_ended")
@@ -54,17 +54,19 @@ PAGE = Kind(
     frozenset({Exit.OK, Exit.USAGE, Exit.IN_USE, Exit.NO_PERMISSION, Exit.BAD_CONFIG}),
     LATER_S,
 )
-"""The process of the web page. Its pause before a restart is longer, because a page that keeps
-failing must not take processor time from the robot. The process itself reports why it ends."""
+"""The process of the web page. The pause before its restart is longer, because a page that fails
+again and again must not take processor time from the robot. The process itself reports why it
+ends."""
 
 
 async def keep_running(
     words: Sequence[str], log: Callable[[Event], None], kind: Kind = GATEWAY
 ) -> int:
-    """Run `acsard` with the arguments `words` until cancelled, and restart it when it ends.
+    """Run `acsard` with the arguments `words`, and restart it whenever it ends.
 
-    If `kind` says that the exit code is final, there is no restart, and this function returns the
-    exit code. `log` gets an event for each restart.
+    Run until this task is cancelled, or until the process ends with an exit code that is final
+    according to `kind`. Then return the exit code. `log` is called with an event before each
+    restart.
     """
     final = kind.final | kind.final_at_first
     while True:

@@ -25,7 +25,7 @@ from acsard.host.timerfd import TimerFd
 
 
 class _Timer:
-    """A kernel timer that the event loop waits on while the context is entered."""
+    """A kernel timer, as a context manager. The event loop watches it inside the context."""
 
     def __init__(self, wake: Callable[[], None]) -> None:
         self._wake = wake
@@ -56,7 +56,10 @@ class Alarm(_Timer):
         self._at_ns: int | None = None
 
     def set(self, at_ns: int | None) -> None:
-        """Call `wake` at monotonic `at_ns`, ns. None does not change the time set before."""
+        """Call `wake` once, at the monotonic time `at_ns`, ns.
+
+        A new time replaces the earlier one. None leaves the timer unchanged.
+        """
         if at_ns is not None and at_ns != self._at_ns:
             self._timer.set(at_ns)
         self._at_ns = at_ns
@@ -68,7 +71,11 @@ class Alarm(_Timer):
 
 
 class Ticker(_Timer):
-    """A timer that calls `wake` at the end of every period. `take` returns the ended periods."""
+    """A timer that calls `wake` at the end of every period.
+
+    `take` then returns how many periods have ended. It must be called each time, because it also
+    sets the timer for the next period.
+    """
 
     def __init__(self, period_ns: int, wake: Callable[[], None]) -> None:
         super().__init__(wake)
@@ -77,14 +84,14 @@ class Ticker(_Timer):
         self._due_ns = 0
 
     def start(self, now_ns: int) -> None:
-        """Start the timer. The first period ends one period after monotonic `now_ns`."""
+        """Start the timer. The first period begins at the monotonic time `now_ns`, ns."""
         self._due_ns = now_ns + self._period_ns
         self._timer.set(self._due_ns)
 
     def take(self, now_ns: int) -> Period:
-        """Return how many periods have ended since the last call, and when the first was due.
+        """Return how many periods have ended since the last call, and when the first of them ended.
 
-        `now_ns` is the present monotonic time.
+        `now_ns` is the present monotonic time, ns.
         """
         if not self._rang and now_ns < self._due_ns:
             return NO_PERIOD
@@ -107,19 +114,18 @@ class Next(Struct, frozen=True):
     """Result of a step. It says which events may run a step before the next period ends."""
 
     listens: bool
-    """Whether a command that arrives gets a step of its own, before the next period."""
+    """Whether the next command gets a step at once, not only in the next period."""
     retry_ns: int | None
-    """Monotonic time of the next step for a waiting command, ns; None if no command waits."""
+    """Monotonic time at which a step can send the waiting command, ns; None if no command waits."""
     period_ended: bool = True
-    """Whether the step ran at the end of a period. If so, the next stop command gets a step of its
-    own."""
+    """Whether the step ran at the end of a period. If so, the next stop gets a step at once."""
 
 
 class Wakeup:
     """Runs the control loop's step when the event loop, a timer or the bus asks for it.
 
-    A call of this object runs a step immediately. During a step, a call instead requests another
-    step, which runs when the present step has ended.
+    Calling this object runs a step immediately. If a step is running already, the call requests
+    another step, which runs after the present one.
     """
 
     def __init__(self) -> None:
@@ -137,9 +143,10 @@ class Wakeup:
             self._run(self._step, self._over)
 
     def command(self) -> None:
-        """Report a sample that may be a command, from any thread.
+        """Tell the loop that a sample has arrived that may be a command. Any thread may call this.
 
-        Only the first sample after a step with `Next.listens` wakes the loop.
+        If the last step returned `Next.listens`, the first such sample runs a step. Any other
+        sample waits for the next step.
         """
         self._heard = True
         if self._listens:
@@ -147,10 +154,10 @@ class Wakeup:
             self._from_thread()
 
     def stop(self) -> None:
-        """Report a stop, from any thread.
+        """Tell the loop that a stop has arrived. Any thread may call this.
 
-        The first stop wakes the loop. Further stops do not, until a step at the end of a period has
-        run or a step has asked for commands (`Next.listens`).
+        The first stop runs a step. Further stops do not run a step of their own until a step has
+        ended a period or has returned `Next.listens`.
         """
         if not self._stop_told:
             self._stop_told = True
@@ -163,7 +170,10 @@ class Wakeup:
             pass  # the event loop has closed, so nothing is left to wake
 
     async def run(self, step: Callable[[], Next | None]) -> None:
-        """Run `step` on every event until `step` returns None, and raise its exceptions."""
+        """Run `step` for every event until `step` returns None or raises an exception.
+
+        The exception is raised here.
+        """
         self._over = self._loop.create_future()
         with self._alarm:
             self._step = step

@@ -9,8 +9,8 @@ from contextlib import suppress
 from pathlib import Path
 
 NEW_MODE = 0o644
-"""Permission bits of a new file, if the caller gives none. The user of the systemd service must be
-able to read the file."""
+"""Permission bits of a new file if the caller does not choose them. Other users may read the file,
+because the systemd service may run as another user."""
 
 
 def replace(
@@ -30,8 +30,8 @@ def replace(
         content: The new content. Only the owner can read the file until its mode is set.
         mode: The permission bits. If None, an existing file keeps its mode, and a new file gets
             `NEW_MODE`.
-        owner: The numbers of the user and the group that own the new file. If None, the file keeps
-            its owner, as far as this process has the permission to set it.
+        owner: The uid and the gid of the new file. If None, the file keeps its owner and group, as
+            far as this process has the permission to set them.
         synced: If True, wait before the rename until the disk has stored the new content. A power
             cut then leaves the complete old or new file. If False, a power cut may leave a part of
             the new file until the caller has called `sync`.
@@ -66,7 +66,7 @@ def replace(
 
 
 def sync(path: Path) -> None:
-    """Wait until the disk has stored the content of this file, or the entries of this directory."""
+    """Wait until the disk has stored a file's content, or the entries of a directory."""
     handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
         os.fsync(handle)

@@ -31,15 +31,15 @@ from acsard.core.values import NS_PER_S
 from acsard.host import clock
 
 OUR_UNIT = ("NOTIFY_SOCKET", "INVOCATION_ID")
-"""Environment variables of systemd that a child does not inherit. With them, the child could send
-systemd notifications in its parent's name."""
+"""Environment variables of systemd that a child does not get from its parent. With them, a child
+could send notifications to systemd in its parent's name."""
 
 BEAT_S = 0.5
-"""Longest time between two signs of life of a child, and between two checks by its parent, s."""
+"""At least once in this time, s, a child sends a sign of life and its parent looks for one."""
 
 SILENT_NS = 3 * NS_PER_S
-"""Time without a sign of life after which the parent kills a child, ns. The TLS gateway ends itself
-after 1 s without progress, so this limit is for a process that cannot even end itself."""
+"""If a child gives no sign of life for this time, ns, its parent kills it. The TLS gateway already
+ends itself after 1 s without progress, so this limit is for a process that cannot even do that."""
 
 START_NS = 15 * NS_PER_S
 """Longest time for which the parent waits for a child's first sign of life, ns. Python starts
@@ -49,8 +49,8 @@ slowly on a busy machine."""
 class Silence:
     """Detects that another process has given no sign of life for longer than `most_ns`, ns.
 
-    If more than 0.5 s passes between two calls of `too_long`, only 0.5 s counts as silence. During
-    a longer time, the computer may have stopped both processes.
+    If more than 0.5 s passes between two calls of `too_long`, only 0.5 s of it counts as silence:
+    the computer may have stopped both processes in that time.
     """
 
     def __init__(self, most_ns: int) -> None:
@@ -75,7 +75,10 @@ def acsard(*words: str) -> list[str]:
 
 
 def environment(hidden: Collection[str] = ()) -> dict[str, str]:
-    """Return this process's environment for a child, without `hidden` and `OUR_UNIT`."""
+    """Return the environment variables for a child.
+
+    They are those of this process, without the names in `hidden` and `OUR_UNIT`.
+    """
     return {key: value for key, value in os.environ.items() if key not in (*OUR_UNIT, *hidden)}
 
 
@@ -87,7 +90,10 @@ class Limits(Struct, frozen=True):
 
 
 def limit(pid: int, limits: Limits) -> None:
-    """Set a child's limits, and let the kernel kill the child first if memory runs out."""
+    """Set the limits of the child with the process id `pid`.
+
+    If the computer runs out of memory, the kernel kills this child before other processes.
+    """
     try:
         with suppress(OSError):
             Path(f"/proc/{pid}/oom_score_adj").write_bytes(b"1000")
@@ -99,8 +105,11 @@ def limit(pid: int, limits: Limits) -> None:
 
 
 def how_it_ended(code: int) -> str:
-    """Return how a process ended, in words. A negative `code` is the number of a signal."""
-    return f"was ended by signal {-code}" if code < 0 else f"ended with {code}"
+    """Return in words how a process ended.
+
+    `code` is its exit code, or the negative number of the signal that ended it.
+    """
+    return f"was ended by signal {-code}" if code < 0 else f"ended with exit code {code}"
 
 
 def end(process: subprocess.Popen[bytes], patience_s: float) -> None:
@@ -122,9 +131,10 @@ async def running(
     stdout: int | None = None,
     stderr: int | None = None,
 ) -> AsyncIterator[Process]:
-    """Start a child process, yield it, and kill it if it still runs at the end of the block.
+    """Start a child process for the duration of an `async with` block, and yield it.
 
-    Raises `OSError` if the child cannot be started.
+    If the child still runs at the end of the block, it is killed. `stdin`, `stdout` and `stderr`
+    are those of `subprocess`. Raises `OSError` if the child cannot be started.
     """
     child = await asyncio.create_subprocess_exec(
         *command,
@@ -163,8 +173,8 @@ class Child:
     def run(self) -> int:
         """Run the child until it ends, and return its exit code.
 
-        A negative exit code is the number of the signal that ended the child. Raises `OSError` if
-        the child cannot start.
+        If a signal ended the child, return the negative number of the signal. Raises `OSError` if
+        the child cannot be started.
         """
         ours, its = socket.socketpair()
         with ours:
@@ -184,7 +194,10 @@ class Child:
             return process.wait()
 
     def _falls_silent(self, ours: socket.socket) -> bool:
-        """Wait until the child falls silent, ends or is released. Return whether it fell silent."""
+        """Wait until the child falls silent, ends, or `release` is called.
+
+        `ours` is the parent's end of the socket to the child. Return True if the child fell silent.
+        """
         silence, before_ns, alive = Silence(START_NS), clock.mono_ns(), False
         while True:
             beat = ours.recv(4096) if select.select([ours], [], [], BEAT_S)[0] else None
@@ -199,7 +212,7 @@ class Child:
             before_ns = now_ns
 
     def release(self) -> None:
-        """Close the child's standard input, so that the child ends. Any thread may call this."""
+        """Make the child end by closing its standard input. Any thread may call this."""
         self._over = True
         if self._ours is not None:
             try:
@@ -212,7 +225,7 @@ class Child:
 
 
 class Parent:
-    """The child's connection to its parent process, over the child's standard input `fd`."""
+    """The child's connection to its parent process. `fd` is the child's standard input."""
 
     def __init__(self, fd: int) -> None:
         self.fd = fd

@@ -17,26 +17,27 @@ from functools import partial
 from acsard.core.values import NS_PER_S, Instant
 
 mono_ns: Callable[[], int] = partial(time.clock_gettime_ns, time.CLOCK_MONOTONIC_RAW)
-"""Function that reads the monotonic clock, ns. A function defined in Python would be slower."""
+"""Function that returns the time of the daemon's monotonic clock, ns. It is a `partial`, because a
+Python function would be slower."""
 
 
 def asleep_ns() -> int:
-    """Return for how long this computer was suspended since its start, ns."""
+    """Return the total time for which this computer has been suspended since its start, ns."""
     awake_ns = time.clock_gettime_ns(time.CLOCK_MONOTONIC)
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - awake_ns
 
 
 def steady_ns() -> int:
-    """Return a time, ns, that is never adjusted and that also advances during a suspend."""
+    """Return the time of a clock that is never adjusted and also runs during a suspend, ns."""
     return mono_ns() + asleep_ns()
 
 
 def steady_s() -> float:
     """Return the time of `steady_ns`, s.
 
-    Programs that send commands or show states compute the ages of commands and states with this
-    clock. With a clock that stands still during a suspend, a command or a state from before the
-    suspend would seem fresh.
+    Programs that send commands or show states use this clock for the ages of commands and states.
+    With a clock that stands still during a suspend, a command or a state from before the suspend
+    would seem fresh.
     """
     return steady_ns() / NS_PER_S
 

@@ -22,27 +22,31 @@ from acsard.host.child import environment
 from acsard.host.extras import install
 
 EDIT_S = 2.0
-"""Time limit of the process, s. The process takes 0.2 s on a computer that is not busy."""
+"""Time limit for the process that computes the change, s. It takes 0.2 s on an idle computer."""
 
 
 class Task(Struct, frozen=True):
-    """Input of the process: the text of a file, and the new values by dotted key."""
+    """Input of the process: the text of an `acsard.toml`, and the new values.
+
+    `keys` maps dotted keys, such as "mcu.port", to these values.
+    """
 
     text: str
     keys: dict[str, object]
 
 
 class Result(Struct, frozen=True):
-    """Output of the process: the new text, or an `error` that says why the change failed."""
+    """Output of the process: the new text, or the reason in `error` why the change failed."""
 
     text: str = ""
     error: str = ""
 
 
 def edited_apart(text: str, keys: Mapping[str, object]) -> str:
-    """Return the configuration `text` with the values of `keys`, computed in a separate process.
+    """Return the configuration `text` with new values, computed in a separate process.
 
-    Raises `ValueError` if the text cannot be changed, and `OSError` if no process can start.
+    `keys` maps dotted keys, such as "mcu.port", to their new values. Raises `ValueError` if the
+    text cannot be changed, and `OSError` if the process cannot be started.
     """
     task = msgspec.json.encode(Task(text, dict(keys)))
     # With -P Python ignores the working directory, so it runs the installed package.

@@ -55,8 +55,9 @@ def find(path: str | None) -> tuple[str, bytes]:
 def writable(path: str | None) -> Path:
     """Return the path of the configuration file that the option --write changes.
 
-    `path` is the value of --config. Raises `MendableError` if the file or tomlkit is missing, if
-    the file is the `acsard.toml` of a clone of acsard, or if this user may not change it.
+    `path` is the value of --config, or None. Raises `MendableError` if there is no configuration
+    file, if it is the `acsard.toml` of a clone of acsard, if this user may not change it, or if the
+    library tomlkit is missing.
     """
     require_tomlkit()
     where, text = find(path)
@@ -93,10 +94,11 @@ class Edit(Struct, frozen=True):
 
 
 def keepable(file: Path | None, keys: Keys) -> Edit:
-    """Prepare the change that writes these settings into the file of the running daemon.
+    """Prepare the change that writes settings into the configuration file of the running daemon.
 
-    Raises `MendableError` if the file is None (the daemon runs without a file), tracked by git or
-    read-only, if tomlkit is missing, or if the old or new text is not a valid configuration.
+    `file` is this file, or None if the daemon runs without one. `keys` are the settings with their
+    new values. Raises `MendableError` if `file` is None, read-only or tracked by git, if the
+    library tomlkit is missing, or if the old or the new text is not a valid configuration.
     """
     if file is None:
         raise MendableError(
@@ -120,11 +122,10 @@ def keepable(file: Path | None, keys: Keys) -> Edit:
 
 
 def keep(edit: Edit) -> None:
-    """Write a prepared change to the file.
+    """Write a prepared change to the configuration file.
 
-    If another program has changed the file since the change was prepared, this function prepares
-    the change again. Raises `MendableError` and leaves the file unchanged if the change cannot be
-    written.
+    If another program has changed the file since then, prepare the change again for the new
+    content. If the change cannot be written, raise `MendableError` and leave the file unchanged.
     """
     try:
         # A change takes 0.2 s to compute, and a person's editor may write the file meanwhile.
@@ -145,7 +146,10 @@ def keep(edit: Edit) -> None:
 
 
 def _require_writable(place: Path) -> None:
-    """Raise `ValueError` if the daemon may not replace the file. `place` has no symbolic links."""
+    """Raise `ValueError` if the daemon may not replace the file at `place`.
+
+    `place` is a path without symbolic links.
+    """
     if not place.is_file():
         raise ValueError("it is not a regular file")
     # Check the mode bits too, because root may write every file. Without these checks the daemon
@@ -157,10 +161,10 @@ def _require_writable(place: Path) -> None:
 
 
 def is_tracked(place: Path) -> bool:
-    """Return whether git tracks the file. `place` has no symbolic links.
+    """Return whether git tracks the file at `place`, a path without symbolic links.
 
-    If git is missing or does not answer, only the `acsard.toml` of a clone of acsard counts as
-    tracked.
+    The `acsard.toml` of a clone of acsard always counts as tracked. If git is missing or does not
+    answer, no other file counts as tracked.
     """
     if not any((parent / ".git").exists() for parent in place.parents):
         return False
@@ -176,7 +180,7 @@ def is_tracked(place: Path) -> bool:
 
 
 def _is_reference(file: Path) -> bool:
-    """Return whether this is the `acsard.toml` in the top directory of a clone of acsard."""
+    """Return whether `file` is the `acsard.toml` at the top of a git clone of acsard."""
     place = file.resolve()
     top = place.parent
     in_clone = (top / ".git").exists() and (top / "acsard" / "__init__.py").is_file()
@@ -184,7 +188,10 @@ def _is_reference(file: Path) -> bool:
 
 
 def require_tomlkit() -> None:
-    """Raise `MendableError` if tomlkit is missing. Call this before long work, not after it."""
+    """Raise `MendableError` if the library tomlkit is missing.
+
+    A tool that works for a long time should call this before that work.
+    """
     try:
         import tomlkit  # noqa: F401
     except ImportError:
@@ -197,8 +204,9 @@ def require_tomlkit() -> None:
 def change(file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = False) -> Keys:
     """Set keys in an `acsard.toml`, and return the keys with their values.
 
-    `keys` may be a function of the file's configuration. If `new` is true, a missing file is
-    created. Raises `MendableError` and leaves the file unchanged if it cannot be changed.
+    `keys` maps the keys to the new values, or is a function that computes this mapping from the
+    file's configuration. If `new` is true, a missing file is created. If the file cannot be
+    changed, raise `MendableError` and leave it unchanged.
     """
     try:
         place, text, given = _changed(file, keys, new)
@@ -211,7 +219,10 @@ def change(file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = Fal
 def require_changeable(
     file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = False
 ) -> None:
-    """Raise the `MendableError` that `change` would raise. Call this before long work."""
+    """Raise `MendableError` if `change` would raise it for the same arguments.
+
+    A tool that works for a long time should call this before that work.
+    """
     try:
         place, _, _ = _changed(file, keys, new)
         if not os.access(place.parent, os.W_OK):
@@ -223,7 +234,10 @@ def require_changeable(
 def _changed(
     file: Path, keys: Keys | Callable[[Config], Keys], new: bool
 ) -> tuple[Path, str, Keys]:
-    """Return the path without symbolic links, the text with the new values, and the keys."""
+    """Return the file's path without symbolic links, its new text, and the keys with new values.
+
+    The arguments are those of `change`.
+    """
     place = file.resolve(strict=not new)
     # `read_text` would lose CRLF line ends.
     text = "" if new and not place.exists() else place.read_bytes().decode()

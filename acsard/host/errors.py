@@ -38,18 +38,18 @@ WORDS: dict[int, str] = {
     Exit.NO_PERMISSION: "no permission",
     Exit.BAD_CONFIG: "bad configuration",
 }
-"""Meaning of each exit code, in words for messages."""
+"""Maps each exit code to its meaning in words, for messages."""
 
 
 class MendableError(AcsardError):
-    """Base class of the errors whose cause a person can fix. The text of the error says how."""
+    """Base class of errors whose cause a person can fix. The text of each error says how."""
 
     code: Exit = Exit.FAILURE
     """Exit code of a subcommand that ends with this error."""
 
 
 class UsageError(MendableError, ValueError):
-    """An argument is not written correctly, or names something that does not exist."""
+    """An argument has the wrong form, or names a thing that does not exist."""
 
     code = Exit.USAGE
 
@@ -61,19 +61,19 @@ class UnreachableError(MendableError, ConnectionError):
 
 
 class NoAnswerError(MendableError, TimeoutError):
-    """A process listens at the endpoint, but no daemon answers this query."""
+    """A program accepts connections at the endpoint, but no daemon answers the query."""
 
     code = Exit.UNREACHABLE
 
 
 class ReplyError(MendableError, RuntimeError):
-    """The daemon replied that the request failed, or its reply cannot be decoded."""
+    """The daemon's reply says that the request failed, or cannot be decoded."""
 
 
 class NotDrivenError(MendableError, RuntimeError):
-    """The robot does not follow this client's commands, or the client sent none for some time.
+    """The robot does not follow this client's commands. The text of the error says why.
 
-    The text is the reason.
+    One reason is that the client has sent no command for some time.
     """
 
 

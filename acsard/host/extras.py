@@ -22,7 +22,7 @@ Extra = Literal["foxglove", "report", "shell", "tls", "web", "write"]
 
 
 def install(extra: Extra) -> str:
-    """Return the shell command that installs an extra, for an error about a missing library."""
+    """Return the shell command that installs an extra. Errors about missing libraries show it."""
     try:
         wanted = wanted_by(distribution("acsard"), extra)
     # acsard runs from its source directory and has not been installed.
@@ -39,10 +39,10 @@ def missing(library: str, extra: Extra) -> MendableError:
 
 
 def wanted_by(installed: Distribution, extra: Extra) -> list[str]:
-    """Return the arguments of `pip install` for an extra, such as ["DIRECTORY[EXTRA]"].
+    """Return the arguments of `pip install` that install an extra, such as ["DIRECTORY[EXTRA]"].
 
-    If the directory from which `installed` was installed no longer exists, return the names of the
-    libraries in the extra instead.
+    DIRECTORY is the directory from which acsard was installed. If it no longer exists, return the
+    names of the extra's libraries instead. `installed` is the metadata of the installed acsard.
     """
     told = json.loads(installed.read_text("direct_url.json") or "{}")
     url = urlsplit(told.get("url", ""))
@@ -56,7 +56,7 @@ def wanted_by(installed: Distribution, extra: Extra) -> list[str]:
 
 
 def _installer() -> list[str]:
-    """Return the command that installs packages into the venv of this process."""
+    """Return the words of the command that installs packages into the venv of this process."""
     sudo = [] if os.access(sys.prefix, os.W_OK) else ["sudo"]
     if find_spec("pip"):
         return [*sudo, sys.executable, "-m", "pip", "install"]

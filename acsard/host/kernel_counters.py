@@ -18,15 +18,15 @@ from acsard.core.values import NS_PER_S
 from acsard.host import clock
 
 SLOWED_BITS = 0b1110
-"""Bits of the Raspberry Pi's `get_throttled` that are set while the clock is limited, the processor
-is throttled, or the soft temperature limit is active."""
+"""Mask for three bits of the Raspberry Pi's `get_throttled`: the clock frequency is limited, the
+processor is throttled, and the soft temperature limit is active."""
 
 OWN_SCALING = ("intel_pstate", "amd-pstate", "amd-pstate-epp")
 """The cpufreq drivers whose governor `powersave` adapts the frequency to the load. With every other
 driver, this governor keeps the lowest frequency."""
 
 COOLERS = ("Processor", "cpufreq", "thermal-cpufreq", "thermal-idle", "intel_powerclamp")
-"""Beginnings of the type names of cooling devices that slow a processor down."""
+"""A cooling device slows a processor down if its type (in sysfs) begins with one of these texts."""
 
 
 class SlowClock(Struct, frozen=True):
@@ -44,7 +44,7 @@ class Conditions(Struct, frozen=True, omit_defaults=True):
     hot: bool = False
     """Whether a cooling device or the firmware slows the processor down now."""
     throttled: int = 0
-    """Number of times that the processors have slowed down because of heat."""
+    """Total number of times that the processors have slowed down because of heat."""
     slow_clock: SlowClock | None = None
 
 
@@ -56,7 +56,7 @@ class Reading(Struct, frozen=True, omit_defaults=True):
 
     asleep_ns: int = 0
     steal_ns: tuple[int, ...] = ()
-    """Time in which the host of a virtual machine ran something else, for each processor, ns."""
+    """For each processor, the time in which the host of this virtual machine ran other work, ns."""
     disk_ns: int = 0
     """Time in which at least one program waited for a disk, ns."""
     own_disk_ns: int = 0
@@ -72,21 +72,25 @@ class Reading(Struct, frozen=True, omit_defaults=True):
 
 
 class Scheduled(Struct, frozen=True, omit_defaults=True):
-    """Time for which a thread ran, and for which it was ready but waited for a processor, ns."""
+    """Two totals of a thread, ns.
+
+    They are the time for which it ran, and the time for which it was ready to run but waited for a
+    processor.
+    """
 
     ran_ns: int = 0
     waited_ns: int = 0
 
 
 class Program(Struct, frozen=True):
-    """A process and the processor time that it has used."""
+    """A process. `ran_ns` is the processor time that it has used, ns."""
 
     pid: int
     name: str
     ran_ns: int
     priority: int = 20
-    """Kernel priority of the process's first thread: 20 plus the nice value, or a negative number
-    for a real-time thread. The lowest number is the highest priority."""
+    """Kernel priority of the process's first thread. A smaller number is a higher priority. It is
+    20 plus the nice value, or a negative number for a real-time thread."""
 
     @property
     def real_time(self) -> bool:
@@ -95,32 +99,39 @@ class Program(Struct, frozen=True):
 
 
 def scheduled(text: bytes) -> Scheduled:
-    """Decode `/proc/PID/task/TID/schedstat`; return zeros if the text is empty."""
+    """Decode the text of `/proc/PID/task/TID/schedstat`. Return zeros if it is empty."""
     words = text.split()
     return Scheduled(int(words[0]), int(words[1])) if len(words) > 1 else Scheduled()
 
 
 def steal(text: str, tick_ns: int) -> tuple[int, ...]:
-    """Return each processor's steal time, ns, from `/proc/stat`; a clock tick lasts `tick_ns`."""
+    """Return the steal time of each processor, ns.
+
+    `text` is the content of `/proc/stat`. `tick_ns` is the duration of its unit, a clock tick, ns.
+    """
     return tuple([int(row[8]) * tick_ns for row in _processors(text) if len(row) > 8])
 
 
 def iowait(text: str, tick_ns: int) -> int:
-    """Return how long a processor was idle while a program waited for I/O, ns, from `/proc/stat`.
+    """Return how long a processor was idle while a program waited for I/O, ns.
 
-    Each processor has its own counter. The result is the largest of these counters.
+    Each processor has its own counter. The result is the largest of these counters. `text` is the
+    content of `/proc/stat`. `tick_ns` is the duration of its unit, a clock tick, ns.
     """
     return max((int(row[5]) * tick_ns for row in _processors(text)), default=0)
 
 
 def _processors(text: str) -> list[list[str]]:
-    """Return the words of each processor's line in `/proc/stat`, without the line of the sums."""
+    """Return the words of each line about one processor in `/proc/stat`."""
     rows = [line.split() for line in text.splitlines() if line.startswith("cpu")]
     return [row for row in rows if row[0] != "cpu"]
 
 
 def stalled(text: str) -> int:
-    """Return how long at least one task waited, ns, from a file such as `/proc/pressure/io`."""
+    """Return the total time in which at least one task waited, ns.
+
+    `text` is the content of a file such as `/proc/pressure/io`.
+    """
     for line in text.splitlines():
         if line.startswith("some "):
             return int(line.rpartition("total=")[2]) * 1000
@@ -128,7 +139,10 @@ def stalled(text: str) -> int:
 
 
 def quota(text: str) -> int:
-    """Return how long a cgroup was stopped by its CPU quota, ns, from `cpu.stat` (v1 or v2)."""
+    """Return the total time for which a CPU quota has stopped a cgroup, ns.
+
+    `text` is the content of the cgroup's file `cpu.stat` (cgroup v1 or v2).
+    """
     for line in text.splitlines():
         name, _, value = line.partition(" ")
         if name == "throttled_usec":
@@ -139,18 +153,27 @@ def quota(text: str) -> int:
 
 
 def disk_bytes(text: str) -> int:
-    """Return how many bytes a thread read from and wrote to disks, from `/proc/.../TID/io`."""
+    """Return how many bytes a thread has read from disks and written to disks.
+
+    `text` is the content of `/proc/PID/task/TID/io`.
+    """
     rows = (line.partition(": ") for line in text.splitlines())
     return sum(int(value) for name, _, value in rows if name in ("read_bytes", "write_bytes"))
 
 
 def fields(text: str) -> list[str]:
-    """Return the fields of `/proc/PID/stat` from `state` on (field 3 in the manual proc(5))."""
+    """Return the fields in the text of `/proc/PID/stat`, without the first two.
+
+    Item 0 is therefore `state`, which is field 3 in the manual page proc(5).
+    """
     return text.rpartition(")")[2].split()
 
 
 def program(text: str, tick_ns: int) -> Program:
-    """Decode `/proc/PID/stat`. Raise `ValueError` or `IndexError` if the text has another form."""
+    """Decode the text of `/proc/PID/stat`. A clock tick lasts `tick_ns` ns.
+
+    Raises `ValueError` or `IndexError` if the text has another form.
+    """
     rest = fields(text)
     before = text.rpartition(")")[0]
     pid, _, name = before.partition(" (")
@@ -163,9 +186,14 @@ def busiest(
 ) -> Program | None:
     """Return the process that used the most processor time between two readings.
 
-    The `ran_ns` of the result is the time that the process ran between the readings, which are
-    `within_ns` apart. Returns None if no process used a quarter of one processor. Processes that
-    cannot delay a thread of kernel priority `priority` are ignored.
+    Args:
+        before: all processes at the first reading.
+        after: all processes at the second reading.
+        within_ns: time between the two readings, ns.
+        priority: kernel priority of a thread. Processes that cannot delay this thread are ignored.
+
+    Returns None if no process used a quarter of one processor. In the result, `ran_ns` is the time
+    for which the process ran between the readings, ns.
     """
     # A process whose nice value is higher by 9 can still delay the thread noticeably. At a
     # difference of 10, the kernel gives the process only a tenth of the thread's weight.
@@ -181,10 +209,11 @@ def busiest(
 
 
 def slow_clock(policy: Mapping[str, str]) -> SlowClock | None:
-    """Return the clock limit of a processor if it is below 0.6 of the full frequency, else None.
+    """Return the frequency limit of a processor if it is below 0.6 of the full frequency.
 
-    `policy` maps the file names in the processor's `cpufreq` directory to their texts. The present
-    frequency does not matter, because an idle processor runs slowly.
+    Otherwise return None. `policy` maps the names of the files in the processor's `cpufreq`
+    directory to their contents. The present frequency is not used, because an idle processor runs
+    slowly anyway.
     """
     governor, limit = policy.get("scaling_governor", ""), policy.get("scaling_max_freq", "")
     if governor == "powersave" and policy.get("scaling_driver") not in OWN_SCALING:
@@ -198,10 +227,10 @@ def slow_clock(policy: Mapping[str, str]) -> SlowClock | None:
 
 
 class Kernel:
-    """Reader of the kernel's files. Call its methods from one thread only."""
+    """Reads the kernel's counters from its files. Only one thread may call the methods."""
 
     def __init__(self, root: Path = Path("/")) -> None:
-        """Find the files below `root`. Only tests use another directory than "/"."""
+        """Find the kernel's files below the directory `root`. Only tests change this directory."""
         self._root, self._proc = root, root / "proc"
         # The first thread of a process has the same id as the process.
         self._io = root / f"proc/self/task/{os.getpid()}/io"
@@ -225,7 +254,10 @@ class Kernel:
         self._quota = next((path for path in self._cgroups() if path.is_file()), None)
 
     def read(self, conditions: Conditions | None = None) -> Reading:
-        """Read all counters. Read the processor's conditions too, unless the caller passes them."""
+        """Read all counters.
+
+        If `conditions` is None, read the present conditions of the processor too.
+        """
         stat = _text(self._proc / "stat")
         own = fields(_text(self._proc / "self/stat"))
         pressure = "" if self._pressure is None else _text(self._pressure)
@@ -260,9 +292,9 @@ class Kernel:
     def busiest(self, seconds: float) -> Program | None:
         """Return the process that uses the most processor time during the next `seconds` s.
 
-        This process itself does not count. Returns None if no other process uses a quarter of a
-        processor and has enough priority to delay this process. Processes that the kernel hides
-        from this user are not considered.
+        This call blocks for that time. It ignores this process, processes whose priority is too low
+        to delay it, and processes that the kernel hides from this user. Returns None if no other
+        process uses a quarter of a processor.
         """
         before, began_ns = list(self.programs()), clock.mono_ns()
         time.sleep(seconds)
@@ -288,7 +320,7 @@ class Kernel:
         yield self._root / "sys/fs/cgroup/io.pressure"
 
     def _cgroups(self) -> Iterator[Path]:
-        """Yield the possible paths of the file `cpu.stat` of this process's cgroup."""
+        """Yield the paths at which this process's cgroup may have its file `cpu.stat`."""
         mounted = self._root / "sys/fs/cgroup"
         for line in _text(self._proc / "self/cgroup").splitlines():
             controllers, path = line.split(":", 2)[1:]

@@ -37,7 +37,10 @@ _PRIORITIES = {"debug": 7, "info": 6, "warning": 4, "error": 3}
 
 
 def is_journal(stream: TextIO, environ: Mapping[str, str]) -> bool:
-    """Return whether the stream leads to the journal, according to systemd's JOURNAL_STREAM."""
+    """Return whether systemd has connected the stream to its journal.
+
+    systemd says so in the variable JOURNAL_STREAM of the environment `environ`.
+    """
     try:
         found = os.fstat(stream.fileno())
     except (OSError, ValueError):
@@ -46,7 +49,10 @@ def is_journal(stream: TextIO, environ: Mapping[str, str]) -> bool:
 
 
 def render(logger: object, method: str, line: MutableMapping[str, Any]) -> str:
-    """Return a structlog line in the journal's own protocol: a line NAME=VALUE for each field."""
+    """Return a log entry of structlog in the journal's protocol: one line NAME=VALUE per field.
+
+    structlog calls this function. `line` contains the fields of the entry.
+    """
     fields = {
         "MESSAGE": _message(line),
         "PRIORITY": str(_PRIORITIES.get(str(line.get("level")), 6)),
@@ -65,7 +71,10 @@ def _message(line: Mapping[str, Any]) -> str:
 
 
 class JournalStream(io.StringIO):
-    """Stream of datagrams to the journal. `__init__` raises `OSError` if there is no journal."""
+    """Stream whose `write` sends each text to the journal as a datagram.
+
+    `__init__` raises `OSError` if there is no journal at `path`.
+    """
 
     def __init__(self, path: str = "/run/systemd/journal/socket") -> None:
         super().__init__()
@@ -84,11 +93,15 @@ class JournalStream(io.StringIO):
 Form = Literal["console", "json", "logfmt", "journal"]
 
 MAX_VALUE = 500
-"""Number of characters after which a logged value is cut. Other programs may send long values."""
+"""Largest number of characters of a logged value. The rest is cut off, because a value from another
+program may have any length."""
 
 
 class Writer:
-    """Stream whose `write` never blocks and never raises. A thread writes the queued lines."""
+    """Stream whose `write` never blocks and never raises.
+
+    `write` only queues the text, and a thread writes it to the real stream.
+    """
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -127,7 +140,7 @@ class Writer:
 
 
 def write_through(stream: TextIO, text: str) -> None:
-    """Write directly to the stream's file descriptor, without the stream's buffer.
+    """Write a text directly to the stream's file descriptor, without the stream's buffer.
 
     If a thread hung in a write through the buffer, it would hold the buffer's lock. Python could
     then not flush the stream when the process ends.
@@ -157,7 +170,10 @@ class Log:
         self.use(settings)
 
     def use(self, settings: LogConfig) -> None:
-        """Apply the log level of these settings. The destination and the format do not change."""
+        """Use the log level in these settings from now on.
+
+        The destination and the format of the log stay as they were at the start.
+        """
         self._logger: Any = structlog.wrap_logger(
             structlog.WriteLogger(self._writer),  # type: ignore[arg-type]
             processors=[
@@ -174,7 +190,11 @@ class Log:
         )
 
     def event(self, event: Event) -> None:
-        """Log an event of the robot, with the client that caused it and its count, if known."""
+        """Log an event.
+
+        The log entry also contains the client that caused the event, and the number of occurrences
+        if there were several.
+        """
         fields: dict[str, object] = {"text": event.text}
         if event.by:
             fields["by"] = event.by
@@ -195,7 +215,10 @@ _LEVELS = {"info": logging.INFO, "warning": logging.WARNING, "error": logging.ER
 
 
 def _in_order(logger: object, method: str, line: MutableMapping[str, Any]) -> dict[str, Any]:
-    """Put the time, the level, the event and its text first in every format."""
+    """Return the fields of a log entry with time, level, event and text as the first fields.
+
+    structlog calls this function for each entry `line`.
+    """
     first = ("timestamp", "level", "event", "text")
     return {key: line[key] for key in first if key in line} | dict(line)
 
@@ -203,7 +226,10 @@ def _in_order(logger: object, method: str, line: MutableMapping[str, Any]) -> di
 def _printable(
     logger: object, method: str, line: MutableMapping[str, Any]
 ) -> MutableMapping[str, Any]:
-    """Cut long values, and replace characters that would move a cursor or begin a new line."""
+    """Make the values of a log entry safe to print.
+
+    Cut long values, and replace characters that would move the cursor or begin a new line.
+    """
     for key, value in line.items():
         if isinstance(value, str) and not (value.isprintable() and len(value) <= MAX_VALUE):
             line[key] = printable(value[:MAX_VALUE])

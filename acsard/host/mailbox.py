@@ -22,14 +22,20 @@ T = TypeVar("T")
 
 
 class Bell:
-    """Signal that wakes one waiting thread. After a `ring`, the next `wait` returns immediately."""
+    """Signal with which one thread wakes another one.
+
+    A `ring` ends the `wait` of the other thread. If no thread waits, it ends the next `wait`.
+    """
 
     def __init__(self) -> None:
         self._lock = Lock()
         self._lock.acquire()
 
     def ring(self) -> None:
-        """End the present wait, or the next one if no thread waits. Any thread may call this."""
+        """Wake the thread that waits. If none waits, the next `wait` returns immediately.
+
+        Any thread may call this.
+        """
         # Releasing a lock is the cheapest way to wake a thread.
         if self._lock.locked():
             try:
@@ -38,7 +44,10 @@ class Bell:
                 pass  # another thread called this method at the same moment
 
     def wait(self, seconds: float | None = None) -> bool:
-        """Wait until `ring` is called; return False after `seconds` s. None waits for ever."""
+        """Wait until `ring` is called, and return True.
+
+        Return False if that does not happen within `seconds` s. None means no time limit.
+        """
         return self._lock.acquire(timeout=-1 if seconds is None else max(0.0, seconds))
 
 
@@ -48,28 +57,30 @@ class Mailbox(Generic[T]):
     def __init__(self, most: int, wake: Callable[[], object] | None = None) -> None:
         """Create a mailbox for at most `most` items.
 
-        `put` stores an item, and then calls `wake` on the writer's thread. If `wake` is None, `put`
-        ends the reader's `wait` instead.
+        `wake` is a function that `put` calls after it has stored an item, in the thread of the
+        writer. If `wake` is None, `put` wakes a reader that waits in the method `wait`.
         """
         self.waiting: deque[T] = deque(maxlen=most)
-        """The items that wait, the oldest on the left. Only the reader may remove items. This
-        attribute is public, because a method call for each of forty mailboxes in each step would be
-        slow."""
+        """The items that wait, the oldest one at index 0. Only the reader may remove items. The
+        attribute is public, because a control step reads forty mailboxes, and forty method calls
+        would be slow."""
         self.lost = 0
-        """Number of items that newer items have displaced; approximate with several writers."""
+        """Total number of items that newer items have displaced. With several writers, this number
+        is approximate."""
         self._bell = Bell()
         self.wake = wake or self._bell.ring
         """Function that wakes the reader. A writer that calls `store` must call `wake`
         afterwards."""
         self.closed = False
-        """Whether no more items will arrive. Earlier items may still wait."""
+        """True if no writer will store more items. Earlier items may still wait for the reader."""
 
     # The writers' side
 
     def store(self, item: T) -> bool:
-        """Store an item without waking the reader. Return False if the oldest item was dropped.
+        """Store an item without waking the reader.
 
-        With several writers at the same time, the result may be wrong.
+        If the mailbox is full, drop its oldest item and return False, else return True. The result
+        may be wrong if several threads store items at the same time.
         """
         items = self.waiting
         room = len(items) < items.maxlen  # type: ignore[operator]
@@ -80,22 +91,28 @@ class Mailbox(Generic[T]):
         return room
 
     def put(self, item: T) -> bool:
-        """Store an item and wake the reader. Return False if the oldest item was dropped."""
+        """Store an item and wake the reader.
+
+        If the mailbox is full, drop its oldest item and return False, else return True.
+        """
         room = self.store(item)
         self.wake()
         return room
 
     def close(self) -> None:
-        """Declare that no more items will come, and wake the reader. Waiting items stay."""
+        """Declare that no more items will come, and wake the reader.
+
+        The reader can still take the items that wait.
+        """
         self.closed = True
         self.wake()
 
     # The reader's side
 
     def wakes(self, wake: Callable[[], object]) -> None:
-        """Let writers call the function `wake` from now on, instead of ending `self.wait`.
+        """Replace the function that wakes the reader. A reader that does so must not call `wait`.
 
-        If an item waits already or the mailbox is closed, `wake` is also called immediately.
+        If an item waits already or the mailbox is closed, call `wake` immediately.
         """
         self.wake = wake
         if self.waiting or self.closed:
@@ -107,12 +124,15 @@ class Mailbox(Generic[T]):
         return self.waiting.popleft() if self.waiting else None
 
     def take(self) -> list[T]:
-        """Remove and return the items that wait now. Items that arrive meanwhile stay."""
+        """Remove and return all items that wait now. Items that arrive during the call stay."""
         items = self.waiting
         return [items.popleft() for _ in range(len(items))]
 
     def wait(self, seconds: float | None = None) -> bool:
-        """Wait for an item or for `close`; return False after `seconds` s. None waits for ever."""
+        """Wait until an item waits or the mailbox is closed, and return True.
+
+        Return False if neither happens within `seconds` s. None means no time limit.
+        """
         began_ns, left = clock.mono_ns(), seconds
         while not (self.waiting or self.closed):
             if left is not None and left <= 0:

@@ -28,12 +28,15 @@ def own_name() -> str:
 
 
 def sender_id(name: str, secret: str = "") -> str:
-    """Return the id `NAME/SECRET` of a sender of commands. If `secret` is "", make a new secret."""
+    """Return the id of a sender of commands, in the form `NAME/SECRET`.
+
+    If `secret` is "", the id contains a new random secret.
+    """
     return f"{name[:MAX_NAME]}/{secret or new_secret()}"
 
 
 def new_secret() -> str:
-    """Return 128 random bits as 22 characters, none of which is "/"."""
+    """Return 128 random bits, encoded as 22 characters. None of them is "/"."""
     return secrets.token_urlsafe(16)
 
 

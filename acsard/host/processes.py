@@ -16,7 +16,8 @@ from msgspec import Struct
 PROC = Path("/proc")
 
 PTY_MAJORS = range(136, 144)
-"""Major device numbers of ptys, with 256 ptys for each. Serial ports have other major numbers."""
+"""Major device numbers of ptys. Each number stands for 256 ptys, and no serial port has one of
+them."""
 
 
 class Holder(Struct, frozen=True):
@@ -38,7 +39,7 @@ class _Open(Struct, frozen=True):
 
 
 def holders(path: str) -> Iterator[Holder]:
-    """Yield the processes that have the device `path` open."""
+    """Yield each process that has opened the device at `path`."""
     for process in dict.fromkeys(one.process for one in _having_open(path)):
         try:
             yield _holder(process)
@@ -48,7 +49,10 @@ def holders(path: str) -> Iterator[Holder]:
 
 
 def holder_of(path: str) -> Holder | None:
-    """Return another process that uses the device, preferably one with a lock on it, or None."""
+    """Return another process that has opened the device at `path`, or None if there is none.
+
+    If there are several, prefer a process that has locked the device.
+    """
     found = None
     for one in _having_open(path):
         try:
@@ -63,7 +67,10 @@ def holder_of(path: str) -> Holder | None:
 
 
 def master_of(path: str) -> Holder | None:
-    """Return the process at the other end of a pty, such as a simulator; None for a real device."""
+    """Return the process at the other end of the pty `path`, such as a simulator.
+
+    Return None if `path` is not a pty, or if the process is not found.
+    """
     wanted = _number(path)
     if os.major(wanted) not in PTY_MAJORS:
         return None
@@ -79,7 +86,10 @@ def master_of(path: str) -> Holder | None:
 
 
 def name_of(pid: int) -> str:
-    """Return the program name of a process; "" if the process does not exist or is hidden."""
+    """Return the program name of a process.
+
+    Return "" if the process does not exist, or if the kernel hides it from this user.
+    """
     try:
         return _name(PROC / str(pid))
     except OSError:
@@ -110,7 +120,7 @@ def _processes() -> Iterator[Path]:
 
 
 def _open_devices(part: str) -> Iterator[_Open]:
-    """Yield each file that any process has open, if its path contains "/dev/" and `part`."""
+    """Yield the open files of all processes whose path contains both "/dev/" and `part`."""
     for process in _processes():
         try:
             numbers = os.listdir(process / "fd")
@@ -150,7 +160,10 @@ def _holder(process: Path) -> Holder:
 
 
 def _name(process: Path) -> str:
-    """Return the program name of a process: "acsard" even if Python runs it as a module."""
+    """Return the program name of the process with the directory `process` in /proc.
+
+    The name is "acsard" for a process that Python runs as the module acsard, too.
+    """
     words = (process / "cmdline").read_bytes().split(b"\0")
     if any(Path(os.fsdecode(word)).name == "acsard" for word in words[:4]):
         return "acsard"
@@ -162,8 +175,9 @@ def _comm(process: Path) -> str:
 
 
 def called(words: tuple[str, ...], within_s: float) -> subprocess.CompletedProcess[str]:
-    """Run the command `words`, wait for its end, and return its output and exit code.
+    """Run a command until it ends, and return its output and exit code.
 
-    Raises `OSError` if it cannot be started, and `subprocess.TimeoutExpired` after `within_s` s.
+    `words` are the program and its arguments. Raises `OSError` if the program cannot be started,
+    and `subprocess.TimeoutExpired` if it still runs after `within_s` s.
     """
     return subprocess.run(words, capture_output=True, text=True, timeout=within_s, check=False)

@@ -22,23 +22,26 @@ class Rate(NamedTuple):
 
 
 class Bucket:
-    """A token bucket. It is full at first. All times are in ns on the monotonic clock."""
+    """A token bucket that limits a rate. It is full at first.
+
+    All times are monotonic times in ns.
+    """
 
     def __init__(self, rate: Rate) -> None:
         self._unit_ns = round(NS_PER_S / rate.hz)
         self._burst_ns = round((rate.most - 1.0) * self._unit_ns)
         self._paid_ns = 0
-        """Time at which the bucket is full again, ns. Each consumed unit adds `_unit_ns`."""
+        """Time at which the bucket is full again, ns. Taking a unit moves it by `_unit_ns`."""
 
     def room(self, now_ns: int) -> bool:
-        """Return whether the bucket contains a unit now."""
+        """Return whether the bucket contains at least one unit now."""
         return self._paid_ns <= now_ns + self._burst_ns
 
     def full(self, now_ns: int) -> bool:
         return self._paid_ns <= now_ns
 
     def take(self, now_ns: int) -> bool:
-        """Consume one unit; return False if the bucket is empty."""
+        """Take one unit from the bucket and return True. Return False if the bucket is empty."""
         if not self.room(now_ns):
             return False
         self._paid_ns = max(self._paid_ns, now_ns) + self._unit_ns
@@ -46,10 +49,14 @@ class Bucket:
 
 
 class Buckets:
-    """A token bucket for each name, and one for all names together."""
+    """Token buckets that limit the rate for each name, and the rate for all names together."""
 
     def __init__(self, of_one: Rate, in_all: Rate | None = None) -> None:
-        """Limit each name to the rate `of_one`, and all names together to `in_all` if it is set."""
+        """Create the buckets.
+
+        `of_one` is the permitted rate of each name. `in_all` is the permitted rate of all names
+        together. If it is None, only the rates of single names are limited.
+        """
         self._of_one = of_one
         self._shared = None if in_all is None else Bucket(in_all)
         self._buckets: dict[str, Bucket] = {}
@@ -58,7 +65,10 @@ class Buckets:
         return name not in self._buckets or self._buckets[name].room(now_ns)
 
     def take(self, name: str, now_ns: int) -> bool:
-        """Consume a unit of the name's bucket and of the shared one; False if either is empty."""
+        """Take a unit from the bucket of `name` and one from the shared bucket, and return True.
+
+        If either bucket is empty, take no unit and return False.
+        """
         if name not in self._buckets:
             # Drop the full buckets, which equal new ones, so that many names do not fill the
             # memory.
@@ -71,9 +81,9 @@ class Buckets:
 
 
 class Places:
-    """A limit on how many places, for example connections, may be in use at the same time.
+    """A limit on how many places may be in use at the same time. A place can be a connection.
 
-    At most `most` places may be in use in total, and at most `of_one` for each name.
+    At most `most` places may be in use in total, and at most `of_one` of them for the same name.
     """
 
     def __init__(self, most: int, of_one: int) -> None:
@@ -88,7 +98,7 @@ class Places:
         return self._taken[name] < self._of_one and self.taken < self._most
 
     def enter(self, name: str) -> bool:
-        """Take a place; return False if none is free."""
+        """Take a place for `name` and return True. Return False if no place is free."""
         if not self.room(name):
             return False
         self._taken[name] += 1
@@ -101,7 +111,10 @@ class Places:
 
     @contextmanager
     def held(self, name: str = "") -> Iterator[bool]:
-        """Take a place until the block ends, and yield True. If no place is free, yield False."""
+        """Take a place for `name` until the `with` block ends, and yield True.
+
+        If no place is free, yield False.
+        """
         free = self.enter(name)
         try:
             yield free

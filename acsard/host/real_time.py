@@ -12,24 +12,26 @@ import resource
 from pathlib import Path
 
 PRIORITY = 10
-"""Real-time priority of the control loop: below that of the kernel's interrupt threads (50)."""
+"""Real-time priority of the control loop. The kernel's interrupt threads have a higher one, 50."""
 
 SPIN_S = 1
-"""Time that the control loop may run without a pause before the kernel ends the process, s. This
-limit is needed because the loop has priority over all ordinary programs. A step takes a thousandth
-of this time."""
+"""If the control loop runs for longer than this without a pause, s, the kernel ends the process.
+Otherwise a loop that hangs would block all ordinary programs, because it has priority over them. A
+step takes a thousandth of this time. The systemd service has no such limit: systemd's watchdog ends
+a daemon that hangs."""
 
 DOZE = "/dev/cpu_dma_latency"
-"""The kernel's device through which a process limits how long a processor may take to wake up."""
+"""Device file through which a process limits the time that a processor takes to wake up."""
 
 _CAP_IPC_LOCK, _CAP_SYS_NICE = 14, 23
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
 
 def ask() -> str:
-    """Ask for real-time scheduling, locked memory and a processor that stays awake.
+    """Ask the kernel for real-time scheduling, locked memory and a processor that stays awake.
 
-    Returns a sentence that names the refused requests and the fix, or "" if none was refused.
+    If the kernel refuses a request, return a text for the user that names the refused requests and
+    says what to do. Otherwise return "".
     """
     asked = {
         "real-time scheduling": _schedule(),
@@ -48,9 +50,10 @@ def ask() -> str:
 
 
 def has(pid: int) -> bool | None:
-    """Return whether the first thread of a process (0: this one) has real-time scheduling.
+    """Return whether the first thread of a process has real-time scheduling.
 
-    In the daemon, this thread runs the control loop. Returns None if the scheduling cannot be read.
+    In the daemon, the first thread runs the control loop. `pid` 0 stands for the calling thread.
+    Returns None if the kernel does not say which scheduling the thread has.
     """
     try:
         policy = os.sched_getscheduler(pid)
@@ -62,7 +65,8 @@ def has(pid: int) -> bool | None:
 def allowed() -> bool:
     """Return whether a daemon started by this user would get real-time scheduling.
 
-    CAP_SYS_NICE or RLIMIT_RTPRIO grants it. In a container, root may lack the capability.
+    The capability CAP_SYS_NICE or the limit RLIMIT_RTPRIO permits it. In a container, even root may
+    lack this capability.
     """
     limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
     return _capable(_CAP_SYS_NICE) or limit == resource.RLIM_INFINITY or limit >= PRIORITY
@@ -87,7 +91,11 @@ def _schedule() -> bool:
 
 
 def _stay_awake() -> bool:
-    """Keep the processor out of deep sleep, from which it wakes late and with cold caches."""
+    """Keep the processor out of deep sleep until this process ends.
+
+    From deep sleep, a processor wakes late and with cold caches. Return False if the kernel
+    refuses.
+    """
     try:
         wish = os.open(DOZE, os.O_WRONLY | os.O_CLOEXEC)
     except FileNotFoundError:

@@ -12,14 +12,15 @@ from collections.abc import Mapping
 from acsard.core.values import NS_PER_S, Outputs
 
 FEEDS_PER_WATCHDOG = 4
-"""Number of times that the control loop feeds systemd's watchdog within the watchdog's timeout."""
+"""The control loop feeds systemd's watchdog this number of times in each timeout of the
+watchdog."""
 
 PATIENCE_S = 30
-"""Time by which `waiting` extends systemd's timeout for the start, s."""
+"""Each call of `waiting` gives the start this much time before systemd ends the process, s."""
 
 
 class Systemd:
-    """Connection to systemd. Its methods do nothing if systemd did not start this process."""
+    """Connection to systemd. If systemd did not start this process, the methods do nothing."""
 
     def __init__(self, environ: Mapping[str, str], pid: int) -> None:
         self._socket: socket.socket | None = None
@@ -47,11 +48,14 @@ class Systemd:
         self._send("READY=1")
 
     def stopping(self) -> None:
-        """Report that the daemon is ending. systemd then no longer expects watchdog signals."""
+        """Report that the daemon is ending. systemd then no longer expects signs of life."""
         self._send("STOPPING=1\nSTATUS=ramping to zero")
 
     def waiting(self, why: str) -> None:
-        """Report why the start is delayed. Call again within `PATIENCE_S`, or systemd gives up."""
+        """Tell systemd why the start takes longer, so that it goes on waiting.
+
+        Call this again within `PATIENCE_S`. Otherwise systemd ends this process.
+        """
         self._send(f"EXTEND_TIMEOUT_USEC={PATIENCE_S * 1_000_000}\nSTATUS={why}")
 
     def status(self, text: str) -> None:
@@ -61,7 +65,10 @@ class Systemd:
         self._send("WATCHDOG=1")
 
     def step(self, outputs: Outputs) -> None:
-        """Feed systemd's watchdog after a control step, and report the status if it has changed."""
+        """Feed systemd's watchdog if that is due, and report the robot's status if it has changed.
+
+        Call this after each control step, with the outputs of the step.
+        """
         if self._socket is None:
             return
         now_ns = outputs.now.mono_ns

@@ -12,16 +12,20 @@ from typing import TextIO
 
 
 def coloured(stream: TextIO) -> bool:
-    """Return whether the stream is a terminal with colors, and NO_COLOR is not set."""
+    """Return whether output to the stream may contain colors.
+
+    It may if the stream is a terminal that can show colors, unless the variable NO_COLOR is set.
+    """
     wanted = not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
     return wanted and stream.isatty()
 
 
 @contextmanager
 def one_by_one() -> Iterator[None]:
-    """Let standard input deliver each key press immediately, without Enter, until the block ends.
+    """Make the terminal deliver each key press immediately, without Enter, during a `with` block.
 
-    Ctrl-S becomes an ordinary key. Otherwise Ctrl-S would block a program that drives the robot.
+    Ctrl-S becomes an ordinary key. Otherwise it would stop the output of the terminal, and block a
+    program that drives the robot.
     """
     before = termios.tcgetattr(sys.stdin)
     tty.setcbreak(sys.stdin)

@@ -15,17 +15,18 @@ T = TypeVar("T")
 
 
 class NoThreadError(TimeoutError):
-    """No thread could be started, so the function was not called."""
+    """No thread could be started. The function that should run in it was not called."""
 
 
 async def in_thread(
     call: Callable[[], T], timeout: float | None, late: Callable[[T], None] | None = None
 ) -> T:
-    """Call `call` in a thread of its own, and return its result.
+    """Call `call` in a new thread, and return its result.
 
-    Raises `TimeoutError` after `timeout` s (None waits for ever), and `NoThreadError` if no thread
-    can be started. If the caller has stopped waiting when the result comes, a thread calls `late`
-    with the result, for example to close a file that `call` has opened.
+    Raises `TimeoutError` if `call` has not returned after `timeout` s; None means no time limit.
+    Raises `NoThreadError` if no thread can be started. If `call` returns after the caller has
+    stopped waiting, a thread calls `late` with the result, for example to close a file that `call`
+    has opened.
     """
     loop = asyncio.get_running_loop()
     future: asyncio.Future[T] = loop.create_future()
@@ -42,7 +43,7 @@ async def in_thread(
             future.set_result(result)
 
     def release(result: T) -> None:
-        """Pass a result to `late` in a thread, because `late` may block."""
+        """Call `late` with the result in a new thread, because `late` may block."""
         if late is not None:
             threading.Thread(target=late, args=(result,), daemon=True).start()
 

@@ -13,21 +13,24 @@ from acsard import __version__
 _PACKAGE = Path(__file__).parents[1]
 
 COMMIT_FILE = "commit"
-"""Name of the file with the commit, which `deploy/build_hook.py` adds to the package."""
+"""Name of a file that `deploy/build_hook.py` adds to the package. It contains the git commit."""
 
 DIGITS = 9
-"""Number of digits of the commit's hexadecimal hash that the version contains."""
+"""The version contains this number of hexadecimal digits of the commit's hash."""
 
 
 @lru_cache(1)
 def version() -> str:
-    """Return the version, such as `0.1.0+g1a2b3c4d5` if the commit of the source is known."""
+    """Return the version of acsard.
+
+    It is like `0.1.0+g1a2b3c4d5` if the commit of the source is known, else like `0.1.0`.
+    """
     commit = _text(_PACKAGE / COMMIT_FILE) or commit_of(_PACKAGE.parent)
     return f"{__version__}+g{commit[:DIGITS]}" if commit else __version__
 
 
 def commit_of(clone: Path) -> str:
-    """Return the commit that is checked out in this directory, or "" if no git clone is there.
+    """Return the commit that is checked out in the git clone `clone`; "" if it is not a clone.
 
     This function reads git's files itself, because a computer that runs the daemon may have no git.
     The files do not show whether the source has changed since the commit.

@@ -31,7 +31,8 @@ PRIVATE = (
     "10.0.0.0/8", "100.64.0.0/10", "127.0.0.0/8", "169.254.0.0/16", "172.16.0.0/12",
     "192.168.0.0/16", "::1/128", "fc00::/7", "fe80::/10",
 )  # fmt: skip
-"""Networks for whose addresses every authority may sign. No Internet host has such an address."""
+"""Networks for whose IP addresses every authority may sign certificates. No host on the Internet
+has such an address."""
 
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 
@@ -46,13 +47,18 @@ class Authority:
     def make(
         cls, directory: Path, name: str, days: int, addresses: Sequence[str] = ()
     ) -> Authority:
-        """Create an authority with the common name `name`, and write its files into `directory`.
+        """Create an authority, and write its certificate and its key into `directory`.
 
-        The authority's own certificate is valid for five times `days` days. The authority may sign
-        for the host names in `addresses` and `LOCAL`, and for all names below them. It may also
-        sign for the IP addresses in `addresses` and `PRIVATE`. For an IPv6 address in `addresses`,
-        it may sign for the whole /64 network. Common names, which identify clients on the bus, are
-        not limited.
+        Args:
+            directory: existing or new directory for the files.
+            name: common name of the authority.
+            days: usual validity of the certificates that it signs, days. The authority's own
+                certificate is valid for five times as long.
+            addresses: host names and IP addresses for which the authority may sign, in addition to
+                `LOCAL` and `PRIVATE`. For a host name it may also sign for all names below it, and
+                for an IPv6 address for the whole /64 network.
+
+        The common names of the certificates, which identify clients on the bus, are not limited.
         """
         directory.mkdir(mode=0o755, parents=True, exist_ok=True)
         key = ec.generate_private_key(ec.SECP256R1())
@@ -70,10 +76,10 @@ class Authority:
 
     @classmethod
     def load(cls, directory: Path, password: Callable[[], str]) -> Authority:
-        """Load the authority from `directory`.
+        """Load the authority from its files in `directory`.
 
-        If the key is encrypted, `password` is called and must return the password. Raises `OSError`
-        or `ValueError` if the authority cannot be loaded.
+        `password` is a function that returns the password of the key. It is called only if the key
+        is encrypted. Raises `OSError` or `ValueError` if the authority cannot be loaded.
         """
         data = (directory / CA_KEY).read_bytes()
         try:
@@ -124,11 +130,15 @@ class Authority:
         return [*names.get_values_for_type(x509.DNSName), *map(str, addresses)]
 
     def issue(self, directory: Path, name: str, addresses: list[str], days: float) -> None:
-        """Create a key and a certificate for use as server and client, valid for `days` days.
+        """Create a key, and sign a certificate that is for use as server and client.
 
-        The key, the new certificate and the authority's certificate are written into `directory`.
-        `name` is the common name. `addresses` are the host names and IP addresses of the
-        certificate's owner.
+        The key, the certificate and the authority's own certificate are written into `directory`.
+
+        Args:
+            directory: existing or new directory for the files.
+            name: common name of the certificate.
+            addresses: host names and IP addresses for which the certificate is valid.
+            days: validity of the certificate, days.
         """
         directory.mkdir(mode=0o755, parents=True, exist_ok=True)
         key = ec.generate_private_key(ec.SECP256R1())
@@ -224,5 +234,8 @@ def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 
 def _write(path: Path, data: bytes, mode: int) -> None:
-    """Write a file that this user owns. It never has more permissions than `mode`."""
+    """Write a file that this user owns, with the permission bits `mode`.
+
+    Not even for a moment does the file have more permissions than that.
+    """
     replace(path, data, mode=mode, owner=(os.geteuid(), os.getegid()))

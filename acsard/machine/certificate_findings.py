@@ -30,7 +30,10 @@ from acsard.machine.finding import LEVELS, Finding
 
 
 def certificates(tls: str) -> Iterator[Finding]:
-    """Yield findings about the certificates in the directory `tls`, or nothing if `tls` is ""."""
+    """Yield findings about the certificates in the directory `tls`.
+
+    Yield nothing if `tls` is "", because this machine then has no certificates.
+    """
     if not tls:
         return
     directory = Path(tls)
@@ -61,10 +64,11 @@ def certificates(tls: str) -> Iterator[Finding]:
 
 
 def renewal(tls: str, whose: str) -> str:
-    """Return the commands that replace a certificate that expires soon.
+    """Return the advice, with commands, how to replace a certificate that expires soon.
 
-    `tls` is the directory of this machine's certificate. `whose` is the owner of the certificate to
-    replace: "" for this machine, `AUTHORITY`, or a text such as "the router tls/HOST:PORT".
+    `tls` is the directory with this machine's certificate. `whose` says which certificate must be
+    replaced: "" for that of this machine, `AUTHORITY` for that of the authority, or a text such as
+    "the router tls/HOST:PORT".
     """
     directory, name = Path(tls), common_name(tls)
     if whose == AUTHORITY:
@@ -91,7 +95,7 @@ def renewal(tls: str, whose: str) -> str:
 
 
 def _mend_of_absent(directory: Path) -> str:
-    """Return the remedy if a certificate file in the directory is missing or cannot be read."""
+    """Return the advice for a directory in which a certificate file is missing or not readable."""
     if (directory / CA_KEY).exists():
         return f"run `{_command('renew', directory)}`, or run this check again with sudo"
     if not directory.is_dir() or not any(directory.iterdir()):
@@ -100,15 +104,16 @@ def _mend_of_absent(directory: Path) -> str:
             "into that directory"
         )
     return (
-        f"either run this check with sudo, or copy {CA}, {CERTIFICATE} and {KEY} into that "
-        f"directory again from the machine that has {CA_KEY}"
+        f"either run this check with sudo, or go to the machine that has {CA_KEY} and copy {CA}, "
+        f"{CERTIFICATE} and {KEY} from there into this directory again"
     )
 
 
 def _command(action: str, directory: Path) -> str:
-    """Return the shell command for an action of `acsard tls` in this directory.
+    """Return the shell command that runs `acsard tls ACTION` for this directory.
 
-    A command with sudo has the full path of acsard, because sudo does not search this user's PATH.
+    If this user may not write there, the command begins with sudo. It then contains the full path
+    of acsard, because sudo does not search this user's PATH.
     """
     there = next(one for one in (directory, *directory.absolute().parents) if one.exists())
     program = "acsard"

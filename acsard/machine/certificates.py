@@ -28,31 +28,38 @@ if TYPE_CHECKING:
 
 PORT = 7449
 CA_KEY = "ca-key.pem"
-"""Name of the file with the authority's key. Clients do not get the file."""
+"""Name of the file with the authority's private key. This file is never copied to a client."""
 
 OWN = "robot"
 """Common name of the certificate that `tls init` makes for the robot itself."""
 
 ADDRESS = re.compile(r"[A-Za-z0-9:]([A-Za-z0-9.:-]{0,251}[A-Za-z0-9:])?\Z")
-"""Pattern of a host name or an IP address."""
+"""Regular expression of a host name or an IP address."""
 
 LABEL = r"[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?"
 HOST_LIKE = re.compile(rf"{LABEL}(\.{LABEL})*\Z")
-"""Pattern of a common name that looks like a host name. It also matches `10.0.0.5`."""
+"""Regular expression of a common name that looks like a host name. Addresses like `10.0.0.5` match
+too."""
 
 
 def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -> list[str]:
     """Create an authority, the robot's certificate and a client certificate for each role.
 
-    All files are written into `directory`. Returns the names and addresses in the robot's
-    certificate: those of this machine, and `addresses`. An existing authority is replaced only if
-    `force` is set.
+    Returns the host names and addresses in the robot's certificate.
+
+    Args:
+        directory: directory for all files.
+        addresses: host names and addresses for the robot's certificate, in addition to those of
+            this machine.
+        days: validity of the certificates, days.
+        force: whether to replace an authority that `directory` already contains. If it is false,
+            raise `MendableError` for such a directory.
     """
     if (directory / CA).exists() and not force:
         raise MendableError(
-            f"{directory / CA} exists: `acsard tls add` makes one more certificate with it; "
-            "--force makes a new authority, and then the daemon refuses all certificates of the "
-            "old authority",
+            f"{directory / CA} exists: to make one more client certificate with this authority, "
+            "use `acsard tls add`; --force makes a new authority, and then the daemon refuses all "
+            "certificates of the old authority",
         )
     maker = _maker()
     _writable(directory)
@@ -67,7 +74,9 @@ def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -
 def add(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path:
     """Create a client certificate with the common name `name`, and return its directory.
 
-    `directory` contains the authority. `addresses` are the client's host names and addresses.
+    `directory` contains the authority. `addresses` are host names and addresses of the client for
+    its certificate, which is valid for `days` days. Raises `MendableError` if the client already
+    has a certificate.
     """
     authority = _load(directory)
     place = directory / "clients" / name
@@ -82,8 +91,9 @@ def add(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path
 def renew_client(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path:
     """Replace the client certificate with the common name `name`, and return its directory.
 
-    The new certificate contains `addresses`. It also contains those names and addresses of the old
-    certificate that the authority permits.
+    `directory` contains the authority. The new certificate contains `addresses`, and those host
+    names and addresses of the old certificate that the authority permits. It is valid for `days`
+    days.
     """
     authority = _load(directory)
     clients = directory / "clients"
@@ -93,7 +103,7 @@ def renew_client(directory: Path, name: str, addresses: Sequence[str], days: int
         raise MendableError(
             f"{clients} has no certificate for {name}, only for: {', '.join(there) or 'nobody'}; "
             f"`acsard tls add {shlex.quote(name)} --directory {shlex.quote(str(directory))}` makes "
-            "a first one"
+            "this certificate"
         )
     _require_permitted(authority, addresses)
     kept = [one for one in authority.names_in(place) if authority.permits(one)]
@@ -104,8 +114,9 @@ def renew_client(directory: Path, name: str, addresses: Sequence[str], days: int
 def renew(directory: Path, addresses: Sequence[str], days: int) -> list[str]:
     """Replace the robot's own certificate, and return the names and addresses in the new one.
 
-    The new certificate contains `addresses`. It also contains those names and addresses of this
-    machine and of the old certificate that the authority permits.
+    `directory` contains the authority and the old certificate. The new certificate contains
+    `addresses`. It also contains the names and addresses of this machine and of the old
+    certificate, as far as the authority permits them. It is valid for `days` days.
     """
     authority = _load(directory)
     _require_permitted(authority, addresses)
@@ -119,9 +130,8 @@ def renew(directory: Path, addresses: Sequence[str], days: int) -> list[str]:
 def _names_of(name: str) -> list[str]:
     """Return the host names that a certificate with the common name `name` should contain.
 
-    If a certificate contains no host name, OpenSSL checks its common name, such as `anna.meyer` or
-    `10.0.0.5`, as a host name. OpenSSL then refuses the certificate if the authority may not sign
-    for that name.
+    If a certificate contains no host name, OpenSSL treats its common name, such as `anna.meyer`, as
+    one. It then refuses the certificate if the authority may not sign for this host name.
     """
     named = [name] if ADDRESS.match(name) else []
     if not HOST_LIKE.match(name) or name.endswith(".local"):
@@ -143,17 +153,18 @@ def _require_permitted(authority: Authority, addresses: Sequence[str]) -> None:
 
 
 def _robot_names(more: Sequence[str]) -> list[str]:
-    """Return the host names and addresses of this machine, and those in `more`."""
+    """Return the host names and addresses of this machine, followed by those in `more`."""
     host = socket.gethostname()
     names = [host, f"{host}.local", "localhost", "127.0.0.1", *own_addresses(), *more]
     return list(dict.fromkeys(names))
 
 
 def keys(config: Config, directory: Path) -> dict[str, object]:
-    """Return the settings `bus.listen` and `bus.tls`, with which other machines can connect.
+    """Return the values of `bus.listen` and `bus.tls` with which other machines can connect.
 
-    `directory` contains the robot's certificate. `bus.listen` keeps the endpoints in `config`, and
-    gets a TLS endpoint if it has none.
+    `config` is the present configuration. The new `bus.listen` contains its endpoints, and one TLS
+    endpoint more if none of them uses TLS. `directory` contains the robot's certificate, and is the
+    new `bus.tls`.
     """
     listen = list(config.bus.listen)
     if not any(endpoint.startswith("tls/") for endpoint in listen):
@@ -162,7 +173,7 @@ def keys(config: Config, directory: Path) -> dict[str, object]:
 
 
 def port(config: Config) -> str:
-    """Return the port of the first TLS endpoint in the setting `bus.listen` that `keys` returns."""
+    """Return the TCP port on which the robot listens with TLS once it uses the result of `keys`."""
     ports = [at.rpartition(":")[2] for at in config.bus.listen if at.startswith("tls/")]
     return ports[0] if ports else str(PORT)
 
@@ -176,7 +187,10 @@ def _maker() -> type[Authority]:
 
 
 def _load(directory: Path) -> Authority:
-    """Load the authority from `directory`, after checking that this user may write files there."""
+    """Load the authority from `directory`.
+
+    Raises `MendableError` if that fails, or if this user may not write files into `directory`.
+    """
     maker = _maker()
     _writable(directory)
     try:

@@ -47,15 +47,16 @@ from acsard.host.processes import name_of
 from acsard.machine.finding import LEVELS, Finding, Level
 
 SHOWN = 6
-"""Largest number of configuration keys that a finding about different values names."""
+"""Largest number of keys that a finding names if their values in the daemon and in the file
+differ."""
 
 
 OPTIONS = (
     "mcu.port", "mcu.baud_rate", "robot.id", "bus.listen", "bus.connect", "record.directory",
     "ros.namespace",
 )  # fmt: skip
-"""Configuration keys that are also options of `acsard run`. If the daemon's value of such a key
-differs from the file, this is probably intended."""
+"""Configuration keys that options of `acsard run` can set. If the daemon's value of such a key
+differs from the value in the file, that is probably intended."""
 
 WAYS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = (
     (
@@ -84,8 +85,8 @@ WAYS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = (
     ),
 )
 """Reasons why the daemon's value of a configuration key may differ from the value in the file. Each
-row has a function that says whether the reason applies to a key, the level of the finding, the
-reason and the remedy."""
+row has four items: a function that returns whether the reason can apply to a key, the level of the
+finding, the reason, and the advice."""
 
 
 class Running(Struct, frozen=True):
@@ -96,21 +97,22 @@ class Running(Struct, frozen=True):
     before: RobotState
     state: RobotState
     looked_ns: int
-    """Wall-clock time of this machine halfway between the `state` request and its answer, ns."""
+    """Wall-clock time of this machine, ns, in the middle between the query of `state` and its
+    answer."""
     trip_ns: int = 0
-    """Time from the request for `state` to its answer, ns."""
+    """Duration from sending the query of `state` to receiving its answer, ns."""
     rows: tuple[DiagnosticStatus, ...] = ()
     here: bool = True
-    """Whether the daemon's process is on this machine. The daemon's address may lead to another
-    machine."""
+    """Whether the daemon runs on this machine. If not, its address leads to another machine."""
     events: tuple[LogEvent, ...] = ()
 
 
 def asked(config: Config, address: Address) -> Running:
-    """Query the daemon at this address. Raises an `AcsardError` if it does not answer.
+    """Query the daemon at this address, and return its answers. This takes a second.
 
-    `config` is the configuration in the local file. If this client cannot query the daemon's
-    configuration, `config` is used instead, with the values that the daemon's `info` contains.
+    `config` is the configuration in the local file. If the daemon does not return its own
+    configuration, `config` replaces it, with the values that the daemon's `info` contains. Raises
+    an `AcsardError` if the daemon does not answer.
     """
     endpoint, robot_id, tls = address
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
@@ -128,7 +130,8 @@ def asked(config: Config, address: Address) -> Running:
 def _configuration(robot: Client, info: Info, file: Config) -> Config:
     """Return the daemon's configuration.
 
-    If it cannot be queried, return `file` with the values that `info` contains.
+    If the daemon does not return it, return `file`, the configuration in the local file, with the
+    values that `info` contains.
     """
     try:
         return from_builtins(robot.get("config"))
@@ -139,10 +142,10 @@ def _configuration(robot: Client, info: Info, file: Config) -> Config:
 
 
 def compared(running: Running, file: Config) -> Iterator[Finding]:
-    """Yield findings about keys whose value in the running daemon differs from that in `file`.
+    """Yield findings about the keys whose values in the running daemon and in the file differ.
 
-    Each row of `WAYS` that applies to such keys gives one finding. If no value differs, there is
-    one finding with the level "ok".
+    `file` is the configuration in the file. There is one finding for each row of `WAYS` that
+    applies to such a key. If no value differs, there is one finding with the level "ok".
     """
     info, others = running.info, differences(running.config, file)
     who = f"acsard {info.version}, pid {info.pid}"
@@ -167,13 +170,16 @@ def compared(running: Running, file: Config) -> Iterator[Finding]:
 
 
 def _tables(its: Mapping[str, Difference]) -> str:
-    """Return the daemon's values of the keys in `its`, as lines for the configuration file."""
+    """Return lines for the configuration file with the daemon's values.
+
+    `its` maps each key to the difference between the daemon's value and the file's value.
+    """
     parts = [(key.rpartition("."), write(one.its)) for key, one in its.items()]
     return "; ".join(f"[{table}] {name} = {value}" for (table, _, name), value in parts)
 
 
 def answers(endpoint: str) -> bool:
-    """Return whether a program listens at `endpoint`.
+    """Return whether a program accepts TCP connections at `endpoint`.
 
     Raises `UsageError` if `endpoint` is not a valid endpoint.
     """
@@ -281,9 +287,9 @@ def _battery(config: BatteryConfig, battery: BatterySummary | None, mend: str) -
 
 
 def lost(passed: Mapping[str, int], config: Config) -> Iterator[str]:
-    """Yield a warning if the board answered too few lines.
+    """Yield a warning if the board answered too few lines of the daemon.
 
-    `passed` says by how much each counter rose within a second.
+    `passed` maps each of the daemon's counters to its rise within a second.
     """
     sent, came = passed.get("lines_sent", 0), passed.get("lines", 0)
     # Fewer than 40 lines are too few to judge the share of lost lines.
@@ -296,7 +302,10 @@ def lost(passed: Mapping[str, int], config: Config) -> Iterator[str]:
 
 
 def refused(counters: Mapping[str, int]) -> list[str]:
-    """Return a list with one warning if the daemon rejected many lines of the board, else []."""
+    """Return a list with one warning text if the daemon rejected too many lines of the board.
+
+    Otherwise return []. `counters` are the daemon's counters, or their rise within a second.
+    """
     kinds = {
         name.removeprefix("line_"): count
         for name, count in counters.items()
@@ -309,9 +318,10 @@ def refused(counters: Mapping[str, int]) -> list[str]:
 
 
 def gone(counters: Mapping[str, int]) -> list[tuple[int, str]]:
-    """Return [(number of losses of the link, sentence)], or [] if there was no loss.
+    """Return a list with one pair: how often the link was lost, and a sentence about it.
 
-    Losses that a stall of the daemon's computer caused do not count.
+    Return [] if the link was never lost. If the daemon's computer did not run the daemon in time,
+    the resulting losses do not count.
     """
     times = counters.get("link_lost", 0) - counters.get("link_lost_host_stall", 0)
     text = (
@@ -322,7 +332,7 @@ def gone(counters: Mapping[str, int]) -> list[tuple[int, str]]:
 
 
 def check(running: Running) -> str:
-    """Return the advice to run `acsard mcu check`, with the preparation that it needs."""
+    """Return the advice to run `acsard mcu check`, and how to prepare the robot for it."""
     port = running.config.mcu.port
     return (
         f"`acsard mcu check --port {port}` finds the cause. Before you run it, lift the wheels off "
@@ -345,10 +355,11 @@ GYRO_MENDS: dict[GyroDoes, str] = {
     "not believed": "check that the gyro's z axis points up and that its driver sends rad/s; then "
     "measure the track width with `acsard calibrate`",
 }
-"""Maps the gyro's status in `state` to the remedy; "" if the status needs no remedy."""
+"""Maps each status of the gyro in the message `state` to advice for the user; "" if no advice is
+needed."""
 
 CAUSES_SHOWN = 3
-"""Largest number of late control periods whose causes the doctor shows. Older ones are left out."""
+"""The doctor shows the causes of at most this number of late control periods, the latest ones."""
 
 CAUSES_PAGE = "deploy/systemd/README.md explains each cause of lateness"
 
@@ -383,7 +394,10 @@ PUT_ROUTER = (
 
 
 def routers(config: Config) -> Iterator[Finding]:
-    """Yield a warning for each configured router that does not listen or is used without TLS."""
+    """Yield a warning for each endpoint of `bus.connect` at which no program listens.
+
+    Also yield a warning for each endpoint to which the daemon connects without TLS.
+    """
     for endpoint in config.bus.connect:
         if not answers(endpoint):
             yield Finding("router", "warning", f"no program listens at {endpoint}", START_ROUTER)
@@ -402,9 +416,10 @@ def routers(config: Config) -> Iterator[Finding]:
 
 
 def found(config: Config, address: Address) -> Running | Finding:
-    """Return the daemon's answers, or a finding that says why there are none.
+    """Return the answers of the daemon at `address`, or a finding that says why there are none.
 
-    Raises `UsageError` for an invalid endpoint.
+    `config` is the configuration in the local file. Raises `UsageError` if the endpoint in
+    `address` is invalid.
     """
     endpoint = address.endpoint
     if not answers(endpoint):
@@ -470,7 +485,11 @@ def daemon(running: Running) -> Iterator[Finding]:
 
 
 def certificate(row: DiagnosticStatus | None, here: bool) -> Iterator[Finding]:
-    """Yield a finding if a certificate that the daemon or its gateway uses expires soon."""
+    """Yield a finding if a certificate of the daemon or its TLS gateway expires soon.
+
+    `row` is the daemon's diagnostics about certificates, or None if it reports none. `here` says
+    whether the daemon runs on this machine.
+    """
     if row is None or not row.level:
         return
     mend = "run `acsard doctor` on the daemon's machine, where it examines the certificate files"
@@ -482,14 +501,16 @@ def certificate(row: DiagnosticStatus | None, here: bool) -> Iterator[Finding]:
             "acsard`. The daemon uses the new files for its next connection. A restart of the "
             "daemon ends this warning at once, but stops the robot"
         )
-    text = f"the daemon's certificate that expires first: {row.message}"
+    text = f"of the daemon's certificates, the one that expires first: {row.message}"
     yield Finding("certificates", LEVELS[min(row.level, 2)], text, mend)
 
 
 def late(running: Running) -> Iterator[Finding]:
-    """Yield a warning if the daemon misses control periods, and findings with the latest causes.
+    """Yield findings about late control periods.
 
-    The counters cover the time since the daemon's start. The diagnostics cover recent periods.
+    There is a warning if the daemon has missed more than 1 % of the periods since its start, or if
+    its diagnostics report recently missed periods. Each of the latest known causes is one more
+    finding.
     """
     counters = running.state.counters
     missed, lines = counters.get("missed_periods", 0), counters.get("lines_sent", 0)
@@ -509,17 +530,17 @@ def late(running: Running) -> Iterator[Finding]:
     ]
     for event, cause in causes[-CAUSES_SHOWN:]:
         level: Level = "warning" if told else "ok"
-        text = f"the daemon missed control periods before {utc(event.stamp.to_ns())}: {cause}"
+        text = f"the daemon missed control periods just before {utc(event.stamp.to_ns())}: {cause}"
         yield Finding("daemon", level, text, CAUSES_PAGE)
 
 
 def clocks(running: Running) -> Iterator[Finding]:
     """Yield a warning if the daemon's clock is wrong, and one if Zenoh has replaced time stamps.
 
-    The daemon's clock is compared with this machine's clock. The daemon read its clock at an
-    unknown moment between the request and the answer. So a difference of up to 0.4 s plus half of
-    the time between request and answer is tolerated. Zenoh replaces the stamps of commands from a
-    computer whose clock is more than 0.5 s ahead.
+    If the daemon runs on another machine, its clock is compared with the clock of this machine. The
+    daemon read its clock at an unknown moment between the query and the answer. So the function
+    tolerates a difference of 0.4 s plus half of the time between query and answer. Zenoh replaces
+    the time stamps of commands from a computer whose clock is more than 0.5 s ahead.
     """
     its_ns, counters = running.state.stamp.to_ns(), running.state.counters
     apart = (its_ns - running.looked_ns) / NS_PER_S
@@ -545,13 +566,17 @@ def clocks(running: Running) -> Iterator[Finding]:
 
 
 def gyro(does: str, counters: Mapping[str, int]) -> Iterator[Finding]:
-    """Yield a finding about the gyro's status `does`, and one about samples that were rejected."""
+    """Yield a finding about the gyro's status, and one if the daemon has rejected gyro samples.
+
+    `does` is the gyro's status in the message `state`. If it is "off", the first finding is left
+    out. `counters` are the daemon's counters.
+    """
     words = next((text for name, text in WORDS.items() if name == does), does)
     if does != "off":
         mend = next(
             (text for name, text in GYRO_MENDS.items() if name == does),
-            "this tool does not know this status: if the daemon has another version of acsard, use "
-            "the daemon's version here",
+            "this tool does not know this status of the gyro: if the daemon has another version of "
+            "acsard, run this tool from the same version",
         )
         yield Finding("gyro", "warning" if mend else "ok", words, mend)
     refused = {n.removeprefix("imu_"): c for n, c in counters.items() if n.startswith("imu_") and c}
@@ -571,7 +596,11 @@ def gyro(does: str, counters: Mapping[str, int]) -> Iterator[Finding]:
 
 
 def linked(rows: Mapping[str, DiagnosticStatus]) -> Iterator[Finding]:
-    """Yield a finding about the connection to routers, if the daemon's diagnostics report it."""
+    """Yield a finding about the daemon's connection to routers.
+
+    Yield nothing if the daemon's diagnostics say nothing about routers. `rows` maps the names of
+    the rows in the diagnostics to the rows.
+    """
     row = rows.get("acsard: router")
     if row is not None:
         mend = START_ROUTER if row.level else ""
@@ -581,7 +610,7 @@ def linked(rows: Mapping[str, DiagnosticStatus]) -> Iterator[Finding]:
 
 
 def gateway(config: Config) -> Iterator[Finding]:
-    """Yield a finding for each endpoint of the TLS gateway that says whether it listens there."""
+    """Yield a finding for each endpoint of the TLS gateway: whether a program listens there."""
     for endpoint in config.bus.outside:
         if answers(endpoint):
             yield Finding("gateway", "ok", f"open at {endpoint}")

@@ -38,25 +38,28 @@ REAL = (
 
 
 def meddlers() -> Iterator[Finding]:
-    """Yield findings about programs that take or disturb serial ports."""
+    """Yield findings about running programs that seize serial ports or send data to them."""
     if running("brltty"):
         mend = (
             "run `sudo apt remove brltty`, unless you use a Braille display: brltty takes the "
             "serial ports of CH340 and FTDI chips"
         )
-        yield Finding("brltty", "failure", "the program brltty runs", mend)
+        yield Finding("brltty", "failure", "the program brltty is running", mend)
     if running("ModemManager") and not Path("/etc/udev/rules.d/70-acsar.rules").is_file():
         mend = "install deploy/udev/70-acsar.rules (`acsard service install` does that)"
         yield Finding(
             "ModemManager",
             "warning",
-            "the program ModemManager runs, and sends data to new serial ports",
+            "ModemManager is running; this program sends data to each new serial port",
             mend,
         )
 
 
 def clock_set() -> Iterator[Finding]:
-    """Yield a finding that says whether the wall clock is set. This clock dates all messages."""
+    """Yield a finding that says whether this computer's wall clock is set to a plausible year.
+
+    The time stamps of all messages come from this clock.
+    """
     year = time.gmtime(clock.now().wall_ns / NS_PER_S).tm_year
     if year < 2026:  # a computer without a battery for its clock starts with an old date
         mend = (
@@ -69,10 +72,11 @@ def clock_set() -> Iterator[Finding]:
 
 
 def scheduling(wanted: bool, pid: int | None) -> Iterator[Finding]:
-    """Yield a finding that says whether the daemon has or would get real-time scheduling.
+    """Yield a finding about real-time scheduling.
 
-    `wanted` is the setting `control.real_time`. `pid` is the daemon's process. If `pid` is None,
-    the permissions of this user are examined.
+    `wanted` is the setting `control.real_time`. `pid` is the process id of the running daemon, and
+    the finding says whether this process has real-time scheduling. If no daemon runs, `pid` is
+    None, and the finding says whether a daemon of this user would get it.
     """
     has = None if pid is None else real_time.has(pid)
     if not wanted:
@@ -91,19 +95,23 @@ def scheduling(wanted: bool, pid: int | None) -> Iterator[Finding]:
             REAL,
         )
     elif real_time.allowed():
-        yield Finding("real time", "ok", "this user may use real-time scheduling")
+        yield Finding("real time", "ok", "a daemon of this user gets real-time scheduling")
     else:
         yield Finding(
-            "real time", "warning", "this user has no permission for real-time scheduling", REAL
+            "real time", "warning", "a daemon of this user gets no real-time scheduling", REAL
         )
 
 
 LOOK_S = 0.3
-"""Time between two readings of the kernel's counters, s. It is 30 ticks of the kernel's clock."""
+"""Time between the two readings of the kernel's counters, s. The counters change with each tick of
+the kernel's clock, and this time contains 30 ticks."""
 
 
 def slowness(kernel: Kernel | None = None) -> Iterator[Finding]:
-    """Yield findings about causes that make programs on this computer late now, such as heat."""
+    """Yield findings about conditions that make programs on this computer late now, such as heat.
+
+    `kernel` reads the kernel's files. If it is None, a new reader is used.
+    """
     kernel = kernel or Kernel()
     before, began_ns = kernel.read(), clock.mono_ns()
     time.sleep(LOOK_S)
@@ -120,7 +128,7 @@ def slowness(kernel: Kernel | None = None) -> Iterator[Finding]:
 
 
 def serial_port(config: Config) -> Iterator[Finding]:
-    """Yield findings that say whether the port exists, may be opened, and is in use."""
+    """Yield findings that say whether the serial port exists, may be opened, and is in use."""
     path = config.mcu.port
     if path == "sim":
         mend = (
@@ -157,11 +165,14 @@ def serial_port(config: Config) -> Iterator[Finding]:
 
 
 def _hardware(name: str) -> Iterator[Finding]:
-    """Yield a warning if the board is unknown, and one if its USB chip delays bytes."""
+    """Yield a warning if the USB id is not in `BOARDS`, and one if the USB chip delays bytes.
+
+    `name` is the name of the serial device in /dev.
+    """
     usb = [port for port in serial_devices() if port.device == f"/dev/{name}"]
     if usb and usb[0].usb_id and not usb[0].board:
         known = ", ".join(sorted(BOARDS))
-        text = f"{usb[0].usb_id} is not one of the common boards ({known})"
+        text = f"the port's USB id {usb[0].usb_id} is not that of a common board ({known})"
         yield Finding(
             "port",
             "warning",
@@ -201,12 +212,14 @@ def examine(
     given: dict[str, dict[str, object]],
     told: Callable[[Config], Address] = address_of,
 ) -> Iterator[Finding]:
-    """Yield all findings of the doctor. Raises `UsageError` if the address is not a valid endpoint.
+    """Yield all findings of the doctor.
+
+    Raises `UsageError` if the daemon's address has an invalid endpoint.
 
     Args:
         where: the path of the configuration file, for messages.
         text: the content of the configuration file.
-        given: values that override those of the file, by table and key.
+        given: values that replace those in the file, by table and key.
         told: function that returns the daemon's address for a configuration.
     """
     try:

@@ -8,11 +8,16 @@ from msgspec import Struct
 
 Level = Literal["ok", "warning", "failure"]
 LEVELS: tuple[Level, ...] = ("ok", "warning", "failure")
-"""The levels, in order of severity. The index of a level is its number in ROS diagnostics."""
+"""The levels of findings, from the mildest to the most severe. The index of a level is its number
+in ROS diagnostics."""
 
 
 class Finding(Struct, frozen=True):
-    """Result of `acsard doctor` for one subject. `mend` is the advice to the user, or ""."""
+    """One result of `acsard doctor`.
+
+    `subject` is the examined part, and `text` is the result in words. `mend` is the advice to the
+    user, or "".
+    """
 
     subject: str
     level: Level

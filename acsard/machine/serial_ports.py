@@ -23,8 +23,8 @@ BOARDS: dict[str, str] = {
     "0403:6015": "FTDI FT-X",
     "10c4:ea60": "Silicon Labs CP210x",
 }
-"""USB ids of common microcontroller boards and USB-to-serial chips, with their names. A test checks
-that deploy/udev/70-acsar.rules has the same ids."""
+"""Maps the USB ids of common microcontroller boards and USB-to-serial chips to their names. A test
+checks that deploy/udev/70-acsar.rules contains the same ids."""
 
 BY_ID = Path("/dev/serial/by-id")
 
@@ -32,18 +32,18 @@ BY_ID = Path("/dev/serial/by-id")
 class SerialDevice(Struct, frozen=True):
     device: str
     names: list[str]
-    """Links to the port whose names stay the same when the device is plugged in again."""
+    """Symbolic links to the port. Their names stay the same when the device is plugged in again."""
     driver: str
     usb_id: str
-    """`vid:pid` in hex; "" if the port is not on USB."""
+    """USB id in the form `vid:pid`, in hex; "" if the port is not on USB."""
     description: str
     board: str
-    """Name of the common board or chip with this USB id; "" if `BOARDS` does not list the id."""
+    """Name of the board or chip with this USB id; "" if `BOARDS` does not contain the id."""
     holders: list[Holder]
 
 
 def serial_devices() -> list[SerialDevice]:
-    """Return the serial ports that have hardware, such as USB ports with a device plugged in."""
+    """Return the serial ports behind which there is hardware, such as a plugged-in USB device."""
     links = _links()
     found = []
     for port in sorted(list_ports.comports(), key=lambda p: str(p.device)):

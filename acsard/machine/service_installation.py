@@ -26,11 +26,11 @@ from acsard.host.processes import called
 
 HOME = "/opt/acsard/venv"
 """Path of the venv in the unit files of `deploy/`. The installation replaces it by the path of the
-venv that runs acsard."""
+venv that runs the installation."""
 
 GROUP, SETPRIV = "dialout", "/usr/bin/setpriv"
-"""The group that the units name, and the program with which the daemon's unit runs `acsard-stop`.
-"""
+"""`GROUP` is the group of the service in the unit files. `SETPRIV` is the program with which the
+daemon's unit runs `acsard-stop`."""
 
 OUT_OF_SIGHT = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
 """Directories that systemd hides from the service."""
@@ -42,7 +42,14 @@ def misplaced(
     executable: str = sys.executable,
     hidden: Sequence[str] = OUT_OF_SIGHT,
 ) -> str:
-    """Return why a service cannot run this installation of acsard, or "" if it can."""
+    """Return why a service cannot run this installation of acsard, or "" if it can.
+
+    Args:
+        prefix: directory of the venv that runs acsard.
+        base: directory of the Python from which the venv was made.
+        executable: path of the Python interpreter.
+        hidden: directories that systemd hides from the service.
+    """
     if prefix == base or _hidden(Path(prefix), hidden):
         return (
             f"a service cannot run from {prefix}, because services have no access to home "
@@ -67,7 +74,10 @@ def misplaced(
 
 
 def lacking(group: str = GROUP, program: str = SETPRIV) -> str:
-    """Return which group or program this system lacks but the units need, in words; else ""."""
+    """Return a message if the service needs a group or a program that this system does not have.
+
+    Return "" if the system has both.
+    """
     if not os.access(program, os.X_OK):
         return (
             f"{program} is missing, but the service needs it to stop the wheels after the daemon's "
@@ -95,7 +105,10 @@ def _hidden(path: Path, hidden: Sequence[str]) -> bool:
 
 
 def _closed(path: Path) -> Path | None:
-    """Return the outermost directory of `path` that other users may not enter, or None."""
+    """Return the outermost directory in `path` that other users have no permission to enter.
+
+    Return None if they may enter all of them.
+    """
     for place in (*reversed(path.parents), path):
         try:
             mode = place.stat().st_mode
@@ -110,7 +123,8 @@ def _closed(path: Path) -> Path | None:
 
 
 OURS = ("bin", "acsard", "acsard.service.d", "acsard-gateway.service.d", "acsard-web.service.d")
-"""Names of the directories that the removal of the service also removes, if they are then empty."""
+"""Names of acsard's own directories. The removal of the service also removes those of them that are
+then empty."""
 
 
 class File(Struct, frozen=True):
@@ -120,11 +134,14 @@ class File(Struct, frozen=True):
     content: bytes
     mode: int = 0o644
     kept: bool = False
-    """True for a file that the user may change, such as the configuration. An installation never
-    replaces such a file. If it was changed, only a purge removes it."""
+    """True for a file that users are expected to change, such as the configuration. An installation
+    never replaces it. If a user has changed it, only a purge removes it."""
 
     def found(self) -> bytes | None:
-        """Return the present content of the path, or None if the file does not exist."""
+        """Return the present content of the file, or None if it does not exist.
+
+        Raises `MendableError` if the file cannot be read.
+        """
         try:
             return self.path.read_bytes()
         except FileNotFoundError:
@@ -133,10 +150,10 @@ class File(Struct, frozen=True):
             raise _unreadable(self.path, error) from None
 
     def is_as_written(self) -> bool:
-        """Return whether the existing file has the mode of the installation, and root owns it.
+        """Return whether the existing file has the permission bits `mode`, and root owns it.
 
-        Also return True for a `kept` file and for a symbolic link, because the user decides about
-        such a file.
+        Always return True for a `kept` file and for a symbolic link, because the user decides about
+        their mode and owner.
         """
         status = self.path.lstat()
         if self.kept or stat.S_ISLNK(status.st_mode):
@@ -144,7 +161,10 @@ class File(Struct, frozen=True):
         return (stat.S_IMODE(status.st_mode), status.st_uid) == (self.mode, 0)
 
     def condition(self) -> str:
-        """Return "missing", "as installed", "changed", "wrong mode or owner" or "unreadable"."""
+        """Return the condition of the file on this system.
+
+        It is "missing", "as installed", "changed", "wrong mode or owner" or "unreadable".
+        """
         try:
             found = self.found()
         except MendableError:
@@ -160,7 +180,7 @@ WRONG_MODE = "wrong mode or owner"
 
 
 class Write(Struct, frozen=True):
-    """Step that writes a file. `why` is the reason that the user reads, or ""."""
+    """Step that writes a file. `why` is the reason, which the user sees, or ""."""
 
     file: File
     why: str = ""
@@ -171,7 +191,7 @@ class Write(Struct, frozen=True):
         return f"write   {self.file.path}  ({size} bytes, mode {mode:o}{why})"
 
     def do(self) -> None:
-        """Write the file, and create its directories so that the service's user may enter them."""
+        """Write the file, and create missing directories, which all users may enter."""
         path = self.file.path
         made = [place for place in path.parents if not place.exists()]
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -182,7 +202,7 @@ class Write(Struct, frozen=True):
 
 
 class Remove(Struct, frozen=True):
-    """Step that removes a file, or a directory with everything in it."""
+    """Step of a removal that deletes a file, or a directory with everything in it."""
 
     path: Path
 
@@ -194,7 +214,7 @@ class Remove(Struct, frozen=True):
         return self.path.is_dir() and not self.path.is_symlink()
 
     def do(self) -> None:
-        """Remove the path, and also those of acsard's own directories that become empty."""
+        """Delete the file or directory. Also delete acsard's own directories that become empty."""
         if self._is_directory:
             shutil.rmtree(self.path)
         else:
@@ -210,7 +230,7 @@ class Remove(Struct, frozen=True):
 
 
 class Keep(Struct, frozen=True):
-    """Step that leaves a path as it is. `why` is the reason that the user reads, or ""."""
+    """Step that leaves a file or directory as it is. `why` is the reason, or ""."""
 
     path: Path
     why: str = ""
@@ -225,13 +245,16 @@ class Keep(Struct, frozen=True):
 class Run(Struct, frozen=True):
     words: tuple[str, ...]
     may_fail: bool = False
-    """True if the installation goes on after a failure, as on a machine without udev."""
+    """True if the other steps follow even if this command fails, for example without udev."""
 
     def __str__(self) -> str:
         return f"run     {' '.join(self.words)}"
 
     def do(self) -> None:
-        """Run the command; raise `MendableError` with its error output, unless it may fail."""
+        """Run the command. If it fails and `may_fail` is False, raise `MendableError`.
+
+        The error contains the error output of the command.
+        """
         try:
             done = called(self.words, 60.0)
             failed = done.stderr.strip() if done.returncode else ""
@@ -265,7 +288,7 @@ STATES = {
     ),
     PAGE: (Path("/var/lib/acsard-web"), "invitations to the page"),
 }
-"""State directories of the units, each with a description of its content."""
+"""Maps a unit to its state directory and a description of what this directory contains."""
 
 Found = Mapping[Path, bytes | None]
 """Maps the path of a file to its present content, or to None if the file does not exist."""
@@ -275,7 +298,7 @@ RELOAD = (
     Run(("udevadm", "control", "--reload"), may_fail=True),
 )
 AGAIN = ("tty", "usb-serial", "misc")
-"""Subsystems of the devices to which `udevadm trigger` applies the new udev rules."""
+"""Kernel subsystems. `udevadm trigger` applies the new udev rules to the devices in them."""
 
 INSTALLED = (
     *RELOAD,
@@ -289,7 +312,7 @@ GONE = (*RELOAD, Run(("systemctl", "reset-failed", *ALL), may_fail=True))
 
 
 def files() -> list[File]:
-    """Return every file that the installation of the service writes."""
+    """Return all files that the installation of the service writes."""
     reference = _reference().read_text(encoding="utf-8")
     return [
         *(_unit(name) for name in ALL),
@@ -317,12 +340,12 @@ def lan_drop_in(unit: str) -> File:
 
 
 def admitting(directory: Path) -> Write | Keep | None:
-    """Return the step that gives the service's TLS gateway the certificates in `directory`.
+    """Return the step that lets the service's TLS gateway use the certificates in `directory`.
 
-    Return None if the service is not installed, or if the user is not root. The step writes a
-    drop-in file of the gateway's unit. Without this file, the gateway may use only loopback and
-    cannot read root's files. An existing drop-in keeps its networks, because a person may have
-    narrowed them.
+    The step writes a drop-in file for the gateway's unit. Without this file, the gateway may use
+    only loopback and cannot read root's files. If the drop-in exists, only its paths change, and
+    the networks in it stay, because a person may have narrowed them. Return None if the service is
+    not installed, or if this user is not root.
     """
     if os.geteuid() != 0 or not (UNITS / GATEWAY).exists():
         return None
@@ -331,9 +354,10 @@ def admitting(directory: Path) -> Write | Keep | None:
 
 
 def admitted(file: File, found: bytes | None, directory: Path) -> Write | Keep:
-    """Return the step that makes a drop-in name the certificates in `directory`.
+    """Return the step that writes the path `directory` of the certificates into a drop-in file.
 
-    `file` is the installation's drop-in. `found` is its present content, which the step changes.
+    `file` is the drop-in as the installation writes it. `found` is its present content, which the
+    step changes, or None if the drop-in does not exist.
     """
     place = str(directory).encode()
     text = re.sub(
@@ -347,23 +371,26 @@ def admitted(file: File, found: bytes | None, directory: Path) -> Write | Keep:
 
 
 def present(wanted: Iterable[File]) -> dict[Path, bytes | None]:
-    """Return the present content of each file, by path; None for a missing file."""
+    """Map the path of each file to the file's present content, or to None if it does not exist."""
     return {file.path: file.found() for file in wanted}
 
 
 def wrong_modes(wanted: Iterable[File]) -> set[Path]:
-    """Return the existing files whose mode or owner is not that of the installation."""
+    """Return the paths of those existing files whose mode or owner an installation would change."""
     return {file.path for file in wanted if file.path.exists() and not file.is_as_written()}
 
 
 def installing(
     wanted: Iterable[File], found: Found, wrong: Container[Path], *, force: bool
 ) -> list[Step]:
-    """Return the steps that install the service; `found` has the present contents of the files.
+    """Return the steps that install the service.
 
-    `wrong` contains the files with a wrong mode or owner. If only the mode or the owner of a file
-    is wrong, the file is written again. Raises `MendableError` if a step would replace a file with
-    changed content, unless `force` is set.
+    Args:
+        wanted: the files of the installation.
+        found: their present contents.
+        wrong: those paths whose mode or owner is wrong. These files are written again.
+        force: whether to replace a file with another content. If it is false and there is such a
+            file, raise `MendableError`.
     """
     steps: list[Step] = []
     changed: list[str] = []
@@ -386,12 +413,12 @@ def installing(
 
 
 def own_places() -> list[Path]:
-    """Return the service's directories in /etc, which may contain other files too."""
+    """Return the service's directories in /etc. They may also contain files of the user."""
     return [*(UNITS / f"{unit}.d" for unit in reversed(ALL)), ETC]
 
 
 def strangers(files: Iterable[File], places: Iterable[Path]) -> list[Path]:
-    """Return the entries of the directories `places` that the installation did not write."""
+    """Return the entries of the directories `places` that are not files of the installation."""
     ours = {file.path for file in files}
     inside = (path for place in places if place.is_dir() for path in sorted(place.iterdir()))
     return [path for path in inside if path not in ours]
@@ -406,13 +433,17 @@ def uninstalling(
     purge: bool = False,
     stateful: Iterable[str] = (),
 ) -> list[Step]:
-    """Return the steps that remove the service, with a reason for each file that stays.
+    """Return the steps that remove the service. A step for a file that stays contains the reason.
 
-    `others` are further paths in the service's directories. `stateful` are the units that have a
-    state directory. A changed file stays unless `force` or `purge` is set. If `File.kept` is true
-    for a changed file, only `purge` removes it. Only `purge` removes the `others` and the state
-    directories. To purge a state directory, the steps first install its unit again if the unit is
-    missing.
+    Args:
+        wanted: the files of the installation.
+        found: their present contents.
+        others: other paths in the service's directories. Only `purge` removes them.
+        force: whether to remove changed files too, except those with `File.kept`.
+        purge: whether to remove everything.
+        stateful: the units that have a state directory. Only `purge` removes these directories. If
+            such a unit is missing, a purge first installs it again, because only systemd can remove
+            the directory.
     """
     wanted, stateful = list(wanted), list(stateful)
     # Only systemd knows the real path of a state directory, and only while the unit is installed.
@@ -432,7 +463,7 @@ def uninstalling(
     if any(path.name == UNIT for path in why):
         # The daemon's unit stays and may start again. Then it needs `acsard-stop`, which sends
         # zeros after the daemon's end.
-        why |= {f.path: f"{UNIT} stays and needs it" for f in there if f.path.name == STOP}
+        why |= {f.path: f"{UNIT} stays and needs this file" for f in there if f.path.name == STOP}
     steps: list[Step] = [
         Keep(file.path, why[file.path]) if file.path in why else Remove(file.path) for file in there
     ]
@@ -450,7 +481,10 @@ def uninstalling(
 
 
 def state(unit: str) -> str:
-    """Return the state of a unit as lines `NAME=value`; "" if systemd does not answer."""
+    """Return the state of a unit as lines `NAME=value`.
+
+    If systemctl fails, return its error text. If it cannot run or hangs, return "".
+    """
     about = "--property=ActiveState,SubState,StatusText,NRestarts"
     try:
         done = called(("systemctl", "show", unit, about), 10.0)
@@ -460,7 +494,11 @@ def state(unit: str) -> str:
 
 
 def source() -> Path:
-    """Return the directory `deploy/`: in the package, or beside the package in a clone."""
+    """Return the path of the directory `deploy/`.
+
+    In an installed package it is inside the package, and in a git clone it is beside the package.
+    Raises `MendableError` if it is missing.
+    """
     package = Path(acsard.__file__).parent
     inside = package / "deploy"
     if inside.is_dir():
@@ -475,6 +513,9 @@ def source() -> Path:
 
 
 def _reference() -> Path:
-    """Return the path of the reference configuration, which is beside `deploy/` in a clone."""
+    """Return the path of the reference configuration `acsard.toml`.
+
+    In an installed package it is inside `deploy/`, and in a git clone it is beside `deploy/`.
+    """
     inside = source() / "acsard.toml"
     return inside if inside.is_file() else source().parent / "acsard.toml"

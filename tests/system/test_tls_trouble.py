@@ -118,8 +118,8 @@ def test_what_is_wrong_with_the_robot_s_certificate(
 @pytest.mark.parametrize(
     ("shown", "sentence"),
     [
-        ("stranger", "was signed by another authority than"),
-        ("mixed", "comes from another authority than the robot's"),
+        ("stranger", "did not sign the certificate of"),
+        ("mixed", "the robot's authority did not sign this"),
         ("ended", "has expired or is not valid yet"),
     ],
 )

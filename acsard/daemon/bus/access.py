@@ -39,8 +39,8 @@ from acsard.core.ros.transports import PARAMETERS, Endpoint, claims, endpoints, 
 from acsard.core.values import ROLES, ROOT, Role
 
 LOCAL_LINKS = ("tcp",)
-"""Protocols of links without a certificate. Such links connect programs of one machine, unless
-`bus.insecure` allows others."""
+"""Link protocols that use no certificate. Such a link connects two programs on the same machine,
+unless `bus.insecure` permits links to other machines."""
 
 TOKENS = ("@ros2_lv/**", "@/*/@ros2_lv/**")
 """Key expressions of the liveliness tokens of ROS."""
@@ -53,7 +53,7 @@ SPOKEN = (
     "declare_liveliness_subscriber",
     "liveliness_query",
 )
-"""Zenoh's names of the messages that a daemon sends, apart from data (`put`)."""
+"""Zenoh's names of the message types that a daemon sends, except `put` (data)."""
 
 EVERYTHING = (*SPOKEN, "put", "delete", "query")
 
@@ -66,17 +66,19 @@ def _grants(role: Role) -> tuple[str, ...]:
 
 
 USES = ("subscribes", "queries", "publishes")
-"""Words for the uses of keys. The name of a rule ends with such a word, as in "viewer queries"."""
+"""The three ways to use a key. They are the last words in the names of access rules, such as
+"viewer queries"."""
 
 GRANTS: dict[Role, tuple[str, ...]] = {role: _grants(role) for role in ROLES}
-"""The names of the rules of each role. `_rules` defines the rules."""
+"""Maps each role to the names of its access rules. `_rules` defines these rules."""
 
 WIDE: dict[Role, tuple[str, ...]] = {
     "viewer": ("roam", "recall"),
     "operator": ("roam", "recall"),
     "maintainer": ("roam", "recall", "browse", "attend"),
 }
-"""The names of the rules that each role gets in addition if `access.wildcards` is true."""
+"""Maps each role to the names of the additional access rules that it gets if `access.wildcards` is
+true."""
 
 LOCAL = (
     *GRANTS["maintainer"],
@@ -88,15 +90,16 @@ LOCAL = (
     "err",
     "forge",
 )
-"""The names of the rules of a client on the robot's own machine: a maintainer's rules and more.
-Such a client may also subscribe with any wildcard and receive the commands of other clients. It may
-put on keys that do not exist, so that the daemon can count such a sample and refuse it with a
-reason. It may not put on the keys on which the robot publishes."""
+"""The names of the access rules for a client on the robot's own machine. These are all rules of a
+maintainer, and more: such a client may also subscribe with any wildcard and receive the commands of
+other clients. It may even put on keys that do not exist. The daemon then counts and refuses the
+sample, and gives the reason. The client may not put on the keys on which the robot publishes."""
 
 Flow = Literal["ingress", "egress"]
 
 Permission = Literal["allow", "deny"]
-"""Effect of a rule. A message to which both an allowing and a denying rule apply is denied."""
+"""Effect of an access rule. If one rule allows a message and another rule denies it, Zenoh denies
+the message."""
 
 
 class Rule(TypedDict):
@@ -110,7 +113,7 @@ class Rule(TypedDict):
 
 
 class _Keys:
-    """The native keys and ROS keys of one robot, in groups for the rules."""
+    """The native keys and ROS keys of one robot. Each attribute is a group for an access rule."""
 
     def __init__(self, config: Config) -> None:
         robot = config.robot.id
@@ -119,7 +122,7 @@ class _Keys:
         topics, outgoing = offered(config), published(config)
         self._incoming = [topic for topic in topics if topic not in outgoing]
         """Rows of the topic table that the daemon does not publish: inputs, queries and services.
-        The row of the gyro is left out if the daemon publishes the gyro of the simulator."""
+        With the simulator, the daemon publishes the gyro itself, so the gyro's row is missing."""
         self._readable = [*outgoing, *(t for t in self._incoming if t.direction != "in")]
         """Rows of the topic table that clients may subscribe to or query."""
         self.all = full_key(robot, "**")
@@ -152,27 +155,30 @@ class _Keys:
         """Key expressions on which the daemon publishes, or whose queries it answers."""
 
     def of(self, role: Role, use: Use) -> list[str]:
-        """Return the exact native and ROS keys that `role` may use and that no lower role may use.
+        """Return the keys for which `role` is the lowest role with the permission `use`.
 
-        Command keys that end with a certificate's name are not included; see `commands_by`.
+        The result contains native keys and ROS keys, without wildcards. It does not contain the
+        command keys that end with a certificate's name: `commands_by` returns these.
         """
         rows = self._incoming if use == "publish" else self._readable
         keys = [full_key(self._robot, key) for key in keys_for(role, use, rows)]
         return keys + [e.key for e in self._ros if use in _uses(e) and self._least(e) == role]
 
     def commands_by(self, certificate: str) -> list[str]:
-        """Return the command keys of all sources for the certificate with this common name.
+        """Return the command keys of all sources for one certificate.
 
-        For the name "*", the result is key expressions that include the keys of all certificates. A
-        router needs these key expressions, because it forwards the commands of every client.
+        `certificate` is the common name of the certificate. If it is "*", return key expressions
+        that match the command keys of all certificates. A router needs these, because it forwards
+        the commands of every client.
         """
         return [full_key(self._robot, key) for key in source_keys(self._sources, certificate)]
 
     def _least(self, endpoint: Endpoint) -> Role | None:
-        """Return the lowest role that may use a ROS endpoint; None if its source is not configured.
+        """Return the lowest role that may use a ROS endpoint.
 
-        A ROS key cannot contain a certificate's name, so every role that may command may use the
-        ROS key of a command. Raises `LookupError` if the table of keys lacks the native key.
+        Return None for the commands of a source that is not configured. A ROS key cannot contain a
+        certificate's name, so every role that may command may use the ROS key of a command. Raises
+        `LookupError` if the endpoint's native key is not in the table of keys.
         """
         native = endpoint.native
         if native.startswith(PARAMETERS):
@@ -195,28 +201,31 @@ def _uses(endpoint: Endpoint) -> tuple[Use, ...]:
 
 
 def access_control(config: Config) -> dict[str, object]:
-    """Return the value of Zenoh's `access_control` for the session of the daemon.
+    """Return the value of Zenoh's setting `access_control` for the session of the daemon.
 
-    A TLS link of that session leads to a router. The router lets each client put only on the keys
-    of the client's own certificate, and forwards these samples to the daemon.
+    Every TLS link of that session leads to a router. The daemon accepts commands for any
+    certificate from the router, because the router checks the certificate of each client: it lets
+    a client put only on the command keys of the client's own certificate.
     """
     return _access(config, LOCAL, gateway=False)
 
 
 def gateway_access(config: Config) -> dict[str, object]:
-    """Return the value of Zenoh's `access_control` for the session of the TLS gateway.
+    """Return the value of Zenoh's setting `access_control` for the session of the TLS gateway.
 
-    The only link of that session without a certificate leads to the daemon. Zenoh applies
-    rules to "subjects". Each certificate that may command is a subject of its own, and also belongs
-    to the subject of its role.
+    The gateway's link to the daemon is its only link without a certificate. Zenoh assigns rules to
+    "subjects". There is a subject for each role, and one more for each certificate that may
+    command, which permits the command keys of this certificate.
     """
     return _access(config, ("pass",), gateway=True)
 
 
 def _access(config: Config, local: tuple[str, ...], *, gateway: bool) -> dict[str, object]:
-    """Return the value of `access_control`.
+    """Return the value of Zenoh's setting `access_control` for one session.
 
-    `local` contains the names of the rules for links without a certificate.
+    `local` contains the names of the rules for links without a certificate. `gateway` says whether
+    the session belongs to the TLS gateway, and not to the daemon. Only the gateway limits each
+    certificate to the command keys of this certificate.
     """
     keys = _Keys(config)
     rules = _rules(keys)

@@ -31,8 +31,9 @@ def address_of(
 ) -> Address:
     """Return the address of a robot from its configuration and from the options of a tool.
 
-    An option that is not None replaces the value of the configuration. Raises `UsageError` for an
-    id that no robot can have.
+    `connect` is an endpoint, and `tls` is a directory with the client's certificate. An option that
+    is given replaces the value of the configuration. Raises `UsageError` for an id that no robot
+    can have.
     """
     robot_id = config.robot.id if robot_id is None else robot_id
     require_id(robot_id)
@@ -48,9 +49,9 @@ def address_of(
 def address_by_environment(endpoint: str | None, robot_id: str | None, tls: str | None) -> Address:
     """Return a robot's address for a program that uses the client library.
 
-    An argument that is not None takes precedence. The other values come from the file that
-    $ACSARD_CONFIG names, or from the defaults. $ACSARD_TLS replaces the certificate directory of
-    the file. Raises `UsageError` for an id that no robot can have, and for an unusable file.
+    Each argument that is None is replaced by a value from the configuration file in $ACSARD_CONFIG
+    or, without such a file, by the default. $ACSARD_TLS has priority over the certificate directory
+    in the file. Raises `UsageError` for an id that no robot can have, and for an unusable file.
     """
     complete = endpoint is not None and robot_id is not None
     if complete and (tls is not None or not _is_tls(endpoint or "")):
@@ -83,7 +84,7 @@ def _config_of_environment() -> Config:
 
 
 def require_id(robot_id: str) -> None:
-    """Raise `UsageError` for an id that no robot can have."""
+    """Raise `UsageError` if `robot_id` does not have the form of a robot's id."""
     try:
         convert(robot_id, Name)
     except ValidationError:

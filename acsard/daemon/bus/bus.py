@@ -40,7 +40,10 @@ names, s."""
 
 
 class ZenohBus:
-    """The robot's keys on the bus. The keys exist while this asynchronous context is entered."""
+    """The robot's keys on the bus, as an asynchronous context manager.
+
+    Entering the context declares the keys, and leaving it removes them.
+    """
 
     def __init__(self, config: Config, waker: Waker) -> None:
         """Prepare the buffers. `waker` wakes the control loop when a command or a stop arrives."""
@@ -63,9 +66,10 @@ class ZenohBus:
         return self._outlets.wanted
 
     def take(self, queries: int) -> BusInput:
-        """Return the input from the bus since the last call.
+        """Return the samples, queries and changes from the bus since the last call.
 
-        `Inbox.take` explains `queries`, the limit on the number of returned queries.
+        `queries` limits the number of returned queries. One slow query may exceed this limit, as
+        `Inbox.take` explains. The other queries wait for the next call.
         """
         taken = self._inbox.take(queries)
         routers = self._links.changed()
@@ -90,7 +94,10 @@ class ZenohBus:
         self._replies.send(reply)
 
     def retire(self, ticket: int) -> None:
-        """End the query of this ticket, so that it gets no more replies."""
+        """End a query. It gets no more replies, so the client stops waiting.
+
+        `ticket` is the number of the query from `take`.
+        """
         self._replies.retire(ticket)
 
     # Opening the session.
@@ -124,7 +131,10 @@ class ZenohBus:
         return session
 
     def _conflict(self, tokens: set[str]) -> str:
-        """Return an error message if another daemon has this robot's id or ROS names, else ""."""
+        """Return an error message if another daemon has this robot's id or ROS names, else "".
+
+        `tokens` contains the liveliness tokens that `_others` has found.
+        """
         if self._alive in tokens:
             return (
                 f"another daemon on this bus already has the id {self._id}; give this robot its "
@@ -210,9 +220,10 @@ class ZenohBus:
 
 
 def _others(session: zenoh.Session, alive: str, claims: tuple[str, ...]) -> set[str]:
-    """Return the liveliness tokens among `alive` and `claims` that other sessions hold.
+    """Return those of this robot's liveliness tokens that other sessions hold already.
 
-    Blocks for up to `TWIN_TIMEOUT_S`.
+    `alive` is the token of the robot's id, and `claims` are the tokens of its ROS names. Blocks for
+    up to `TWIN_TIMEOUT_S`.
     """
     liveliness = session.liveliness()
     subscribers = {

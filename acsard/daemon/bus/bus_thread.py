@@ -24,6 +24,6 @@ class BusThread(Thread):
             self._error = error
 
     def check(self) -> None:
-        """Raise the exception that has ended this thread, if any, without waiting."""
+        """Raise the exception that has ended this thread. Do nothing if there is none."""
         if self._error is not None:
             raise self._error

@@ -33,8 +33,8 @@ class CertificateFiles:
     def __init__(self, authority: Path, certificate: Path, key: Path) -> None:
         """Record the state of the files.
 
-        The process must read the files only after this call. Otherwise a replacement between the
-        reading and this call goes unnoticed.
+        Call this before Zenoh reads the files. If a file were replaced between the reading and this
+        call, `renewed` would not notice it.
         """
         self._files = authority, certificate, key
         self._used = self._seen = self._signature()
@@ -58,7 +58,10 @@ class CertificateFiles:
         return True
 
     def refused(self) -> str:
-        """Return why Zenoh refuses the files that `renewed` has found, or "" if it accepts them."""
+        """Return why Zenoh refuses the present files, or "" if it accepts them.
+
+        Call this after `renewed` has returned True. It takes half a second.
+        """
         return certificate_trouble(*self._files)
 
     def _signature(self) -> Signature:
@@ -70,13 +73,12 @@ class CertificateFiles:
 
 
 ENDS_LOOK_S = 60.0
-"""Pause between two readings of the expiry times, s."""
+"""Pause between two readings of the certificates' expiry times, s."""
 
 ROUTER_LOOKS = 60
-"""Number of readings of the robot's files for each reading of the routers' certificates. The
-routers' certificates are read more rarely, because each reading uses one of the router's
-connections. If a router did not answer, all routers are tried again at the next reading of the
-robot's files."""
+"""The routers' certificates are read only at every 60th reading of the robot's own certificates,
+because each reading takes one of a router's connections. If a router did not answer, all routers
+are tried again at the next reading of the robot's certificates."""
 
 
 def ends_of(routers: Iterable[str], directory: str) -> dict[str, int]:
@@ -91,9 +93,11 @@ def ends_of(routers: Iterable[str], directory: str) -> dict[str, int]:
 
 
 async def watch_certificates(bus: BusConfig, known: MutableMapping[str, int]) -> None:
-    """Update the expiry times in `known`, ns since 1970, every `ENDS_LOOK_S` until cancelled.
+    """Update the expiry times in `known` every `ENDS_LOOK_S`, until this task is cancelled.
 
-    If a certificate cannot be read, its value in `known` stays unchanged.
+    `known` maps the name of each certificate to its expiry time, ns since 1970. The names are the
+    dict keys of `tls.ends` and `ends_of`. If a certificate cannot be read, its value stays
+    unchanged.
     """
     routers = [endpoint for endpoint in bus.connect if endpoint.startswith(TLS)]
     answered, look = 0, 0

@@ -23,10 +23,11 @@ from acsard.daemon.bus.tls import common_name
 from acsard.host import clock
 
 WHOAMI_S, WHOAMI_MORE_S = 2.0, 0.3
-"""Time to wait for the first answer to the queries for the role, and then for other answers, s."""
+"""`WHOAMI_S` is the longest wait for the first answer to the queries for the role, s.
+`WHOAMI_MORE_S` is the wait for the other answers after the first one, s."""
 
 Ask = Callable[[str, Callable[[zenoh.Sample], object]], None]
-"""Function that queries a key, and passes each sample of the answer to the callback."""
+"""Function that queries a key of the robot, and calls the callback with each replied sample."""
 
 
 class Identity(Struct, frozen=True):
@@ -37,7 +38,7 @@ class Identity(Struct, frozen=True):
     certificate: str
     """The common name of the client's certificate; "" if the client has no certificate."""
     sender: str
-    """The name that the daemon gives to this client's commands."""
+    """The name that the daemon gives to the sender of this client's commands."""
     robot: str = ""
     endpoint: str = ""
 
@@ -58,9 +59,9 @@ class Identity(Struct, frozen=True):
     def silence(self) -> str:
         """The likeliest reasons why no key answered, in words.
 
-        The text is "" if a key answered, or if the client has no certificate. A
-        client cannot distinguish a robot that is absent, a robot that hangs, and a robot that does
-        not list the client's certificate.
+        The text names several reasons, because a client cannot tell whether the robot is absent,
+        hangs, or does not list the client's certificate. The text is "" if a key answered, or if
+        the client has no certificate.
         """
         return "" if self.role or not self.certificate else self._nobody()
 
@@ -95,8 +96,14 @@ class Identity(Struct, frozen=True):
 def identity(ask: Ask, tls: str, sender: str, robot: str = "", endpoint: str = "") -> Identity:
     """Query the robot for this client's role, and return the client's identity.
 
-    Blocks for up to `WHOAMI_S`. `tls` is the directory of the client's certificate, or "". `sender`
-    is the name that the daemon gives to this client's commands.
+    Blocks for up to `WHOAMI_S`.
+
+    Args:
+        ask: sends a query to the robot.
+        tls: the directory of the client's certificate, or "".
+        sender: the name that the daemon gives to the sender of this client's commands.
+        robot: the robot's id, for messages.
+        endpoint: the endpoint of the daemon or router, for messages.
     """
     answers: SimpleQueue[str] = SimpleQueue()
     for role in ROLES:

@@ -46,13 +46,15 @@ class Replies:
         self._queries: dict[int, tuple[zenoh.Query, str]] = {}
         self._tickets = count(1)
         self._queue: queue.SimpleQueue[Reply | int | None] = queue.SimpleQueue()
-        """Replies and retired tickets, in order. None ends the thread."""
+        """Replies to send, and tickets (numbers) of queries to end, in the order of their arrival.
+        None ends the thread."""
         self._thread: BusThread | None = None
 
     def issue(self, query: zenoh.Query, key: str) -> int | None:
-        """Return a ticket for this query, or None if there are too many unfinished queries.
+        """Return a ticket, the number of this query, or None if too many queries are unfinished.
 
-        The replies are sent on `key` or, if it is "", on the robot's prefix plus the reply's key.
+        The replies to the query are sent on the full key `key`. If it is "", each reply is sent on
+        its own key below the robot's id.
         """
         if len(self._queries) >= TICKETS:
             return None
@@ -64,7 +66,7 @@ class Replies:
         self._queue.put(reply)
 
     def retire(self, ticket: int) -> None:
-        """End the query of this ticket after the replies that are queued already."""
+        """End the query with this ticket as soon as the replies queued so far are sent."""
         self._queue.put(ticket)
 
     def start(self, session: zenoh.Session) -> None:
@@ -73,12 +75,12 @@ class Replies:
         self._thread.start()
 
     def check(self) -> None:
-        """Raise the error that has ended the thread, if there was one."""
+        """Raise the error that has ended the sending thread. Do nothing if there is none."""
         if self._thread is not None:
             self._thread.check()
 
     def stop(self) -> None:
-        """Let the thread send the queued replies and end."""
+        """Let the sending thread end after it has sent the queued replies. Do not wait for it."""
         self._queue.put(None)
 
     def _run(self, session: zenoh.Session) -> None:
@@ -113,8 +115,8 @@ class Replies:
 
 
 ARRIVALS = 16
-"""Size of the buffer of each command key, in samples. A newer sample displaces the oldest one. A
-sender at the limit of 1000 Hz puts 10 samples into one step at 100 Hz."""
+"""Size of the buffer of each command key, in samples. A newer sample displaces the oldest one. At
+100 steps a second, a sender at the limit of 1000 Hz puts 10 samples between two steps."""
 
 SAMPLES = 64
 """Size of the buffer for gyro samples. A gyro at 400 Hz fills it if the control loop takes no
@@ -125,7 +127,7 @@ OTHERS = ""
 cannot displace the command of a configured source."""
 
 ALL = "*"
-"""Placeholder for the name of a certificate in a key."""
+"""Stands in a command key for the name of any certificate."""
 
 STOPS = 16
 """Size of the buffer for stops. It is separate, so that no flood of commands displaces a stop."""
@@ -137,8 +139,8 @@ full, further queries are refused with `BUSY`. One slow query is answered per st
 
 ATTACHMENT_BYTES = 256
 """Largest size of an attachment, bytes. An attachment of rmw_zenoh has 33 bytes, and an attachment
-of acsard has up to 140. A longer attachment is cut off, so that no sender can be decoded from
-it."""
+of acsard has up to 140. The rest of a longer attachment is cut off. Such an attachment cannot be
+decoded, so it names no sender."""
 
 STOP, SET = service_key("stop"), service_key("set")
 STOP_ALL = full_key("*", "stop")
@@ -170,17 +172,18 @@ class Inbox:
         """Slow queries: ROS parameters and settings. The answer to one slow query takes as long as
         the answers to all other queries of a step."""
         self._lost = dict.fromkeys(self._arrivals, 0)
-        """For each buffer, the number of displaced samples at the last `take`."""
+        """For each buffer, the total of displaced samples that the last `take` has seen."""
         self._any = False
-        """True if an item waits. It is set after the item is queued, so `take` misses no item."""
+        """True if a sample or query waits. It is set after the item is queued, so that `take` never
+        overlooks an item."""
         self._waker = waker
 
     def take(self, queries: int) -> BusInput:
         """Return the samples since the last call, and at most `queries` of the waiting queries.
 
-        The stops come before the other samples, which are in the order of their arrival. Of the
-        queries, service calls come first, then one slow query, and then the other queries. The slow
-        query is returned even if the number of queries then exceeds `queries`.
+        The stops come first, and then the other samples in the order of their arrival. The queries
+        are in this order: service calls, one slow query, other queries. If service calls alone
+        reach the limit `queries`, the slow query is returned in addition.
         """
         if not self._any:
             return NOTHING
@@ -321,7 +324,10 @@ class Inbox:
 
 
 def _bytes(payload: zenoh.ZBytes | None, most: int) -> bytes:
-    """Return at most `most` + 1 bytes of a payload. With `most` + 1 bytes it is too long."""
+    """Return the payload's first `most` + 1 bytes.
+
+    A result longer than `most` shows that the payload is too long.
+    """
     return b"" if payload is None else payload.to_bytes()[: most + 1]
 
 

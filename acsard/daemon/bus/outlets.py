@@ -32,13 +32,13 @@ OPTIONS: dict[str, Any] = {
 }
 
 HELD = 16
-"""Size of the slot of a topic, in messages. A newer message displaces the oldest one. At 100 Hz a
-slot holds 0.16 s of odometry. A busy machine or a client that connects usually blocks the thread
-for a shorter time."""
+"""Number of messages that the slot of a topic holds until the thread sends them. A newer message
+displaces the oldest one. At 100 Hz a slot holds 0.16 s of odometry. A busy machine or a client that
+connects usually blocks the thread for a shorter time."""
 
 STUCK_NS = NS_PER_S // 4
-"""If a round of puts takes longer than this time, ns, the bus counts as blocked. A round sends all
-waiting messages, and usually takes 0.1 ms."""
+"""If the thread needs longer than this to send all waiting messages, ns, the bus counts as blocked.
+Usually the thread needs 0.1 ms."""
 
 HEARTBEAT = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5)
 """Heartbeat of the publishers of latched ROS topics, with the settings of rmw_zenoh."""
@@ -115,13 +115,14 @@ class Outlets:
 
     @property
     def behind(self) -> bool:
-        """True if `losses` may have something to report: dropped messages or a blocked bus."""
+        """True if messages were dropped or the bus may block. If so, `losses` must be called."""
         return self._began_ns is not None or self._stuck or self._dropped > 0
 
     def losses(self, now_ns: int) -> tuple[int, bool]:
-        """Return a pair: the number of dropped messages, and whether the bus has begun to block.
+        """Return the number of dropped messages, and whether the bus has begun to block.
 
-        Both values cover the time since the last call. `now_ns` is the monotonic time.
+        Both values cover the time since the last call, so a blockage is reported only once.
+        `now_ns` is the present monotonic time, ns.
         """
         dropped, self._dropped = self._dropped, 0
         began_ns, was_stuck = self._began_ns, self._stuck
@@ -171,14 +172,17 @@ class Outlets:
         gid: bytes = b"",
         signed: bytes = b"",
     ) -> None:
-        """Declare a publisher of the topic with the native key `topic` on the key `key`.
+        """Declare one publisher of a topic.
 
         Args:
-            encoding: Zenoh's name of the encoding.
+            topic: native key of the topic.
+            key: full key on which the publisher puts the topic's messages.
+            form: encoding of the messages.
+            encoding: Zenoh's name of this encoding.
             latched: whether the publisher keeps its last sample for late subscribers.
-            gid: identity of a ROS publisher; b"" for any other publisher. The samples of a ROS
+            gid: identity of a ROS publisher, or b"" for a native publisher. The samples of a ROS
                 publisher carry an attachment of rmw_zenoh.
-            signed: attachment of the samples if `gid` is b"".
+            signed: attachment of a native publisher's samples, or b"" for none.
         """
         if latched:
             publisher: Any = zenoh.ext.declare_advanced_publisher(

@@ -42,16 +42,17 @@ def named(text: str) -> tuple[str, ...]:
             require_id(robot_id)
     except UsageError:
         raise UsageError(
-            f"--id {text}: separate the ids with commas, or write '*' for all robots"
+            f"--id {text} is not a list of robot ids: an id has 1 to 32 characters of A-Z a-z "
+            "0-9 _ -, and commas separate the ids; '*' stands for all robots"
         ) from None
     return ids
 
 
 def present(session: zenoh.Session, ids: Sequence[str], endpoint: str) -> list[str]:
-    """Return the ids in `ids` whose daemon is running, sorted. "*" stands for all robots.
+    """Return the sorted ids of those robots in `ids` whose daemon is running.
 
-    Raises `NoAnswerError` if `ids` contains "*" and no robot is visible. The error names
-    `endpoint`.
+    An id "*" in `ids` stands for all robots. Raises `NoAnswerError` if `ids` contains "*" and no
+    robot is visible. `endpoint` is the client's endpoint, for the text of this error.
     """
     found = set()
     for robot_id in ids:
@@ -64,7 +65,10 @@ def present(session: zenoh.Session, ids: Sequence[str], endpoint: str) -> list[s
 
 
 def presence(session: zenoh.Session, robot_id: str, endpoint: str) -> Presence | None:
-    """Return which robots this client sees on the bus, or None if the session is closing."""
+    """Return whether this client sees a robot on the bus, and which others if it does not.
+
+    `endpoint` is the client's endpoint. Returns None if the session is closing.
+    """
     try:
         if not session.info.links():
             return Presence(linked=False, here=False)
@@ -88,7 +92,7 @@ def stop(session: zenoh.Session, ids: Sequence[str], sender: str) -> None:
 
 
 def seen(endpoint: str, robots: int) -> str:
-    """Return a text that says that `robots` robots are visible at `endpoint`."""
+    """Return a text that says how many robots are visible at `endpoint`."""
     return f"all robots visible at {endpoint}: {many(robots, 'robot')}"
 
 
@@ -107,9 +111,11 @@ def nobody(endpoint: str) -> str:
 
 
 def follow(session: zenoh.Session, ids: Sequence[str], name: str) -> Subscription:
-    """Subscribe to the key `name` of all these robots; "*" in `ids` stands for all robots.
+    """Subscribe to a key of several robots, and return the samples of all these robots.
 
-    `robot_of` finds the robot of a sample. Raises `UsageError` if `name` is not a key.
+    `ids` are the robots' ids; "*" stands for all robots. `name` is the key below the robot's id.
+    Use `robot_of` to find which robot published a sample. Raises `UsageError` if `name` is not a
+    key.
     """
     topic = by_key(name)
     latched = topic is not None and topic.latched
@@ -121,7 +127,7 @@ def follow(session: zenoh.Session, ids: Sequence[str], name: str) -> Subscriptio
 
 
 def robot_of(key: str) -> str:
-    """Return the robot id in a full key; "" for a key expression with a wildcard."""
+    """Return the robot id in a full key; "" for any other key, or if the key has a wildcard."""
     root, _, rest = key.partition("/")
     return rest.partition("/")[0] if root == ROOT and not set(key) & set("*$") else ""
 
@@ -138,11 +144,16 @@ class Presence(Struct, frozen=True):
     here: bool
     """True if the requested robot is present."""
     others: tuple[str, ...] = ()
-    """The ids of the other robots if the requested robot is absent; over TLS always ()."""
+    """The ids of the visible robots if the requested robot is absent, else (). Over TLS, a client
+    sees other robots only if `access.wildcards` is set."""
 
 
 def explain_silence(key: str, robot_id: str, endpoint: str, presence: Presence) -> str:
-    """Return why no sample arrives on `key` (the part below the robot's id), and how to fix it."""
+    """Return why no sample arrives on a key of a robot, and how to fix it.
+
+    `key` is the part of the key below the robot's id. `presence` is the result of the function
+    `presence` for this robot.
+    """
     if not presence.linked:
         return (
             f"the connection to {endpoint} is lost: the daemon or router there has ended "

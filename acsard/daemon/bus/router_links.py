@@ -16,7 +16,7 @@ POLL_S = 0.5
 """Time between two polls, s. One poll takes Zenoh 0.1 ms."""
 
 STOP_S = 0.05
-"""Longest time that `stop` waits for the thread, s."""
+"""Longest time for which `stop` waits until the polling thread ends, s."""
 
 
 class RouterLinks:
@@ -39,7 +39,7 @@ class RouterLinks:
         return self._changes.pop()
 
     def check(self) -> None:
-        """Raise the error that has ended the thread, if there was one."""
+        """Raise the error that has ended the polling thread. Do nothing if there is none."""
         self._thread.check()
 
     def start(self, session: zenoh.Session) -> None:
@@ -49,7 +49,7 @@ class RouterLinks:
             self._thread.start()
 
     def stop(self) -> None:
-        """Stop polling, without waiting for a name lookup that is under way."""
+        """Stop polling. Wait at most `STOP_S` for the thread, which may be in a name lookup."""
         self._over.set()
         if self._thread.is_alive():
             self._thread.join(STOP_S)
@@ -79,11 +79,14 @@ class RouterLinks:
 
 
 def unreached(mode: str, endpoints: tuple[str, ...], ends: set[str]) -> tuple[str, ...]:
-    """Return the endpoints to which no link leads. Resolves host names, which may block.
+    """Return those of `endpoints` to which the daemon has no link. May block in a name lookup.
 
-    `ends` contains the address of the far end of each link. In client mode there is only one link,
-    and if it exists, no endpoint counts as unreached. A program that has connected to the daemon
-    (the TLS gateway, a bridge, a ROS node) has an ephemeral port, so it matches no endpoint.
+    Args:
+        mode: Zenoh's mode. In mode "client" there is only one link. If it exists, no endpoint
+            counts as unreached.
+        endpoints: the endpoints of `bus.connect`.
+        ends: the address at the far end of each link. A program that has itself connected to the
+            daemon, such as the TLS gateway, has an ephemeral port, so it matches no endpoint.
     """
     if mode == "client":
         return () if ends else endpoints
@@ -91,7 +94,10 @@ def unreached(mode: str, endpoints: tuple[str, ...], ends: set[str]) -> tuple[st
 
 
 def _leads_there(endpoint: str, ends: set[str]) -> bool:
-    """Return whether `ends` contains an address of the endpoint, like "tcp/192.168.0.2:7447"."""
+    """Return whether a link leads to the endpoint. May block in a name lookup.
+
+    `ends` contains the address at the far end of each link, like "tcp/192.168.0.2:7447".
+    """
     bare = endpoint.partition("?")[0].partition("#")[0]
     protocol, _, address = bare.partition("/")
     host, _, port = address.rpartition(":")

@@ -19,7 +19,7 @@ QUEUED = 1000
 
 
 class Arrivals(Mailbox[zenoh.Sample]):
-    """Queue in which Zenoh's thread puts the samples of a subscription for their reader."""
+    """Queue between Zenoh's thread, which adds the samples of a subscription, and their reader."""
 
     def __init__(self) -> None:
         super().__init__(QUEUED)
@@ -45,7 +45,11 @@ class Subscription:
     """The samples of one or more keys, in the order of their arrival."""
 
     def __init__(self, queue: Any, key: str = "") -> None:
-        """Read from `queue`. If `key` is not "", skip samples put on another key or a wildcard."""
+        """Read samples from `queue`.
+
+        If `key` is not "", return only samples that were put on exactly this key. Samples on other
+        keys, and on keys with a wildcard, are skipped.
+        """
         self._queue, self._key = queue, key
 
     def try_recv(self) -> zenoh.Sample | None:
@@ -65,7 +69,7 @@ class Subscription:
         self._queue.wakes(wake)
 
     def add(self, sample: zenoh.Sample) -> None:
-        """Append a sample from the reply to a query, as if it had been published now."""
+        """Append a sample that came as the reply to a query, as if it had just been published."""
         self._queue.put(sample)
 
     def until_silence(self, timeout: float | None) -> Iterator[zenoh.Sample]:
@@ -126,7 +130,7 @@ class Subscription:
 
 
 def on(key: str, sample: zenoh.Sample) -> bool:
-    """Return whether a sample was put on exactly the key `key`, and not on a wildcard."""
+    """Return whether a sample was put on exactly `key`, and not on a key with a wildcard."""
     return str(sample.key_expr) == key
 
 

@@ -59,7 +59,7 @@ def require_usable(directory: str) -> None:
 
 
 def files_in(directory: str) -> tuple[Path, Path, Path]:
-    """Return the authority, the certificate and the key in a TLS directory."""
+    """Return the paths of the three files in a TLS directory: authority, certificate and key."""
     return Path(directory, CA), Path(directory, CERTIFICATE), Path(directory, KEY)
 
 
@@ -86,9 +86,10 @@ def common_name(directory: str) -> str:
 
 
 def shown_at(endpoint: str, directory: str) -> str:
-    """Return the common name with which this client presents itself at an endpoint.
+    """Return the common name of the certificate that this client shows to an endpoint.
 
-    Returns "" if the client needs no certificate there, or has no readable one in `directory`.
+    `directory` contains the certificate. Returns "" if the endpoint needs no certificate, or if the
+    certificate cannot be read.
     """
     return common_name(directory) if directory and endpoint.startswith(TLS) else ""
 
@@ -100,7 +101,10 @@ def names_in(directory: str) -> list[str]:
 
 
 def _plain(name: str) -> str:
-    """Return an IPv6 address without the zeros that `ssl` adds; return other names unchanged."""
+    """Return an IPv6 address in its short form, because `ssl` writes it with all its zeros.
+
+    Any other name is returned unchanged.
+    """
     try:
         return str(ipaddress.ip_address(name))
     except ValueError:
@@ -143,7 +147,7 @@ def ends(directory: str) -> dict[str, int]:
     """Return when the certificates in `directory` expire, ns since 1970.
 
     The dict key "" stands for `certificate.pem`, and `AUTHORITY` for `ca.pem`. Returns {} if a
-    file cannot be read or the optional library is missing.
+    file cannot be read or the library `cryptography` is missing.
     """
     try:
         from cryptography import x509
@@ -163,8 +167,9 @@ def ends(directory: str) -> dict[str, int]:
 def peer_ends_ns(endpoint: str, directory: str) -> int | None:
     """Return when the certificate of the program at a TLS endpoint expires, ns since 1970.
 
-    The certificate is not verified, so this function also works for an expired certificate. Returns
-    None if the program cannot be reached or the optional library is missing. Blocks for up to twice
+    `directory` contains this machine's certificate, which the program may require. The program's
+    certificate is not verified, so this function also works if it has expired. Returns None if the
+    program cannot be reached or the library `cryptography` is missing. Blocks for up to twice
     `PATIENCE_S`.
     """
     try:
@@ -183,7 +188,10 @@ def peer_ends_ns(endpoint: str, directory: str) -> int | None:
 
 
 def _trusting(directory: str) -> ssl.SSLContext:
-    """Return a TLS client context that has the certificate in `directory` and verifies nothing."""
+    """Return a TLS client context that does not verify the server.
+
+    It shows the certificate in `directory` to the server.
+    """
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
     _load(context, directory)
@@ -211,25 +219,27 @@ def _place(endpoint: str) -> tuple[str, str]:
 
 
 PATIENCE_S = 2.0
-"""Time limit for the server to accept the TCP connection, s. Each answer of the server in the TLS
-handshake has the same limit."""
+"""Longest wait for the server to accept the TCP connection, and for each of its answers in the TLS
+handshake, s."""
 
 REFUSAL_S = 0.5
-"""Time to wait after the TLS handshake for a rejection of the client's certificate, s. A server
-that accepts the certificate sends nothing and waits for data."""
+"""Time for which this client waits after the TLS handshake, s. A server that rejects the client's
+certificate reports that within this time. A server that accepts it sends nothing."""
 
 AWAY = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN)
 """Error numbers that mean that no machine answers at the address."""
 
 EXPIRED, NOT_YET, WRONG_NAME, WRONG_ADDRESS = 10, 9, 62, 64
-"""OpenSSL's verify codes (X509_V_ERR_...). Every other code is reported as a certificate of another
-authority."""
+"""OpenSSL's error codes (X509_V_ERR_...) for a certificate that has expired, is not valid yet, or
+is not for the host name or the IP address. For any other code, `trouble` reports that another
+authority signed the certificate."""
 
 
 def trouble(endpoint: str, directory: str) -> str:
-    """Return why this machine cannot connect to a TLS endpoint and how to fix it; else "".
+    """Return why this machine cannot connect to a TLS endpoint, and how to fix it.
 
-    `directory` contains the client's certificate. Blocks for a few seconds at most.
+    `directory` contains the client's certificate. Returns "" if the connection succeeds. Blocks for
+    a few seconds at most.
     """
     host, port = _place(endpoint)
     try:
@@ -282,7 +292,10 @@ def _tls_trouble(plain: socket.socket, host: str, directory: str) -> str:
 
 
 def _server_rejected(error: ssl.SSLCertVerificationError, host: str, directory: str) -> str:
-    """Return the message for a server whose certificate this machine rejects."""
+    """Return the message for a server whose certificate this machine rejects.
+
+    `directory` contains the client's certificate and the certificate of its authority.
+    """
     now = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime())
     match error.verify_code:
         case code if code == EXPIRED:
@@ -305,14 +318,18 @@ def _server_rejected(error: ssl.SSLCertVerificationError, host: str, directory: 
                 "robot; the command says what to do next"
             )
     return (
-        f"the certificate of {host} was signed by another authority than {directory}/{CA} "
+        f"the authority in {directory}/{CA} did not sign the certificate of {host} "
         f"({error.verify_message}); use a certificate directory that `acsard tls add` made for "
         "this robot"
     )
 
 
 def _client_rejected(reason: str, host: str, directory: str) -> str:
-    """Return the message for a server that rejects the client's certificate with alert `reason`."""
+    """Return the message for a server that rejects the client's certificate.
+
+    `reason` is OpenSSL's name of the TLS alert that the server sent. `directory` contains the
+    client's certificate.
+    """
     certificate = f"{directory}/{CERTIFICATE}"
     if "CERTIFICATE_EXPIRED" in reason:
         return (
@@ -322,8 +339,8 @@ def _client_rejected(reason: str, host: str, directory: str) -> str:
         )
     if "UNKNOWN_CA" in reason or "CERTIFICATE" in reason or "DECRYPT" in reason:
         return (
-            f"{host} does not accept {certificate}: this certificate comes from another authority "
-            "than the robot's; get a certificate that `acsard tls add` made for this robot"
+            f"{host} does not accept {certificate}: the robot's authority did not sign this "
+            "certificate; get a certificate that `acsard tls add` made for this robot"
         )
     return (
         f"{host} does not speak TLS on this port ({reason}); an endpoint without TLS begins with "

@@ -22,10 +22,10 @@ from acsard.host.errors import CertificateError, InUseError, UnreachableError, U
 from acsard.host.terminal_modes import coloured
 
 COMMAND_RATE_HZ = 1000.0
-"""Largest number of commands per second that a session accepts on each key. The limit allows a zero
-command 1 ms after another command, and is low enough that a flood does not make the daemon miss a
-control period. The TLS gateway also applies the limit to stops. Dropping a stop beyond the
-limit is safe, because another stop came less than a millisecond before."""
+"""Largest number of commands per second that a session accepts on each key. The limit is high
+enough for a zero command 1 ms after another command. It is low enough that a flood of commands does
+not make the daemon miss a control period. The TLS gateway also applies this limit to stops. It may
+drop a stop safely, because it has then passed another stop less than a millisecond before."""
 
 MAX_SESSIONS = 256
 """Largest number of connections of the daemon's session, and of the TLS gateway's session."""
@@ -104,16 +104,16 @@ def certificate_trouble(authority: Path, certificate: Path, key: Path) -> str:
 
 
 def reachable(endpoint: str) -> str:
-    """Return the endpoint to which a program on this machine can connect.
+    """Return the endpoint with which a program on this machine can connect to a listening program.
 
-    This is `endpoint` with the loopback address in place of 0.0.0.0 or [::], which stand for all
-    addresses of the machine.
+    `endpoint` is the endpoint at which that program listens. If its address is 0.0.0.0 or [::],
+    which stand for all addresses of the machine, the loopback address replaces it.
     """
     return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 
 
 def no_endpoint(text: str) -> UsageError:
-    """Return the error for a text that is not an endpoint."""
+    """Return the error that says that `text` is not a Zenoh endpoint, and how to write one."""
     lack = ", because its port is missing" if _lacks_port(text) else ""
     return UsageError(f'{text} is not an endpoint{lack}; write it like "tcp/127.0.0.1:7448"')
 
@@ -127,7 +127,10 @@ PATIENT = {"connect/timeout_ms": -1, "connect/exit_on_failure": False}
 
 
 def _listening() -> dict[str, object]:
-    """Return the settings against clients that stay silent, send too much or do not read."""
+    """Return settings that protect a listening session against faulty clients.
+
+    Such clients stay silent, send too much or do not read.
+    """
     return {
         "transport/link/rx/max_message_size": MESSAGE_BYTES,
         "transport/unicast/accept_timeout": 1000,
@@ -162,8 +165,9 @@ def _opened(settings: dict[str, object], where: tuple[str, ...]) -> zenoh.Sessio
 def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
     """Open a session in Zenoh's client mode to the daemon or router at `endpoint`.
 
-    In peer mode the session would reach no program behind a router. `tls` is the directory with the
-    client's certificate. Only an endpoint like "tls/robot.local:7449" needs it.
+    The session is not in peer mode, because it would then reach no program behind a router. `tls`
+    is the directory with the client's certificate. Only an endpoint like "tls/robot.local:7449"
+    needs it.
 
     Raises:
         UsageError: `endpoint` is not an endpoint.
@@ -222,7 +226,10 @@ def _base(mode: str) -> dict[str, object]:
 
 
 def _tls(directory: str) -> dict[str, object]:
-    """Return the TLS settings. A link closes when the certificate of either end expires."""
+    """Return Zenoh's TLS settings for the certificate files in `directory`.
+
+    With them, a link closes when the certificate at either of its ends expires.
+    """
     certificate, key = f"{directory}/{CERTIFICATE}", f"{directory}/{KEY}"
     return {
         "transport/link/tls": {
@@ -240,8 +247,8 @@ def _tls(directory: str) -> dict[str, object]:
 def _command_limits(config: Config) -> dict[str, object]:
     """Return the rate limits of commands, speed limits and gyro samples, on native and ROS keys.
 
-    All certificates of a configured source share a limit. All sources that are not configured
-    share one more limit. Zenoh applies each limit to each connection separately.
+    All certificates of a configured source share one limit. All sources that are not configured
+    share another one. Zenoh counts the samples of each connection separately.
     """
     names = [*(source.name for source in config.commands.sources), "*"]
     below = [*source_keys(names), *source_keys(names, "*"), IMU, SPEED_LIMIT]
@@ -266,7 +273,7 @@ def _config(settings: dict[str, object]) -> zenoh.Config:
 
 
 def first_line(error: Exception) -> str:
-    """Return the first line of a Zenoh error without the paths of its source files."""
+    """Return the first line of Zenoh's error text, without the paths of Zenoh's source files."""
     text = re.sub(r"(?: at)? /\S+\.rs:\d+\.?", "", str(error)).splitlines()
     return text[0][:200].strip() if text else type(error).__name__
 

@@ -29,14 +29,15 @@ from acsard.host.errors import InUseError, RouterFileError, UsageError
 EXAMPLE = "robot1"
 """Id of the robot in the template."""
 
-IS_FOR = "// It is for {}. For yours:\n"
-"""Line near the top of the template and of the router's file, in which {} stands for the ids."""
+IS_FOR = "// This file is for {}. To make a file for your own robots:\n"
+"""Comment near the top of the template and of the router's file. {} stands for the robots' ids."""
 
 _BLOCK = re.compile(r"^ *// ROBOT\n(.*?)^ *// END\n", re.M | re.S)
 _NAME = re.compile(rf"\b{EXAMPLE}\b")
 
 PERSON: Role = "operator"
-"""Example name in the template's lines between PERSON and END PERSON, which real names replace."""
+"""Example name in the template's lines between PERSON and END PERSON. The common names of the
+certificates that may command replace it."""
 
 _PERSONS = re.compile(r"^ *// PERSON\n(.*?)^ *// END PERSON\n", re.M | re.S)
 # Match a whole name or the last part of a key, but not the beginning of a robot's id "operator-1".
@@ -46,10 +47,15 @@ _PERSON = re.compile(rf'(?<=[/" ]){PERSON}(?=")')
 def router_file(template: str, robots: Sequence[str], people: Mapping[Role, Sequence[str]]) -> str:
     """Return the text of the router's configuration file.
 
-    `template` is the text of `deploy/zenoh/router.json5`. `people` maps each role to the common
-    names of the certificates with this role, without the certificate that has the role's own name.
     Raises `UsageError` if a name occurs twice, because a certificate belongs either to one robot or
     to one role.
+
+    Args:
+        template: the text of `deploy/zenoh/router.json5`.
+        robots: the robots' ids.
+        people: maps each role to the common names of the certificates with this role. Leave out the
+            names "viewer", "operator" and "maintainer": these certificates always have the role of
+            this name.
     """
     names = [*robots, *ROLES, *(name for role in ROLES for name in people.get(role, ()))]
     twice = [name for name, count in Counter(names).items() if count > 1]
@@ -109,7 +115,10 @@ _SYNTAX_ERROR = re.compile(
 
 
 def reason(error: zenoh.ZError) -> str:
-    """Return the readable part of Zenoh's error, with line and column if the error names them."""
+    """Return the readable part of Zenoh's error about a configuration file.
+
+    The result begins with the line and the column in the file if the error names them.
+    """
     text = str(error)
     if match := _VALUE_ERROR.search(text):
         message = re.sub(r"\\(.)", r"\1", match[1])
@@ -177,9 +186,10 @@ class Router(Listener):
             ) from error
 
     def _opens_elsewhere(self) -> bool:
-        """Return whether Zenoh accepts the configuration with free loopback ports as addresses.
+        """Return whether Zenoh opens a session if it listens on free loopback ports instead.
 
-        If Zenoh does, only the configured addresses are wrong. Zenoh's own error does not say so.
+        If it does, only the addresses in the file are wrong. Zenoh's own error does not show
+        whether the addresses or other settings are wrong.
         """
         config = zenoh.Config.from_file(str(self._file))
         free = [AN_ADDRESS.sub(r"\1/127.0.0.1:0", endpoint) for endpoint in self._endpoints]
@@ -193,7 +203,10 @@ class Router(Listener):
         return True
 
     def _certificate_files(self) -> CertificateFiles | None:
-        """Return the certificate files of the endpoints, or None if not all three are named."""
+        """Return the certificate files that the router's file names.
+
+        Return None if it does not name all three of them.
+        """
         tls = json.loads(self._config.get_json("transport/link/tls")) or {}
         named = [Path(tls[name]) for name in CERTIFICATE_FILES if tls.get(name)]
         return CertificateFiles(*named) if len(named) == len(CERTIFICATE_FILES) else None

@@ -35,23 +35,24 @@ STUCK_NS = NS_PER_S
 millisecond."""
 
 FIRST_NS = 5 * NS_PER_S
-"""Time within which the daemon must connect after the session has been opened, ns; otherwise this
-process restarts. It is longer than `ALONE_NS`, because all other clients also connect then."""
+"""Time within which the daemon must connect after the session has been opened, ns. If it does not,
+this process restarts. The time is longer than `ALONE_NS`, because all clients connect at the same
+moment after a restart."""
 
 ALONE_NS = NS_PER_S
 """Time within which the daemon must connect again after its connection was lost, ns. If it does
 not, this process restarts."""
 
 REPORTS = Rate(1 / 60)
-"""Largest rate of events that report that all connections are in use: one a minute."""
+"""Largest rate of the log event that reports that all connections are in use: one a minute."""
 
 MAX_UNANSWERED = 4
-"""If the daemon leaves this number of consecutive queries unanswered for 1 s each, the connection
-to the daemon counts as dead. Such a connection is still open, but its data does not reach the
-daemon."""
+"""If the daemon does not answer this number of consecutive queries within 1 s each, the gateway's
+connection to the daemon counts as dead: it is open, but its data does not reach the daemon."""
 
 NAMES = 5
-"""Largest number of clients that an event names. It names the clients with the most connections."""
+"""Number of clients that the event about used-up connections names. These are the clients with the
+most connections."""
 
 Incident = Literal["open", "full", "stuck", "alone"]
 
@@ -73,7 +74,7 @@ class Observation(Struct, frozen=True):
     at_ns: int
     """Monotonic time of the observation, ns."""
     holders: tuple[str, ...] = ()
-    """The common name in the client's certificate for each connection, "" if unknown."""
+    """For each connection, the common name in the client's certificate, or "" if it is unknown."""
     linked: bool = False
     """True if the daemon is connected. For a router, which needs no daemon, it is always True."""
     unanswered: int = 0
@@ -87,7 +88,7 @@ class SessionHealth:
         """Prepare for the first observation.
 
         `most` is the largest number of connections. `opened_ns` is the monotonic time at which the
-        session was opened.
+        session was opened, ns. `events` has the names of the log events.
         """
         self._most, self._events = most, events
         self._linked_ns, self._patience_ns = opened_ns, FIRST_NS
@@ -97,7 +98,10 @@ class SessionHealth:
         """Number of observations in which all connections were in use."""
 
     def full_event(self, observed: Observation) -> Event | None:
-        """Return an event if all connections are in use, at most once a minute; otherwise None."""
+        """Return a log event if all connections are in use, else None.
+
+        At most one event is returned in each minute.
+        """
         if len(observed.holders) < self._most:
             return None
         self.full += 1
@@ -112,8 +116,8 @@ class SessionHealth:
     def restart_event(self, observed: Observation, passed_ns: int) -> Event | None:
         """Return an event that says why the process must restart, or None if it need not.
 
-        `observed` is the latest observation, which may be the same as in the last call of this
-        method. `passed_ns` is the time since the last call, ns.
+        `observed` is the latest observation. If it is still the one of the last call, Zenoh may
+        hang. `passed_ns` is the time since the last call, ns.
         """
         new, self._last_ns = observed.at_ns != self._last_ns, observed.at_ns
         stuck = self._silence.too_long(new, passed_ns)
@@ -150,9 +154,9 @@ PERIOD_S = 0.25
 """Time between two observations of the session, and between two checks by the main thread, s."""
 
 MEMORY_BYTES = 192 << 20
-"""Limit of the data memory of the process, bytes. The process uses 35 MB, or 72 MB with all
-connections in use. An attack can take 600 MB a second, too fast for a check. The kernel refuses
-memory above the limit, which ends the process."""
+"""Limit of the data memory of this process, bytes. The process needs 35 MB, or 72 MB if all
+connections are in use. An attack can use another 600 MB in each second, too fast for a periodic
+check. So the kernel enforces the limit: it refuses more memory, which ends the process."""
 
 NICE = 5
 """Nice value of this process, so that the daemon and ordinary programs have priority over it."""
@@ -182,18 +186,21 @@ class Listener:
         raise NotImplementedError
 
     def report(self, session: zenoh.Session, observed: Observation, health: SessionHealth) -> None:
-        """Publish the state for the daemon, if there is a daemon. This call may never return."""
+        """Publish the session's state for the daemon. A router, which has no daemon, does nothing.
+
+        This call may never return.
+        """
 
 
 class ListenerProcess:
     """The process of one listener, from its start until it ends or must be restarted."""
 
     def __init__(self, listener: Listener, log: Log, manager: Systemd, parent: int | None) -> None:
-        """Prepare the process.
+        """Prepare the process; `run` runs it.
 
-        `parent` is a file descriptor whose other end the parent process holds, or None. This
-        process ends when the parent closes that end. If the descriptor is a socket, the process
-        writes a sign of life to it in every period.
+        `manager` is the connection to systemd. `parent` is a file descriptor whose other end the
+        parent process holds, or None. This process ends when the parent closes that end. If the
+        descriptor is a socket, the process writes a sign of life to it in every period.
         """
         self._listener, self._log, self._manager = listener, log, manager
         self._parent = None if parent is None else Parent(parent)

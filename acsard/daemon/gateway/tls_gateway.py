@@ -33,8 +33,8 @@ from acsard.host import clock
 CONNECT_S = 1.0
 
 PROBE_NS = NS_PER_S
-"""Time between two queries to the daemon, ns. A query that has not ended when the next one is due
-counts as unanswered."""
+"""Time between two queries to the daemon, ns. If a query has not ended when the next query is due,
+it counts as unanswered."""
 
 QUERY_TIMEOUT_S = 60.0
 """Time after which Zenoh itself ends a query to the daemon, s. It is much longer than `PROBE_NS`,
@@ -42,7 +42,10 @@ after which the query counts as unanswered."""
 
 
 class Gateway(Listener):
-    """The TLS gateway. It opens when the daemon runs, and reports its connections to the daemon."""
+    """The TLS gateway.
+
+    It admits clients only after the daemon has started, and reports its connections to the daemon.
+    """
 
     most = MAX_SESSIONS - 1
     """Largest number of connections from the network. The daemon needs the remaining connection."""
@@ -98,21 +101,25 @@ class Gateway(Listener):
 
 
 class DaemonProbe:
-    """A probe that queries the daemon repeatedly, because an open connection may carry no data.
+    """Queries the daemon repeatedly to detect a connection that is open but carries no data.
 
-    In a test on an overloaded machine, a connection stayed open for minutes, although
-    the daemon's Zenoh did not read from it.
+    In a test on an overloaded machine, a connection stayed open for minutes, although the daemon's
+    Zenoh did not read from it.
     """
 
     def __init__(self, key: str) -> None:
-        """Prepare queries of `key`, which the daemon answers."""
+        """Prepare the probe. `key` is the full key of the queries, which the daemon answers."""
         self._key, self._asked_ns, self._unanswered = key, 0, 0
         self._ended = threading.Event()
         """This event is set when the last query has ended, with or without a reply. A query that
         ends within `PROBE_NS` has reached the daemon."""
 
     def unanswered(self, session: zenoh.Session, now_ns: int) -> int:
-        """Send the next query if it is due. Return the number of consecutive unanswered queries."""
+        """Send the next query if it is due, and return how many of the latest queries failed.
+
+        The result is the number of consecutive queries that did not end within `PROBE_NS`. `now_ns`
+        is the present monotonic time, ns.
+        """
         if now_ns - self._asked_ns < PROBE_NS:
             return self._unanswered
         if self._asked_ns:

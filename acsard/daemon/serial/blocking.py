@@ -16,8 +16,8 @@ from acsard.host import clock
 from acsard.host.processes import Holder, master_of, waited_ns
 
 SEND_S = 0.5
-"""Longest time for which `send` waits while the driver accepts no byte, s. Even at the lowest baud
-rate, a line needs only 50 ms."""
+"""Longest time for which `send` waits until the driver has accepted all bytes, s. Even at the
+lowest baud rate, a line needs only 50 ms."""
 
 DRAIN_S = 0.5
 """Longest time for which `close` waits for the driver to send the last stop lines, s."""
@@ -28,7 +28,7 @@ because they first try to send the bytes in their buffer."""
 
 
 class BlockingPort:
-    """Blocking access to one serial device, with the interface `checkup.board.Wire`."""
+    """Blocking access to one serial device. It implements the protocol `checkup.board.Wire`."""
 
     def __init__(self, path: str) -> None:
         self._path = path
@@ -57,8 +57,10 @@ class BlockingPort:
             raise WireLostError(f"{self._path}: {error}") from error
 
     def close(self) -> None:
-        """Send the last bytes, then unlock and close the port. No wait for the driver is
-        endless."""
+        """Send the last bytes, then unlock and close the port.
+
+        This waits for the driver for at most `DRAIN_S` plus `CLOSE_S`.
+        """
         device, self._device = self._device, None
         if device is None:
             return
@@ -71,9 +73,9 @@ class BlockingPort:
         return clock.mono_ns()
 
     def late_ns(self) -> int:
-        """Return how long the program at the pty's other end waited for a processor, ns.
+        """Return how long a simulator at the other end of a pty waited for a processor, ns.
 
-        Only the time since the last call counts. The result is 0 for a real device.
+        Only the waits since the last call count. The result is 0 for a real device.
         """
         if self._program is None:
             return 0
@@ -96,9 +98,10 @@ class BlockingPort:
                 raise WireLostError(f"{self._path} was lost: {error.strerror}") from error
 
     def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
-        """Read until monotonic `until_ns`. Return a pair for each read: its time, ns, and its data.
+        """Read all bytes that arrive until the monotonic time `until_ns`.
 
-        Raises `WireLostError` if the port is lost.
+        Return a pair for each read: the monotonic time after the read, ns, and the bytes. Raises
+        `WireLostError` if the port is lost.
         """
         fd = self._fileno()
         pieces: list[tuple[int, bytes]] = []

@@ -22,15 +22,18 @@ _left_open: list[int] = []
 """Descriptors that `close` could not close because no thread could be started."""
 
 DRAIN_STEP_S = 0.001
-"""Time between two checks for unsent bytes, s. Even at the highest baud rate a line takes
-longer."""
+"""Pause between two checks whether the driver has sent all bytes, s. A line takes longer than this,
+even at the highest baud rate."""
 
 
 class _Device(serial.Serial):  # type: ignore[misc]
     """A port whose `read` makes one system call and never waits."""
 
     def read(self, size: int = 1) -> bytes:
-        """Return up to `size` bytes without waiting. Raises `SerialException` for a lost port."""
+        """Return up to `size` bytes without waiting; b"" if no bytes have arrived.
+
+        Raises `SerialException` if the port is lost.
+        """
         if self.fd is None:
             raise serial.PortNotOpenError
         try:
@@ -45,7 +48,7 @@ class _Device(serial.Serial):  # type: ignore[misc]
 
 
 def open_raw(path: str, baud_rate: int) -> serial.Serial:
-    """Open the port in raw mode, locked and with empty buffers. Raises `OSError` if that fails."""
+    """Open the port in raw mode, lock it and empty its buffers. Raises `OSError` if that fails."""
     # Close the devices that `close` could not close. Two threads may empty the list at the same
     # time.
     with suppress(IndexError):
@@ -91,7 +94,7 @@ def _set_up(device: serial.Serial) -> None:
 
 
 def unsent(fd: int) -> int:
-    """Return how many bytes the driver has not sent, or 0 if that is unknown, as for a pty."""
+    """Return how many bytes the driver has not sent yet. Return 0 if the driver does not say so."""
     waiting = array.array("i", [0])
     try:
         fcntl.ioctl(fd, termios.TIOCOUTQ, waiting)
@@ -101,13 +104,17 @@ def unsent(fd: int) -> int:
 
 
 def draining(fd: int, deadline_ns: int) -> Iterator[float]:
-    """Yield pauses, s, for the caller to sleep, until all bytes are sent or until `deadline_ns`."""
+    """Yield the length of each pause, in seconds, until the driver has sent all bytes.
+
+    The caller must sleep for this time after each step of the iteration. The iteration also ends at
+    the monotonic time `deadline_ns`.
+    """
     while unsent(fd) and clock.mono_ns() < deadline_ns:
         yield DRAIN_STEP_S
 
 
 def unlock(fd: int) -> None:
-    """Unlock the device. Otherwise a pty stays locked for others after this process ends."""
+    """Unlock the device. A pty would otherwise stay locked even after this process has ended."""
     try:
         fcntl.ioctl(fd, termios.TIOCNXCL)
     except OSError:
@@ -115,15 +122,16 @@ def unlock(fd: int) -> None:
 
 
 def close(device: serial.Serial, *, lost: bool = False, wait_s: float = 0.0) -> None:
-    """Discard unsent bytes, and unlock and close the device in a thread.
+    """Discard unsent bytes, then unlock and close the device in a thread.
 
-    The thread is needed because a driver may take 30 s to close. This call waits for at most
-    `wait_s` seconds until the thread has ended. If no thread can be started, the next `open_raw`
-    closes the device. After the call, the descriptor of `device` refers to /dev/null, so the owner
-    can drain and close `device` without delay.
+    The thread is needed because a driver may take 30 s to close. If no thread can be started, the
+    next `open_raw` closes the device. After this call, the descriptor of `device` refers to
+    /dev/null, so the caller can close `device` itself without delay.
 
-    If `lost` is true, the device has failed. Its output buffer is then discarded even if the driver
-    reports no unsent bytes.
+    Args:
+        lost: whether the device has failed. Its output buffer is then discarded even if the driver
+            reports no unsent bytes.
+        wait_s: longest time for which this call waits until the thread has closed the device, s.
     """
     fd = device.fileno()
     if lost or unsent(fd):
@@ -151,7 +159,10 @@ def _end(fd: int) -> None:
 
 
 def refusal(path: str, error: OSError) -> MendableError:
-    """Return the error that explains why the port cannot be opened."""
+    """Return the error for users that explains why the port at `path` cannot be opened.
+
+    `error` is the error of the operating system.
+    """
     match error.errno:
         case errno.ENOENT | errno.ENODEV | errno.ENXIO | errno.ENOTDIR:
             return NoPortError(
@@ -172,16 +183,18 @@ def refusal(path: str, error: OSError) -> MendableError:
 _LISTED = "`acsard ports` lists the serial ports"
 _FREE = "stop that process first (`systemctl stop acsard` if it is the service of acsard)"
 _JOIN = (
-    "add the user to the device's group (`sudo usermod -aG dialout $USER`), then log in again; "
-    "the systemd service of acsard is in the group dialout already; if the service lacks "
-    "permission, the device has another group, or acsard.service does not allow this type of device"
+    "add your user to the device's group (`sudo usermod -aG dialout $USER`), then log in again. "
+    "The systemd service of acsard is in the group dialout already: if the service has no "
+    "permission, the device belongs to another group, or acsard.service does not allow this type "
+    "of device"
 )
 
 
 def require(path: str) -> None:
-    """Raise the error of `refusal` unless `path` is a character device.
+    """Raise an error that says what is wrong if `path` is not a character device.
 
-    Only the tools call this function. The daemon does not, because it waits for an absent device.
+    Only the tools call this function. The daemon does not call it, because it waits until an absent
+    device appears.
     """
     try:
         if not stat.S_ISCHR(os.stat(path).st_mode):

@@ -27,16 +27,16 @@ from acsard.host.errors import InUseError, MendableError, NotPermittedError
 from acsard.host.threads import NoThreadError, in_thread
 
 OPEN_TIMEOUT_S = 5.0
-"""Time after which a call that opens a device counts as hung, s. Until that call returns, the same
-device is not opened again."""
+"""Time limit of a call that opens a device, s. After this time the call counts as hung. The daemon
+does not try to open the same device again until the hung call returns."""
 
 BACK_OFF_S = (0.05, 0.1, 0.2)
-"""Pauses between the attempts to reopen the port, s. The last pause repeats. The first ones are
-short, because udev sets the group of a new device within a short time."""
+"""Pauses between the attempts to reopen the port, s. All further pauses are as long as the third
+one. The first pauses are short, because udev soon sets the group of a new device."""
 
 PERMISSION_PATIENCE_S = 2.0
-"""Time for which the start of the daemon waits for udev to grant access to the device, s. If access
-is still denied after this time, the start fails."""
+"""Time for which the starting daemon waits until udev grants access to the device, s. If the daemon
+has no access by then, its start fails."""
 
 HUNG = "the driver of the serial port did not answer"
 
@@ -46,14 +46,14 @@ lowest baud rate, plus a margin."""
 
 
 AT_ONCE = 4096
-"""Largest number of bytes per read. A driver buffers this many."""
+"""Largest number of bytes in one read. The buffer of a driver has this size."""
 
 
 class SerialPort:
-    """The port to the board, as an asynchronous context manager.
+    """The serial port to the board, as an asynchronous context manager.
 
-    Entering the context opens the port. `keep_open` reopens the port whenever it is lost. Leaving
-    the context sends STOP and closes the port.
+    Entering the context opens the port. While `keep_open` runs, a lost port is opened again.
+    Leaving the context sends STOP and closes the port.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class SerialPort:
         self._lost = asyncio.Event()
         self._fd = -1
         self._opening = set[tuple[int, int]]()
-        """The devices that a thread is opening now, as (`st_dev`, `st_ino`) of their paths."""
+        """The devices that threads are opening now. Each is a pair (`st_dev`, `st_ino`)."""
         self.trouble = ""
         """The reason why the port is closed; "" while the port is open."""
 
@@ -86,18 +86,19 @@ class SerialPort:
 
     @property
     def sent_ns(self) -> int:
-        """Monotonic time at which the kernel took the last line, ns."""
+        """Monotonic time at which the kernel accepted the last line, ns."""
         return self._output.sent_ns
 
     def take(self, late: Instant | None = None) -> tuple[Received, ...]:
         """Return the bytes received since the last call.
 
-        `late` is the time of this step if it is late, else None. In a late step, this method also
-        reads the bytes that wait in the kernel. Otherwise the delay of the step would look like
-        silence of the board.
+        `late` is the time of the present control step if periods were missed before it, else None.
+        In such a step, this method also reads the bytes that wait in the kernel. Otherwise the
+        delay of the step would look like silence of the board.
 
         After a suspend of the computer, this method closes the port, even if the device still
-        works. `keep_open` then opens the port again, and every sender must return to neutral.
+        works. `keep_open` then opens the port again, and every sender must send a zero before it
+        can move the robot.
         """
         if self._asleep.was():
             self._leave(OSError(errno.EIO, "this computer was suspended"))
@@ -113,10 +114,11 @@ class SerialPort:
         return got
 
     def offer(self, line: bytes, now: Instant) -> Offered:
-        """Write a line that was made at `now`, and return "sent".
+        """Try to write a line, and return the result.
 
-        Return "down" if the port is closed. Return "superseded" if the line was not written
-        completely, so that a newer line must replace it.
+        Return "sent" if the kernel accepted the line, and "down" if the port is closed. Return
+        "superseded" if the line was not written completely: a newer line must then replace it.
+        `now` is the time of the step that made the line.
         """
         if not self.is_open:
             return "down"
@@ -240,7 +242,10 @@ class SerialPort:
     # Closing.
 
     async def __aexit__(self, *_: object) -> None:
-        """Send STOP as the last line and close within `FAREWELL_S`, also after an exception."""
+        """Send STOP as the last line, and close the port.
+
+        Sending takes at most `FAREWELL_S`. Also do this if an exception ends the context.
+        """
         deadline_ns = clock.now().mono_ns + int(FAREWELL_S * 1e9)
         while self.is_open and self.offer(self._stop, clock.now()) == "superseded":
             if clock.now().mono_ns > deadline_ns:

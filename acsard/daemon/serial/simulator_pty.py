@@ -55,7 +55,7 @@ class PtyEnd:
         return data
 
     def write(self, data: bytes) -> bool:
-        """Write to the host. If the pty's buffer is full, drop the data and return False."""
+        """Send data to the host. If the pty's buffer is full, drop the data and return False."""
         try:
             os.write(self._master, data)
         except BlockingIOError:
@@ -71,7 +71,10 @@ _RATES: dict[int, int] = {getattr(termios, f"B{rate}"): rate for rate in get_arg
 
 
 class SimPty:
-    """The simulated board at the end of a pty. Entering it creates a serial device at `path`."""
+    """The simulated board at one end of a pty, as a context manager.
+
+    Entering the context creates the pty. `path` is the serial device for the daemon.
+    """
 
     def __init__(self, mcu: FakeMcu) -> None:
         self.mcu = mcu
@@ -103,13 +106,16 @@ class SimPty:
             self._arm()
 
     def _set_speed(self) -> None:
-        """Set the pty to the board's baud rate, for a host that does not set a rate."""
+        """Set the pty to the board's baud rate, in case the host never sets a baud rate."""
         attributes = termios.tcgetattr(self._end.slave)
         attributes[4] = attributes[5] = getattr(termios, f"B{self.mcu.baud_rate}")
         termios.tcsetattr(self._end.slave, termios.TCSANOW, attributes)
 
     def _speed(self) -> int:
-        """Return the host's baud rate, or the board's rate if acsard does not know the host's."""
+        """Return the baud rate that the host has set on the pty.
+
+        If it is not a rate that acsard supports, return the board's baud rate.
+        """
         return _RATES.get(termios.tcgetattr(self._end.slave)[5], self.mcu.baud_rate)
 
     def _advance(self) -> None:
@@ -129,7 +135,7 @@ POSE = "sim/pose"
 
 
 class Simulated(SimPty):
-    """The simulated board of a daemon, which also publishes the robot's true pose on the bus."""
+    """The simulated board of a daemon. It also publishes the robot's true pose on the bus."""
 
     def __init__(self, config: Config) -> None:
         super().__init__(WatchedMcu(config, clock.mono_ns(), self._see))

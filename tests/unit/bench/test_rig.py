@@ -16,9 +16,9 @@ JSON = '{"event": "ended"}\n'
     ("code", "log", "wanted", "text"),
     [
         (-9, JSON, Exit.FAILURE, "the daemon was ended by signal 9"),
-        (0, JSON, Exit.FAILURE, "the daemon ended with 0"),
-        (3, "what\n", Exit.FAILURE, "the daemon ended with 3: what"),
-        (75, JSON, Exit.FAILURE, "the daemon ended with 75"),
+        (0, JSON, Exit.FAILURE, "the daemon ended with exit code 0"),
+        (3, "what\n", Exit.FAILURE, "the daemon ended with exit code 3: what"),
+        (75, JSON, Exit.FAILURE, "the daemon ended with exit code 75"),
         (75, f"acsard: in use\n{JSON}\n", Exit.IN_USE, "in use"),
         (1, "Traceback ...\nKeyError: 1\n", Exit.FAILURE, "KeyError: 1"),
     ],

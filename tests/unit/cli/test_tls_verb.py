@@ -516,7 +516,7 @@ def test_a_name_without_a_certificate_is_not_renewed(
     assert tls("renew", "--name", "robot9", "--directory", str(own)) == Exit.FAILURE
     told = capsys.readouterr().err
     assert "has no certificate for robot9, only for: maintainer, operator, viewer" in told
-    assert f"`acsard tls add robot9 --directory {own}` makes a first one" in told
+    assert f"`acsard tls add robot9 --directory {own}` makes this certificate" in told
     assert files(own) == before
 
 

@@ -102,10 +102,10 @@ def test_a_daemon_without_a_file_is_compared_with_its_start(started: Started) ->
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (b"[limits\n", "the daemon could not start again with its present file: not TOML"),
+        (b"[limits\n", "the daemon could not start with the present content of its file: not TOML"),
         (
             b"[limits]\nlinear_sped = 1\n",
-            "the daemon could not start again with its present file: limits.",
+            "the daemon could not start with the present content of its file: limits.",
         ),
         (None, "the configuration file cannot be read: No such file or directory"),
     ],

@@ -87,7 +87,7 @@ def test_a_router_that_once_ran_is_started_again_when_its_files_are_wrong(
 
     asyncio.run(asyncio.wait_for(runs(), 10.0))
     codes = [event.text.partition(";")[0] for event in said[:3]]
-    assert codes == [f"the router ended with {number}" for number in (1, code, code)]
+    assert codes == [f"the router ended with exit code {number}" for number in (1, code, code)]
 
 
 @pytest.mark.parametrize(("kind", "code"), [(GATEWAY, 78), (ROUTER, 75), (ROUTER, 1)])
@@ -98,5 +98,5 @@ def test_one_that_may_be_opened_later_is_tried_again(
     event = asyncio.run(told(kind))
     assert (event.name, event.text.partition(";")[0]) == (
         kind.ended,
-        f"{kind.name} ended with {code}",
+        f"{kind.name} ended with exit code {code}",
     )

@@ -72,8 +72,8 @@ def until_gone(pid: int) -> None:
 @pytest.mark.parametrize(
     ("text", "code", "words"),
     [
-        ("", 0, "ended with 0"),
-        ("raise SystemExit(78)", 78, "ended with 78"),
+        ("", 0, "ended with exit code 0"),
+        ("raise SystemExit(78)", 78, "ended with exit code 78"),
         ("import os; os.kill(os.getpid(), 9)", -9, "was ended by signal 9"),
     ],
 )

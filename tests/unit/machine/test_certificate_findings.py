@@ -146,7 +146,7 @@ def test_a_missing_key_of_a_robot_of_a_fleet_does_not_lead_to_a_new_authority(fl
     (own / "key.pem").unlink()
     for one in certificates(str(own)):
         assert "tls init" not in one.mend
-        assert "copy ca.pem, certificate.pem and key.pem into that directory again" in one.mend
+        assert "copy ca.pem, certificate.pem and key.pem from there into this directory" in one.mend
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")

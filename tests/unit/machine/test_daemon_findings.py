@@ -449,7 +449,7 @@ def test_the_last_causes_of_lateness_are_shown_and_warn_only_if_periods_are_miss
         "it is 2", "it is 3", "it is 4",
     ]  # fmt: skip
     assert (
-        "missed control periods before 2027-01-15 08:00:05 UTC: by 0.14 s, because"
+        "missed control periods just before 2027-01-15 08:00:05 UTC: by 0.14 s, because"
         in findings[-1].text
     )
     row = DiagnosticStatus(1, "acsard: control loop", "600 of 6000 periods missed", "acsar", [])

@@ -225,7 +225,7 @@ def test_each_that_stays_says_why_and_what_removes_it() -> None:
     steps = uninstalling(ALL, found, [tls, own], force=False)
     assert {step.path: step.why for step in steps if isinstance(step, Keep)} == {
         UNIT_FILE.path: "the file differs from what this version installs; --force removes it",
-        STOP_FILE.path: f"{UNIT} stays and needs it",
+        STOP_FILE.path: f"{UNIT} stays and needs this file",
         OWN.path: "it is your configuration; --purge removes it",
         tls: "certificates and their authority; --purge removes it",
         own: "not the service's own; --purge removes it",

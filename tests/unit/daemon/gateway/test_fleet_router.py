@@ -170,9 +170,8 @@ def granted(access: Any, subjects: set[str], message: str) -> set[str]:
 def test_each_of_ten_robots_has_its_own_keys_and_none_of_another_robot() -> None:
     one, ten = made(["robot1"]), made(TEN)
     for robots in (["robot1"], TEN):
-        assert f"// It is for {', '.join(robots)}. For yours:\n" in router_file(
-            TEMPLATE, robots, {}
-        )
+        line = f"// This file is for {', '.join(robots)}. To make a file for your own robots:\n"
+        assert line in router_file(TEMPLATE, robots, {})
     own = [rule for rule in one["rules"] if "robot1" in rule["id"]]
     assert len(ten["rules"]) == len(one["rules"]) + 9 * len(own)
     rules = {rule["id"]: rule for rule in ten["rules"]}
