@@ -179,7 +179,9 @@ class Witness:
         self.rested = True
         """Whether the robot has stood for a second since the last line that was no zero."""
         self._turns_ns = 0
-        """When a wheel turned last, or a line was no zero."""
+        """When a wheel turned last, or a line was no zero, or the daemon did not read the speeds."""
+        self._wheels_ns = 0
+        """When the daemon last read the speeds of the wheels."""
         self.blocked_ns: int | None = None
         """Since when the kernel takes no line."""
         self.braking: tuple[int, tuple[float, ...]] | None = None
@@ -753,7 +755,8 @@ class Witness:
 
     def wheels(self, at_ns: int, fastest: float) -> None:
         """Judge the true wheels: those of a robot that is held must stand in the end."""
-        if self.last != ZERO or fastest > 0.1:
+        unseen, self._wheels_ns = at_ns - self._wheels_ns > NS // 2, at_ns
+        if self.last != ZERO or fastest > 0.1 or unseen:
             self._turns_ns = at_ns
         self.rested |= at_ns - self._turns_ns > NS
         if fastest < 0.5:
