@@ -179,7 +179,7 @@ class Witness:
         self.rested = True
         """Whether the robot has stood for a second since the last line that was no zero."""
         self._turns_ns = 0
-        """When a wheel turned last, or a line was no zero, or the daemon did not read the speeds."""
+        """When a wheel turned last, a line was no zero, or the daemon did not read the speeds."""
         self._wheels_ns = 0
         """When the daemon last read the speeds of the wheels."""
         self.blocked_ns: int | None = None
