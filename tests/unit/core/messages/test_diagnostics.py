@@ -148,9 +148,24 @@ BATTERY = replace(CONFIG, battery=BatteryConfig(warning_below=22.0, stop_below=2
     ("level", "number", "message"),
     [
         ("ok", OK, "22.50 V, 40 %, -1.50 A"),
-        ("warning", WARN, "22.50 V, 40 %, -1.50 A; the mean is below battery.warning_below = 22 V"),
-        ("stop", ERROR, "22.50 V, 40 %, -1.50 A; the mean is below battery.stop_below = 21 V"),
-        ("unknown", WARN, "22.50 V, 40 %, -1.50 A; the level is known after 3 s of reports"),
+        (
+            "warning",
+            WARN,
+            "22.50 V, 40 %, -1.50 A; the mean of the last seconds is below battery.warning_below = "
+            "22 V",
+        ),
+        (
+            "stop",
+            ERROR,
+            "22.50 V, 40 %, -1.50 A; the mean of the last seconds is below battery.stop_below = "
+            "21 V",
+        ),
+        (
+            "unknown",
+            WARN,
+            "22.50 V, 40 %, -1.50 A; the level is not known until the board has reported for at "
+            "least 3 s",
+        ),
     ],
 )
 def test_a_battery_that_the_board_reports_has_a_row(
@@ -285,10 +300,12 @@ def test_the_commands_show_what_each_source_waits_for_and_what_was_refused() -> 
 def test_the_commands_name_the_speed_limit_that_slows_the_robot() -> None:
     (one,) = [
         one
-        for one in diagnostics(CONFIG, OUTPUTS, SNAPSHOT, NO_CERTIFICATE, "0.3 m/s by x").status
+        for one in diagnostics(
+            CONFIG, OUTPUTS, SNAPSHOT, NO_CERTIFICATE, "0.3 m/s, set by x"
+        ).status
         if one.name == "acsard: commands"
     ]
-    assert (one.level, one.message) == (OK, "commanded by app; speed limit: 0.3 m/s by x")
+    assert (one.level, one.message) == (OK, "commanded by app; speed limit: 0.3 m/s, set by x")
 
 
 def test_two_programs_on_one_source_are_a_warning_that_names_the_source() -> None:
