@@ -201,6 +201,13 @@ def test_a_router_has_its_row_before_anybody_has_looked_whether_it_is_there() ->
     assert [of.name for of in rows(config, snapshot=looked)] == [of.name for of in rows(config)]
 
 
+def test_a_lost_router_is_named_although_another_one_was_never_connected() -> None:
+    config = replace(CONFIG, bus=BusConfig(connect=("tcp/a:7447", "tcp/b:7447")))
+    one = row("router", config, snapshot=seen(routers=RoutersStatus(missing=("tcp/a:7447",))))
+    assert (one.level, one.message) == (WARN, "not connected to tcp/a:7447")
+    assert values(one) == {"tcp/a:7447": "not connected", "tcp/b:7447": "not connected yet"}
+
+
 # mode
 
 
