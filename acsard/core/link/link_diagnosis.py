@@ -222,17 +222,20 @@ class SilenceDiagnosis:
 
         The reason is that the link is up, the output is blocked, or the port was opened or closed.
         """
-        if self._since_ns is not None:
-            self.heard, self.now, self._since_ns = None, Heard(), None
+        self.heard, self.now, self._since_ns = None, Heard(), None
 
-    def judge(self, now_ns: int) -> bool:
+    def judge(self, now_ns: int, late_s: float = 0.0) -> bool:
         """Process a step without a link.
 
-        Return True if this step ends the first interval, or an interval whose class of received
-        bytes (`Look`) differs from that of the interval before.
+        `late_s` is the time since the step before, s, if this step is late; otherwise 0. Return
+        True if this step ends the first interval, or an interval whose class of received bytes
+        (`Look`) differs from that of the interval before.
         """
         if self._since_ns is None:
+            # The interval begins with this step, so the time before it does not belong to it.
             self._since_ns = now_ns
+        else:
+            self.now.late_s = max(self.now.late_s, late_s)
         if now_ns - self._since_ns < PATIENCE_NS:
             return False
         before, self.heard = self.heard, self.now

@@ -209,6 +209,51 @@ def test_it_is_told_after_three_seconds_and_again_only_when_it_looks_otherwise()
     assert not hearing.judge(10 * PATIENCE_NS)
 
 
+def sparse(bench: Bench) -> Heard:
+    """Return the first diagnosis of a board that sends three good lines and then nothing."""
+    for tick in range(3 * 100 + 2):
+        bench.wait(10, *([GOOD] if tick % 20 == 1 and tick < 50 else []))
+    found = bench.session._hearing.heard
+    assert found is not None
+    assert found.looks == "sparse"
+    return found
+
+
+def test_a_stall_while_the_link_was_up_does_not_explain_the_sparse_lines_of_later() -> None:
+    bench = Bench(McuConfig(port="/dev/board")).up()
+    bench.wait(2000, GOOD * 3)
+    for _ in range(500):
+        bench.wait(10, GOOD)
+    assert bench.link() == "up"
+    for _ in range(11):
+        bench.wait(10)
+    assert bench.link() == "stale"
+    assert "did not run" not in sparse(bench).words
+
+
+def test_a_closed_port_is_no_stall_of_this_computer() -> None:
+    bench = Bench(McuConfig(port="/dev/board")).up().close()
+    for _ in range(500):
+        bench.wait(10)
+    assert "did not run" not in sparse(bench.open()).words
+
+
+def test_a_stall_within_the_time_of_the_sparse_lines_explains_them() -> None:
+    bench = Bench(McuConfig(port="/dev/board")).open()
+    bench.wait(10)
+    bench.wait(800)
+    found = sparse(bench)
+    assert found.words.startswith("this computer did not run the daemon for 0.80 s")
+    assert is_ours(found.words)
+
+
+def test_lines_that_came_while_the_output_was_blocked_are_not_counted_afterwards() -> None:
+    hearing = SilenceDiagnosis()
+    hearing.now.line(STILL, good=True)
+    hearing.forget()
+    assert hearing.now == Heard()
+
+
 def events_of(every: int, windows: int = 3, period: float = 0.0, linked: bool = True) -> list[str]:
     """Return the events of a link that loses every n-th line."""
     answered = UnansweredLines(period)
