@@ -31,7 +31,7 @@ WARNED = replace(
     emergency_stop="released",
     bumpers=[False, False],
     battery=BatterySummary(22.41, 21.0, -1.2, "warning"),
-    certificate_expiry="ends in 10 days",
+    certificate_expiry="expires in 10 days",
     recording_error="/var/lib/acsard/recordings: No space left on device",
 )
 """The same robot with what ends its work later."""

@@ -60,10 +60,9 @@ def require_asking(args: argparse.Namespace) -> None:
 
 def count(text: str) -> int:
     """Parse a whole number of at least 1, as an argparse type."""
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"{text} is less than 1; give a number of at least 1")
-    return number
+    if not text.isascii() or not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not a whole number of at least 1")
+    return int(text)
 
 
 def between(least: float, most: float, units: str) -> Callable[[str], float]:

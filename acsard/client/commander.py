@@ -245,7 +245,10 @@ def objection(state: RobotState, source: str, sender: str) -> str:
     ours = next((one for one in state.sources if one.name == source), None)
     if ours is None:
         names = ", ".join(one.name for one in state.sources)
-        return f"{source} is not one of commands.sources: {names}"
+        return (
+            f"{source} is not one of commands.sources: {names}; use one of these sources, or add "
+            f"{source} to commands.sources in the robot's acsard.toml and restart the daemon"
+        )
     if state.mode == "waiting":
         return state.reason
     if not heard(state, source):

@@ -144,7 +144,10 @@ class Guard:
             abs(new) > abs(old) or new * old < 0 for new, old in zip(wheels, before, strict=True)
         )
         if grows and not self._commanded(outputs):
-            return "the line speeds up a wheel without a fresh command, or not in mode driving"
+            return (
+                "the line speeds up a wheel although no command is fresh, or although the mode is "
+                "not driving"
+            )
         if self._late(outputs.now.mono_ns):
             return "the line still moves a wheel although the longest ramp to zero has ended"
         return ""

@@ -453,7 +453,8 @@ class Robot:
             return []
         lines, dropped = self._odometry.confirmed(line)
         if dropped:
-            self._reject("the lines after it contradict its speeds", dropped, events)
+            which = "this line" if dropped == 1 else "these lines"
+            self._reject(f"later lines contradict the speeds of {which}", dropped, events)
         return lines
 
     def _reject(self, why: str, count: int, events: list[Event]) -> None:

@@ -104,7 +104,9 @@ def test_a_program_whose_stamping_router_changes_must_send_a_zero_again_and_then
     speaker.session = "another router"
     speaker.hold(0.4, 1.5)
     assert world.state.mode == "ready"
-    assert "send a zero first: app must send a zero, and no speed for 1 s" in world.state.reason
+    assert (
+        "send a zero first: app must send a zero, and then no speed for 1 s" in world.state.reason
+    )
     speaker.open()
 
 

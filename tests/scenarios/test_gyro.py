@@ -206,7 +206,7 @@ def test_without_its_gyro_the_heading_is_good_by_the_track_that_it_taught() -> N
           f"by the learned one {asked.error:.1%}; {asked.world.state.effective_track}")  # fmt: skip
     assert asked.error < 0.1 * plain.error
     assert " (in use), configured 1.000" in asked.world.state.effective_track
-    assert plain.world.state.effective_track.endswith("(only shown), configured 1.000 (in use)")
+    assert plain.world.state.effective_track.endswith("(only reported), configured 1.000 (in use)")
     (told,) = [event for event in asked.world.events if event.name == "learned_track"]
     assert told.text.endswith(" (in use), configured 1.000")
     assert not [event for event in plain.world.events if event.name == "learned_track"]

@@ -71,7 +71,8 @@ def test_a_clear_read_before_a_later_stop_and_delivered_after_it_is_refused(worl
     reply = call(world, "clear", "ann", seen)
     assert (reply.success, world.state.mode) == (False, "stopped")
     assert (
-        f"would release another one; the robot is still stopped by {JOE} (native)" in reply.message
+        f"would release another latch; the robot is still stopped by {JOE} (native)"
+        in reply.message
     )
     assert call(world, "clear", "ann", world.state.latch).success
     assert world.state.mode == "ready"
@@ -190,7 +191,7 @@ def test_an_activate_read_before_a_later_deactivate_and_delivered_after_it_is_re
     world.run(3.0)
     reply = call(world, "activate", "eve", seen)
     assert (reply.success, world.state.mode) == (False, "inactive")
-    told = f"would release another one; the robot is still switched off by {JOE} (native)"
+    told = f"would release another latch; the robot is still switched off by {JOE} (native)"
     assert told in reply.message
     assert call(world, "activate", "ann", world.state.latch).success
     assert world.state.mode == "ready"
@@ -248,7 +249,7 @@ def test_a_stop_during_a_fault_is_latched_as_well(world: World) -> None:
     runaway(world)
     fault = world.state.latch
     reply = call(world, "stop", "joe")
-    twice = "call srv/clear twice: for the fault, then for the stop"
+    twice = "call srv/clear twice: the first call releases the fault, the second the stop"
     assert reply.message == f"stopped and latched; {twice}"
     assert world.state.latch == fault
     assert call(world, "clear", "ann", fault).success
@@ -265,7 +266,8 @@ def test_two_clears_of_one_fault_do_not_release_the_stop_under_it(world: World) 
     reply = call(world, "clear", "eve", fault)
     assert (reply.success, world.state.mode) == (False, "stopped")
     assert (
-        f"would release another one; the robot is still stopped by {JOE} (native)" in reply.message
+        f"would release another latch; the robot is still stopped by {JOE} (native)"
+        in reply.message
     )
 
 

@@ -427,7 +427,7 @@ def test_a_loop_that_did_not_run_is_told_so_and_a_board_that_is_silent_as_that(
         world.stall(0.2)
         world.run(0.02)
         assert world.state.link == "stale"
-        assert world.state.reason.startswith("this computer did not run for 0.2")
+        assert world.state.reason.startswith("this computer did not run the daemon for 0.2")
     assert world.state.counters["link_lost_host_stall"] == world.state.counters["link_lost"] == 1
     world.hold(0.5, seconds=1.0)
     with world.mcu.mute():

@@ -86,7 +86,7 @@ def test_a_new_mcu_is_driven_with_checked_lines(check: str) -> None:
     assert world.state.mode == "driving"
     assert "(serial lines checked)" in world.state.reason
     assert check_of(world) == "checked"
-    assert texts(world, "link_check") == ["the form of the lines on the serial port is now checked"]
+    assert texts(world, "link_check") == ["the lines on the serial port are now checked"]
     heard = moving(world.lines())
     assert len(heard) > 150
     assert all(protocol.whole(line) and b"#" in line for line in heard)

@@ -60,7 +60,7 @@ def test_a_zone_slows_the_robot_and_its_end_lets_it_go_on_as_before(world: World
     limit(world, 25.0, percentage=True)
     world.hold(0.8, seconds=1.5)
     assert world.state.linear == pytest.approx(0.25, abs=0.02)
-    assert world.state.speed_limit.startswith("0.25 m/s by speed_limit, ")
+    assert world.state.speed_limit.startswith("0.25 m/s, set by speed_limit, ")
     assert config(world).limits.linear_speed == 0.25
     (reply,) = world.ask("diagnostics")
     assert f"speed limit: {world.state.speed_limit}".encode() in reply.payload
@@ -116,7 +116,7 @@ def test_no_line_is_faster_than_the_limit_when_an_operator_sets_more(world: Worl
     assert "limits.linear_speed = 1.5 will apply when the limit of 0.3 m/s ends" in reply.message
     world.hold(1.0, seconds=1.0)
     assert max(speeds) <= 0.3 + 1e-9
-    assert "; 1.5 m/s when this limit ends" in world.state.speed_limit
+    assert "; back to 1.5 m/s when this limit ends" in world.state.speed_limit
 
 
 @each(

@@ -290,7 +290,7 @@ def first_run(host: Host) -> None:
     host.drive()
     host.note(
         "late host",
-        r"^link late: this computer did not run for 0\.60 s",
+        r"^link late: this computer did not run the daemon for 0\.60 s",
         r"^missed periods: \d+ x missed",
         "^mode: driving -> waiting: this computer did not run",
         after=0.6,
@@ -315,11 +315,14 @@ def first_run(host: Host) -> None:
     host.drive()
     with host.world.mcu.battery(50.0, 0.6):
         host.drive_until("return")
-        host.note("low battery", "^battery: return: .*the mean is below battery.return_below = 30")
+        host.note(
+            "low battery",
+            "^battery: return: .*the mean of the last seconds is below battery.return_below = 30",
+        )
         host.drive_until("stop")
     host.note(
         "empty battery",
-        "^battery stop: .*the mean is below battery.stop_below = 10 %",
+        "^battery stop: .*the mean of the last seconds is below battery.stop_below = 10 %",
         r"^mode: driving -> stopped: battery below battery\.stop_below = 10 %",
         r"^drive: drove \d+\.\d\d m in \d+\.\d s \(by nav\)",
     )

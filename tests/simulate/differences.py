@@ -28,6 +28,7 @@ REWORDED: tuple[tuple[str, str], ...] = (
     ("nothing but zeros", "only zeros"),
     ("which sends only zeros", "which has sent only zeros"),
     ("is kept waiting", "must wait"),
+    (r", and no speed for ([\d.]+) s after it,", r", and then no speed for \1 s,"),
     (
         r"of a speed sends none: (.*) in (\S+) has tools that do",
         r"with a speed never sends a zero; the section \1 of \2 lists tools that send one",
@@ -75,8 +76,8 @@ REWORDED: tuple[tuple[str, str], ...] = (
     ("mend it, or switch", "repair the driver, or switch"),
     (
         "no motion leads away, so the robot stands until the release",
-        "no straight motion leads away from the pressed bumpers, so the robot stands until they "
-        "are released",
+        "no straight motion leads away from the pressed bumpers, so the robot stands still until "
+        "the bumpers are released",
     ),
     (": only straight", ": the robot drives only straight"),
     ("stopped at the start, because", "stopped when the daemon started, because"),
@@ -90,6 +91,12 @@ REWORDED: tuple[tuple[str, str], ...] = (
         r"what else runs here\? \(`top`; as a service it goes first\)",
         "the Linux command `top` shows which other program uses the processor; acsard has priority "
         "if it runs as the systemd service",
+    ),
+    ("this computer did not run for", "this computer did not run the daemon for"),
+    (
+        "the built-in simulator, a part of this program, is late",
+        "a fault in sim.faults silences the built-in simulator, or the simulator, which is a part "
+        "of the daemon, is late",
     ),
     ("and this daemon reads", "but this daemon reads format"),
     ("and heard nothing of the", "so it received nothing from the"),
@@ -127,7 +134,8 @@ REWORDED: tuple[tuple[str, str], ...] = (
     ("look at cable, ground and baud rate", "check the cable, the ground and the baud rate;"),
     (
         "if its lines are further apart than ours, say so by mcu.reply_period",
-        "if the board sends its lines less often than the daemon, set mcu.reply_period;",
+        "if the board reports by its own clock, set mcu.reply_period to the seconds between its "
+        "lines;",
     ),
     ("`acsard mcu check` looks closer", "`acsard mcu check` finds out more"),
     (
@@ -139,13 +147,13 @@ REWORDED: tuple[tuple[str, str], ...] = (
     (r"\b1 bytes received", "1 byte received"),
     ("lines heard, ", "lines received, "),
     (r"\b1 lines received", "1 line received"),
-    ("good, all good, but too few", "good, all of them good, but too few"),
-    ("received, all good, but too few", "received, all of them good, but too few"),
+    ("good, all good, but too few", "good, all of them good, but too few for a link"),
+    ("received, all good, but too few", "received, all of them good, but too few for a link"),
     (
-        "apart: too seldom for a link by any setting; firmware that reports by its own clock "
-        r"must do so every ([\d.]+) s or sooner",
-        "apart, which is too seldom for any setting; firmware that reports by its own clock must "
-        r"send a line at least every \1 s",
+        r"the microcontroller's lines come ([\d.]+) s apart: too seldom for a link by any setting; "
+        r"firmware that reports by its own clock must do so every ([\d.]+) s or sooner",
+        r"the microcontroller sends a line only every \1 s, and no value of mcu.reply_period "
+        r"allows that; firmware that reports by its own clock must send a line at least every \2 s",
     ),
     (
         "what is sent comes back: TX and RX are joined, or the terminal echoes, or the RS-485 "
@@ -153,7 +161,7 @@ REWORDED: tuple[tuple[str, str], ...] = (
         "then replug it",
         "the daemon's own lines come back: TX and RX are connected to each other, or a terminal or "
         "the RS-485 adapter echoes, or the board reports the commanded speeds instead of "
-        "the measured ones; fix that, then unplug the board and plug it in again",
+        "the measured ones; remove the cause, then unplug the board and plug it in again",
     ),
     (
         "answered with a check before and now does not: its replies are damaged on the way "

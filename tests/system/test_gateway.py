@@ -117,7 +117,7 @@ def test_a_new_certificate_is_used_and_the_daemon_runs_on(tmp_path: Path) -> Non
         with Bus(robot.daemon.endpoint) as bus:
             until(lambda: bus.count("gateway_opened") == 2, 5.0, "it is counted")
             # The new certificate of this test ends after half a day.
-            told = "ends in 0 days"
+            told = "expires in 0 days"
             until(lambda: bus.state()["certificate_expiry"] == told, 5.0, told)
 
 

@@ -252,7 +252,7 @@ def test_a_full_disk_and_a_certificate_that_ends_do_not_look_ready(tmp_path: Pat
         view = Robots(tmp_path, endpoint, daemons)
         said = {
             "full": "WARNING: recording fails; waiting for a command",
-            "ends": "WARNING: certificate ends in 10 days; waiting for a command",
+            "ends": "WARNING: certificate expires in 10 days; waiting for a command",
             "sound": "waiting for a command",
         }
 

@@ -124,7 +124,9 @@ def test_a_reload_gives_the_services_a_new_certificate_while_the_robot_drives(
     viewer = ("--connect", "tls/127.0.0.1:7449", "--tls", f"{TLS}/clients/viewer")
     words = (ACSARD, "get", "state", *viewer)
     until(
-        lambda: "ends in 9 days" in container.run(*words).out, 20.0, "the gateway uses the new one"
+        lambda: "expires in 9 days" in container.run(*words).out,
+        20.0,
+        "the gateway uses the new one",
     )
     for name in ("ca.pem", "certificate.pem", "key.pem"):
         assert container.run("cmp", f"{TLS}/{name}", f"/run/acsard/{name}").code == 0

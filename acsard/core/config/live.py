@@ -22,7 +22,7 @@ When = Literal["always", "raised", "rest"]
 
 WHEN: dict[When, str] = {
     "always": "at any time",
-    "raised": "raised at any time, lowered only while the robot stands",
+    "raised": "may be raised at any time, but lowered only while the robot stands",
     "rest": "only while the robot stands",
 }
 """Maps each `When` to words that say when such a setting may change.
@@ -48,10 +48,10 @@ LIVE: dict[str, Live] = {
     "limits.linear_acceleration": Live("always", "acceleration"),
     "limits.angular_acceleration": Live("always", "acceleration of a turn"),
     "limits.linear_deceleration": Live(
-        "raised", "deceleration to a slower command, and when the commands end"
+        "raised", "deceleration toward a slower command, and after the commands end"
     ),
     "limits.angular_deceleration": Live(
-        "raised", "deceleration of a turn to a slower command, and when the commands end"
+        "raised", "deceleration of a turn toward a slower command, and after the commands end"
     ),
     "limits.linear_stop_deceleration": Live("raised", "deceleration after a stop or a fault"),
     "limits.angular_stop_deceleration": Live(
@@ -62,7 +62,8 @@ LIVE: dict[str, Live] = {
     "limits.wheel_speed": Live("rest", "highest speed of any wheel"),
     "commands.neutral_pause": Live(
         "rest",
-        "time without a speed after the first zero, before a shared sender identity may drive",
+        "after its zero, a shared sender identity must send no speed for this time before it may "
+        "drive",
     ),
     "commands.sources.*.timeout": Live(
         "rest", "time without a command after which the robot stops following the source"
@@ -207,7 +208,8 @@ def _refusal(key: str, value: object, known: Mapping[str, object]) -> str:
     if key in known:
         return (
             f"{key} = {show(value)}: this key is read only when the daemon starts: change it in "
-            "acsard.toml and restart acsard (`acsard set` lists the keys that change at once)"
+            "acsard.toml and restart acsard (`acsard set` lists the keys that can change "
+            "without a restart)"
         )
     return f"{show(key)}: unknown key; {hint(key, known, '`acsard set` lists the settings')}"
 

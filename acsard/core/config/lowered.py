@@ -73,7 +73,10 @@ def _applied(config: Config, wishes: Mapping[str, object]) -> tuple[Config, list
     if not wishes:
         return config, []
     made, news = changed(config, wishes, at_rest=True)
-    return made, [Event("set", f"{news}: lowered before the restart, still in force", "warning")]
+    why = "it was lowered before the restart and stays lowered"
+    if len(wishes) > 1:
+        why = "they were lowered before the restart and stay lowered"
+    return made, [Event("set", f"{news}: {why}", "warning")]
 
 
 def _rank(name: str, value: float) -> float:

@@ -97,7 +97,7 @@ def named(text: str) -> NamedFault:
     if name in INPUTS and not min(fault.values) >= 0:
         raise ValueError(
             "give the seconds from the start to the fault, then the seconds that the fault lasts "
-            "(0: without end)"
+            "(0 means that it never ends)"
         )
     if name == "battery" and not (0 <= fault.values[0] <= 100 and fault.values[1] > 0):
         raise ValueError(

@@ -131,7 +131,8 @@ class SpeedLimiter:
             return ""
         setting = self._settings.limits.linear_speed
         return (
-            f"{self._limit.speed:.3g} m/s by {self._limit.by}; {setting:g} m/s when this limit ends"
+            f"{self._limit.speed:.3g} m/s, set by {self._limit.by}; back to {setting:g} m/s when "
+            "this limit ends"
         )
 
     def receive(self, arrival: Arrival, configured: float, refusals: list[Refusal]) -> None:

@@ -27,8 +27,11 @@ BUSY = (
     "it runs as the systemd service"
 )
 
-HOST = "this computer did not run for"
-SIMULATOR = "the built-in simulator, which is a part of this program, is late"
+HOST = "this computer did not run the daemon for"
+SIMULATOR = (
+    "a fault in sim.faults silences the built-in simulator, or the simulator, which is a part of "
+    "the daemon, is late"
+)
 
 PATIENCE_NS = 3 * NS_PER_S
 """Time without a link until the first diagnosis, ns. A board that is only booting answers within
@@ -57,7 +60,8 @@ LOOK_MENDS: dict[Look, str] = {
     "foreign": "is there noise on the cable, or does another program send on the cable too?",
     "garbage": "is mcu.baud_rate the baud rate of the board?",
     "few": "check the cable, the ground and the baud rate;",
-    "sparse": "if the board sends its lines less often than the daemon, set mcu.reply_period;",
+    "sparse": "if the board reports by its own clock, set mcu.reply_period to the seconds between "
+    "its lines;",
 }
 
 _RIGHT = re.compile(TOKENS)
@@ -128,7 +132,7 @@ class Lateness:
                 f"{BUSY}"
             )
         if link == "stale" and self._simulated:
-            return f"{SIMULATOR}, or a fault in sim.faults silences it: {BUSY}"
+            return f"{SIMULATOR}: {BUSY}"
         return WORDS[link]
 
 
@@ -146,7 +150,7 @@ class Heard(Struct):
     last: bytes = b""
     """The last bad line, or the last received bytes if no line has ended yet."""
     late_s: float = 0.0
-    """Longest time in the interval in which this computer did not run and received nothing, s."""
+    """Longest time in the interval in which this computer did not run the daemon, s."""
 
     def take(self, data: bytes) -> None:
         """Add received bytes. Call this method before `line` adds the lines in these bytes."""
@@ -190,7 +194,7 @@ class Heard(Struct):
         if self.good:
             good, which = f"only {self.good} good", "last bad one"
             if self.good == self.lines:
-                good = "all of them good, but too few"
+                good = "all of them good, but too few for a link"
         bad = printable_bytes(self.last, SHOWN)
         last = f", the {which} is `{bad}`" if self.good < self.lines else ""
         return f"{many(self.lines, 'line')} received, {good}{last}"
@@ -220,18 +224,21 @@ class SilenceDiagnosis:
         The caller does this if the link is up, if the output is blocked, or if the port was opened
         or closed.
         """
-        if self._since_ns is not None:
-            self.heard, self.now, self._since_ns = None, Heard(), None
+        self.heard, self.now, self._since_ns = None, Heard(), None
 
-    def judge(self, now_ns: int) -> bool:
+    def judge(self, now_ns: int, late_s: float = 0.0) -> bool:
         """Process a control step without a link.
 
-        Such steps are divided into intervals of 3 s (`PATIENCE_NS`). Return True if this step ends
-        the first interval, or an interval whose class of received bytes (`Look`) differs from that
-        of the interval before.
+        `late_s` is the time since the step before, s, if this step is late; otherwise 0. Steps
+        without a link are divided into intervals of 3 s (`PATIENCE_NS`). Return True if this step
+        ends the first interval, or an interval whose class of received bytes (`Look`) differs from
+        that of the interval before.
         """
         if self._since_ns is None:
+            # The interval begins with this step, so the time before it does not belong to it.
             self._since_ns = now_ns
+        else:
+            self.now.late_s = max(self.now.late_s, late_s)
         if now_ns - self._since_ns < PATIENCE_NS:
             return False
         before, self.heard = self.heard, self.now
@@ -323,13 +330,16 @@ def words(
 
 def _sparse(sparse_s: float, longest_reply: float) -> str:
     apart = f"{sparse_s:.2f}"
-    told = f"the microcontroller's lines come {apart} s apart"
     if float(apart) > longest_reply:
         return (
-            f"{told}, which is too seldom for any setting; firmware that reports by its own "
-            f"clock must send a line at least every {longest_reply:g} s"
+            f"the microcontroller sends a line only every {apart} s, and no value of "
+            "mcu.reply_period allows that; firmware that reports by its own clock must send a line "
+            f"at least every {longest_reply:g} s"
         )
-    return f"{told}; if it reports by its own clock, set mcu.reply_period = {apart}"
+    return (
+        f"the microcontroller's lines come {apart} s apart; if it reports by its own clock, set "
+        f"mcu.reply_period = {apart}"
+    )
 
 
 def check_event(check: Negotiation, wants_samples: bool) -> Event:
@@ -339,9 +349,9 @@ def check_event(check: Negotiation, wants_samples: bool) -> Event:
     and the board does not send its encoder counts.
     """
     fallen = check.state == "plain" or (wants_samples and check.state == "checked")
-    text = f"the form of the lines on the serial port is now {check.in_force}"
+    text = f"the lines on the serial port are now {check.in_force}"
     if check.state == "plain":
-        text += ": the microcontroller answers without a checksum"
+        text += ", because the microcontroller answers without a checksum"
     elif fallen:
         text += ", but the microcontroller does not send encoder counts"
     return Event("link_check", text, "warning" if fallen else "info")

@@ -88,7 +88,7 @@ MENDS: dict[Trouble, str] = {
     "": "",
     "echo": "the daemon's own lines come back: TX and RX are connected to each other, or a "
     "terminal or the RS-485 adapter echoes, or the board reports the commanded speeds "
-    "instead of the measured ones; fix that, then unplug the board and plug it in again",
+    "instead of the measured ones; remove the cause, then unplug the board and plug it in again",
     "forgotten": "the microcontroller answered with a checksum before and now answers without "
     "one: either its replies are damaged (check cable and baud rate), or it runs other "
     "firmware (then unplug it and plug it in again)",

@@ -168,9 +168,6 @@ class McuSession:
                 self._bad()
             if self.lateness.look(now.mono_ns, good=bool(feedback)):
                 self._link.excuse()
-            if self.lateness.step_s:
-                heard = self._hearing.now
-                heard.late_s = max(heard.late_s, self.lateness.step_s)
             self._judge(now.mono_ns)
         if self._rejected:
             self._announce_rejects()
@@ -315,7 +312,7 @@ class McuSession:
             check.judge(now_ns)
         if up or self.blocked:
             self._hearing.forget()
-        elif self._hearing.judge(now_ns):
+        elif self._hearing.judge(now_ns, self.lateness.step_s):
             self.events.append(Event(NAMES[self.link], self.words(), "warning"))
 
     def _reject(self, reason: str, line: bytes = b"", more: int = 1) -> None:

@@ -22,7 +22,7 @@ def expiry(ends: Mapping[str, int], now_ns: int) -> tuple[int, str]:
     if not ends:
         return (
             1,
-            "unknown: the TLS gateway does not run, or the library that reads "
+            "unknown, because the TLS gateway does not run, or the library that reads "
             "certificates is missing (`acsard doctor` says which)",
         )
     whose, ends_ns = first(ends)
@@ -31,7 +31,7 @@ def expiry(ends: Mapping[str, int], now_ns: int) -> tuple[int, str]:
     if days < 0:
         return 2, f"expired {-days:.0f} days ago{of}: TLS refuses every client"
     if days < EXPIRY_DAYS:
-        return 1, f"ends in {days:.0f} days{of}"
+        return 1, f"expires in {days:.0f} days{of}"
     return 0, f"valid for {days:.0f} days{of}"
 
 

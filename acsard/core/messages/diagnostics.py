@@ -257,9 +257,9 @@ def _routers(endpoints: Sequence[str], routers: RoutersStatus) -> list[Row]:
     missing, peers = routers.missing, routers.peers
     values = dict.fromkeys(endpoints, NOT_YET) | dict.fromkeys(routers.connected, "connected")
     values |= dict.fromkeys(missing, "not connected") | dict.fromkeys(peers, NO_ROUTER)
-    words = f"not connected to {', '.join(missing)}" if missing else "connected"
-    if NOT_YET in values.values():
-        words = NOT_YET
+    words = NOT_YET if NOT_YET in values.values() else "connected"
+    if missing:
+        words = f"not connected to {', '.join(missing)}"
     if peers:
         words += (
             f"; {', '.join(peers)} is not a router: clients that connect to this daemon see only "

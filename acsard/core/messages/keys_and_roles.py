@@ -84,16 +84,16 @@ SERVICES: dict[Verb, Service] = {
     "stop": Service("viewer", "stop the robot; it stays stopped until srv/clear is called"),
     "clear": Service(
         "operator",
-        "clear the fault if there is one, else the stop; {latch} in the payload is the number of "
-        "the fault or stop",
+        "clear the fault if there is one, else the stop; the payload {latch} names the fault or "
+        "stop to release",
         "Release",
         '{"latch": 1800000000000}',
         optional=True,
     ),
     "activate": Service(
         "operator",
-        "switch the robot on, so that it follows commands; {latch} in the payload is the number "
-        "of the latch to release",
+        "switch the robot on, so that it follows commands; the payload {latch} names the latch "
+        "to release",
         "Release",
         '{"latch": 1800000000000}',
         optional=True,
@@ -205,7 +205,10 @@ TOPICS: tuple[Topic, ...] = (
     ),
     _out("wheel_states", "JointState", "every feedback", "wheel angles and speeds"),
     _out("battery", "Battery", "1 Hz, on change", "voltage, current and state of charge"),
-    _out("cmd_vel_out", "TwistStamped", "every period", "the twist in force after all limits"),
+    _out(
+        "cmd_vel_out", "TwistStamped", "every control period",
+        "the twist that the daemon applies after all limits",
+    ),
     _out("state", "RobotState", "10 Hz, on change", "mode, reason, pose, link, counters"),
     _out("diagnostics", "DiagnosticArray", "1 Hz, on change", "health of every part"),
     _out("events", "Events", "on change", "the last 20 events with time, text and caller"),
@@ -213,7 +216,10 @@ TOPICS: tuple[Topic, ...] = (
         "sim/pose", "PoseStamped", "100 Hz", "the true pose, only with the simulator",
         simulated=True,
     ),
-    _out(json_key("<key>"), "JSON", "as the key", "each published key as JSON, for subscribers"),
+    _out(
+        json_key("<key>"), "JSON", "at the rate of the key",
+        "each published key as JSON, for subscribers",
+    ),
     _command("cmd/<source>", "Twist or TwistStamped", "velocity command of a source", local=True),
     _command("wheel_cmd/<source>", "JointState", "wheel speeds that a source commands", local=True),
     _command("cmd/<source>/<certificate>", "Twist or TwistStamped", "cmd/<source> over TLS"),

@@ -7,6 +7,7 @@ read the same facts from the fields of the message `state`.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from typing import Literal, get_args
 
@@ -82,9 +83,9 @@ def _warnings(state: RobotState) -> Iterator[StateWarning]:
         yield StateWarning("battery", f"{words} ({left})" if left else words)
     expiry = state.certificate_expiry
     if expiry and not expiry.startswith("valid"):
-        brief = expiry.partition(":")[0].partition(" (")[0]
+        brief = re.split(r"[:,]| \(", expiry, maxsplit=1)[0]
         yield StateWarning(
-            "certificate", f"certificate {brief}", expiry.removeprefix(brief).strip()
+            "certificate", f"certificate {brief}", expiry.removeprefix(brief).lstrip(":, ")
         )
     if state.recording_error:
         yield StateWarning("recording", "recording fails", state.recording_error)

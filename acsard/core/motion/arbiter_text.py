@@ -58,10 +58,10 @@ def waiting(wait: Wait) -> str:
                 "network, then restart the sender"
             )
         case "stalled":
-            return f"the daemon stood still: waiting for the next command of {wait.source}"
+            return f"the daemon stalled: waiting for the next command of {wait.source}"
         case "neutral":
             lasts = f"; it has sent speeds for over {lasting(wait.lasts)}" if wait.lasts else ""
-            alone = f", and no speed for {wait.seconds:g} s after it," if wait.shared else ""
+            alone = f", and then no speed for {wait.seconds:g} s," if wait.shared else ""
             return (
                 f"send a zero first: {wait.source} must send a zero{alone} before it can drive"
                 f"{lasts}{ROS_NEVER if wait.ros else ''}"

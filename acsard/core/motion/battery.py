@@ -62,11 +62,12 @@ def words(config: BatteryConfig, status: BatteryStatus) -> str:
     if level == "ok":
         return shown
     if level != "unknown":
-        return f"{shown}; the mean is below {_threshold(config, level)}"
+        return f"{shown}; the mean of the last seconds is below {_threshold(config, level)}"
     if getattr(status, config.measure) is None:
         lacks = "voltage" if config.measure == "volts" else "charge"
         return f'{shown}; battery.measure = "{config.measure}", but the board reports no {lacks}'
-    return f"{shown}; the level is known after {SETTLE_S:g} s of reports"
+    settled = f"the board has reported for at least {SETTLE_S:g} s"
+    return f"{shown}; the level is not known until {settled}"
 
 
 def _threshold(config: BatteryConfig, level: BatteryLevel) -> str:

@@ -105,7 +105,7 @@ class Bumpers(BoardInput):
         if allowed is None:
             return (
                 f"{self.why}: no straight motion leads away from the pressed bumpers, so the robot "
-                "stands until they are released"
+                "stands still until the bumpers are released"
             )
         return f"{self.why}: the robot drives only straight {allowed}, at most {AWAY_SPEED:g} m/s"
 

@@ -66,8 +66,8 @@ WORDS: dict[GyroDoes, str] = {
     "waiting for rest": "the gyro's bias is not known yet: the robot must stand for "
     f"{REST_S + KNOWN_S:.1f} s",
     "used": "the heading comes from the gyro",
-    "silent": "the gyro is silent: the heading comes from the wheels alone",
-    "disagrees": "the wheels slip: the gyro measures a different turn than the wheels",
+    "silent": "the gyro is silent: the heading comes from the wheels",
+    "disagrees": "the wheels seem to slip: the gyro measures a different turn than the wheels",
     "reversed": "the gyro is not used, because it reports a left turn of the robot as a right "
     "turn: check how the gyro is mounted",
     "in degrees": "the gyro is not used, because its rate is 57 times too high: it sends degrees "

@@ -32,9 +32,9 @@ only above the lower bound times this factor and below the upper bound divided b
 Without this margin, a track near a bound could go in and out of use again and again."""
 
 NOTES: dict[TrackUse, str] = {
-    "shown": "(only shown)",
+    "shown": "(only reported)",
     "uncertain": "(uncertain)",
-    "too far off": "(too far off)",
+    "too far off": "(implausible)",
     "used": "(in use)",
 }
 

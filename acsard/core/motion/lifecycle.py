@@ -155,7 +155,10 @@ class Lifecycle:
         if self._shutting_down:
             return f"stopped and latched; {GOING_DOWN}"
         if self.latches.fault is not None:
-            return "stopped and latched; call srv/clear twice: for the fault, then for the stop"
+            return (
+                "stopped and latched; call srv/clear twice: the first call releases the fault, the "
+                "second the stop"
+            )
         return "stopped and latched; srv/clear releases it"
 
     def clear(self, number: int | None, asked_ns: int, now: Instant) -> str:
@@ -360,8 +363,9 @@ def number_after_restart(kept: int, now: Instant) -> int:
 
 def _not_in_force(number: int, still: str, call: str) -> str:
     return (
-        f"this call names latch {number}, but {call} would release another one; the robot is still "
-        f"{still}: look at the robot, then call {call} again with the present `latch` in `state`"
+        f"this call names latch {number}, but {call} would release another latch; the robot is "
+        f"still {still}: look at the robot, then call {call} again with the present `latch` in "
+        "`state`"
     )
 
 

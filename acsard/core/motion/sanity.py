@@ -155,9 +155,9 @@ class Sanity:
     def _words(self, why: str) -> str:
         return (
             f"{self._dropped} of {self._lines} lines were dropped, because no wheel can do "
-            f"what they report; the last: {why}. If a wheel really does that, raise that setting. "
-            "Otherwise lines arrive damaged: check cable and ground; firmware that supports "
-            'mcu.link_check = "auto" protects each line with a checksum'
+            f"what they report; the last: {why}. If a wheel really does that, raise the setting "
+            "named above. Otherwise lines arrive damaged: check cable and ground; firmware that "
+            'supports mcu.link_check = "auto" protects each line with a checksum'
         )
 
     def _too_fast(self, line: Feedback) -> str:

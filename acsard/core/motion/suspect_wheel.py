@@ -58,7 +58,7 @@ speed may be healthy while the other wheel slips."""
 WheelFault = Literal["dead", "reversed", "stuck"]
 
 WORDS: dict[WheelFault, str] = {
-    "dead": "reports that it stands while the other wheel on its side turns",
+    "dead": "reports no motion while the other wheel on its side turns",
     "reversed": "reports the opposite direction to the other wheel on its side",
     "stuck": "reports a speed that never changes",
 }

@@ -83,7 +83,7 @@ def _described(name: str, type_of: int) -> ParameterDescriptor:
         name,
         type_of,
         words if row is None else f"{row.what}: {words}",
-        "only in acsard.toml, then restart the daemon" if row is None else WHEN[row.when],
+        "change it in acsard.toml, then restart the daemon" if row is None else WHEN[row.when],
         read_only=row is None,
         floating_point_range=floats,
         integer_range=whole,

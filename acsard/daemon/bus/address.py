@@ -90,7 +90,7 @@ def require_id(robot_id: str) -> None:
     except ValidationError:
         raise UsageError(
             f"{robot_id!r} is not a robot's id: an id has 1 to 32 characters of A-Z a-z 0-9 _ -; "
-            "write the value of robot.id in the robot's acsard.toml"
+            "the id must equal robot.id in the robot's acsard.toml"
         ) from None
 
 

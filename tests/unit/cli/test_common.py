@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from acsard.cli import main, parser
-from acsard.cli.common import OPTIONS, load, recorded
+from acsard.cli.common import OPTIONS, count, load, recorded
 from acsard.cli.connection import require_asked, require_followed, robot_address
 from acsard.cli.run import options
 from acsard.core.config.parsing import parse
@@ -339,3 +339,11 @@ def test_write_leaves_the_reference_file_of_a_clone_as_git_has_it(
         writable(str(places.here) if named else None)
     (clone / "robot.toml").write_text("")
     assert writable("robot.toml") == Path("robot.toml")
+
+
+@each("text", ["x", "", "0", "-1", "1.5", "²"])
+def test_a_count_that_is_none_is_refused_with_what_to_write(text: str) -> None:
+    assert count("12") == 12
+    with pytest.raises(argparse.ArgumentTypeError) as raised:
+        count(text)
+    assert str(raised.value) == f"{text} is not a whole number of at least 1"

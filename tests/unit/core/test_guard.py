@@ -55,7 +55,9 @@ STOP = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
 NOT_A_LINE = "the line is not complete, or does not have four wheel speeds"
 TOO_FAST = "the line moves a wheel faster than limits.wheel_speed"
 NO_LINK = "the line moves a wheel while the serial link is not up"
-GROWS = "the line speeds up a wheel without a fresh command, or not in mode driving"
+GROWS = (
+    "the line speeds up a wheel although no command is fresh, or although the mode is not driving"
+)
 LATE = "the line still moves a wheel although the longest ramp to zero has ended"
 
 

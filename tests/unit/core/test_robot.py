@@ -1194,7 +1194,7 @@ def test_a_silent_mcu_is_rest_after_quiet() -> None:
         assert bench.step(GO).applied == GO
     out = bench.step(GO)
     assert (out.applied, out.link, out.mode) == (REST, "stale", "waiting")
-    assert out.reason.startswith("the built-in simulator, which is a part of this program, is late")
+    assert out.reason.startswith("a fault in sim.faults silences the built-in simulator, or")
 
 
 def test_without_feedback_only_zero_lines_go_out_ten_times_a_second() -> None:
@@ -1514,7 +1514,7 @@ def test_after_a_silence_a_line_that_the_next_one_refutes_is_rejected() -> None:
     bench = silence(Bench().linked(), 40.0)
     assert list(bench.out.estimates) == []
     (event,) = [event for event in bench.step().events if event.name == "lines_rejected"]
-    assert event.text == "implausible: the lines after it contradict its speeds"
+    assert event.text == "implausible: later lines contradict the speeds of this line"
     (estimate,) = bench.out.estimates
     assert (estimate.pose, estimate.speeds) == (Pose(), STILL)
     assert bench.counters()["line_implausible"] == 1
@@ -1855,7 +1855,9 @@ def test_a_lowered_limit_holds_after_a_restart_and_an_event_says_so() -> None:
     bench = Bench(latches=Latches(lowered=SLOW))
     (event,) = bench.out.events
     assert (event.name, event.level) == ("set", "warning")
-    text = "limits.linear_speed = 0.3 (was 1.0): lowered before the restart, still in force"
+    text = (
+        "limits.linear_speed = 0.3 (was 1.0): it was lowered before the restart and stays lowered"
+    )
     assert event.text == text
     bench.driving(Twist(1.0, 0.0), steps=100)
     assert bench.out.applied == Twist(0.3, 0.0)

@@ -60,7 +60,7 @@ def test_the_robots_own_certificate_is_renewed_as_printed(
 ) -> None:
     Authority.load(fleet, str).issue(fleet, "robot", ["localhost"], 9.9)
     told = finding(fleet)
-    assert (told.level, told.text) == ("warning", f"{fleet}: ends in 10 days")
+    assert (told.level, told.text) == ("warning", f"{fleet}: expires in 10 days")
     typed(told.mend, fleet, monkeypatch)
     assert finding(fleet).level == "ok"
 
@@ -95,7 +95,7 @@ def test_the_advice_about_an_authority_makes_a_new_one(
     directory = tmp_path / "fleet"
     Authority.make(directory, "fleet", 2).issue(directory, "robot", [], 700)
     told = finding(directory)
-    assert told.text == f"{directory}: ends in 10 days (certificate of the authority)"
+    assert told.text == f"{directory}: expires in 10 days (certificate of the authority)"
     typed(told.mend, directory, monkeypatch)
     assert finding(directory).level == "ok"
 
@@ -118,7 +118,7 @@ def test_the_end_of_each_router_that_answers_is_a_finding(
     )
     (told,) = router_certificates(Config(bus=bus))
     assert (told.subject, told.level) == ("router", "warning")
-    assert told.text == "ends in 9 days (certificate of the router tls/router.local:7447)"
+    assert told.text == "expires in 9 days (certificate of the router tls/router.local:7447)"
     assert "--name router.local" in told.mend
 
 

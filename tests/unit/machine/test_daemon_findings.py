@@ -235,7 +235,7 @@ CONFIG = Config(mcu=McuConfig(port="/dev/ttyX"))
     ],
 )
 def test_a_certificate_in_use_that_ends_is_a_warning_with_its_mend(here: bool, mend: str) -> None:
-    words = "ends in 9 days (certificate of the router tls/router.local:7447)"
+    words = "expires in 9 days (certificate of the router tls/router.local:7447)"
     row = DiagnosticStatus(1, "acsard: certificate", words, "acsar", [])
     (told,) = certificate(row, here)
     assert (told.subject, told.level) == ("certificates", "warning")
@@ -315,7 +315,7 @@ def test_a_link_that_went_because_this_computer_was_late_is_not_blamed_on_the_bo
     (sim,) = link(Running(INFO, Config(), STATE, states, 0))
     assert "the daemon's computer" in sim.text
     assert "mcu check" not in sim.mend
-    why = "this computer did not run for 0.80 s, and heard nothing"
+    why = "this computer did not run the daemon for 0.80 s, and heard nothing"
     (finding,) = found({}, {}, link="stale", mode="waiting", reason=why)
     assert why in finding.text
     assert "mcu check" not in finding.mend
@@ -385,9 +385,10 @@ THRESHOLDS = BatteryConfig(warning_below=22.0, stop_below=21.0)
     [
         (BatterySummary(24.0, 80.0, -1.0, "ok"), "ok", "24.00 V, 80 %, -1.00 A", ""),
         (BatterySummary(21.5, None, None, "warning"), "warning",
-         "21.50 V; the mean is below battery.warning_below = 22 V", "charge it"),
+         "21.50 V; the mean of the last seconds is below battery.warning_below = 22 V",
+         "charge it"),
         (BatterySummary(20.5, None, None, "stop"), "failure",
-         "20.50 V; the mean is below battery.stop_below = 21 V",
+         "20.50 V; the mean of the last seconds is below battery.stop_below = 21 V",
          "charge the battery to 21.5 V, then `acsard call clear`"),
         (BatterySummary(None, None, None, "unknown"), "warning",
          "the board has not reported its battery for 5 s", CHECK),

@@ -234,7 +234,9 @@ def test_a_link_that_is_lost_briefly_has_the_reason_of_its_event_only() -> None:
     entries = [entry for entry in story(tape) if entry.name in ("reason", "link_late", "mode")]
     late = next(n for n, entry in enumerate(entries) if entry.name == "link_late")
     lost, back = entries[late + 1 : late + 3]
-    assert lost.text.startswith("driving -> waiting: this computer did not run for 0.60 s")
+    assert lost.text.startswith(
+        "driving -> waiting: this computer did not run the daemon for 0.60 s"
+    )
     assert back.text.startswith("waiting -> ready")
 
 
@@ -311,7 +313,7 @@ def test_a_host_stall_is_not_called_a_silence_of_the_board() -> None:
     told = [one for one in story(tape) if one.name in ("link_stale", "link_late")]
     late, stale = told
     assert (late.name, stale.name) == ("link_late", "link_stale")
-    assert late.text.startswith("this computer did not run for 0.2")
+    assert late.text.startswith("this computer did not run the daemon for 0.2")
     assert summary(told) == "1 computer stall, 1 board silence"
 
 

@@ -88,7 +88,9 @@ def test_a_battery_stop_is_counted_and_listed_and_drawn_on_the_path() -> None:
     origin = Origin("a.mcap", "r2", "0.1.0", "3.11.0")
     table = dict(rows(report, origin, lambda s, day: f"<{s:.0f}>"))
     assert table["Battery stops"].startswith("1: <1800000003> ")
-    assert "the mean is below battery.stop_below = 21 V" in table["Battery stops"]
+    assert (
+        "the mean of the last seconds is below battery.stop_below = 21 V" in table["Battery stops"]
+    )
     assert "battery stop" in {key.meaning for key in path_figure(report).keys}
 
 

@@ -46,7 +46,7 @@ FULL = "the disk is full: nothing is recorded"
     ("wrong", "brief"),
     [
         ({"recording_error": FULL}, "recording fails"),
-        ({"certificate_expiry": "ends in 10 days"}, "certificate ends in 10 days"),
+        ({"certificate_expiry": "expires in 10 days"}, "certificate expires in 10 days"),
         ({"latch_file_error": "no room"}, "latch file fails"),
         ({"wheel_fault": "rear left wheel is left out"}, "wheel fault"),
         ({"settings_differ": DIFFER}, "settings differ"),
@@ -81,14 +81,26 @@ def test_the_column_of_the_battery_is_there_if_a_robot_has_one() -> None:
 
 
 def test_the_words_of_each_warning_follow_all_of_them() -> None:
-    expiry = "ends in 10 days (certificate of the authority)"
+    expiry = "expires in 10 days (certificate of the authority)"
     state = replace(READY, recording_error=FULL, certificate_expiry=expiry, settings_differ=DIFFER)
     (_, line) = table([replace(ROW, state=state)], 300)
     assert line.endswith(
-        "WARNING: certificate ends in 10 days, recording fails, settings differ; waiting for a "
+        "WARNING: certificate expires in 10 days, recording fails, settings differ; waiting for a "
         "command; certificate: (certificate of the authority); "
         f"recording: {FULL}; settings: {DIFFER}"
     )
+
+
+def test_the_details_of_a_certificate_follow_its_warning_without_a_second_colon() -> None:
+    unknown, refused = "unknown, because the gateway does not run", "expired 2 days ago: refused"
+    for expiry, told in {
+        unknown: "WARNING: certificate unknown; waiting for a command; certificate: because the "
+        "gateway does not run",
+        refused: "WARNING: certificate expired 2 days ago; waiting for a command; certificate: "
+        "refused",
+    }.items():
+        (_, line) = table([replace(ROW, state=replace(READY, certificate_expiry=expiry))], 300)
+        assert line.endswith(told)
 
 
 def test_the_reason_of_a_fault_comes_before_the_warnings() -> None:
@@ -116,8 +128,8 @@ def test_a_narrow_terminal_lacks_the_version_first() -> None:
 
 
 def test_the_speed_limit_that_slows_a_robot_is_shown() -> None:
-    (_, line) = table([replace(ROW, state=replace(STATE, speed_limit="0.3 m/s by x"))], 160)
-    assert line.endswith("; speed limit: 0.3 m/s by x")
+    (_, line) = table([replace(ROW, state=replace(STATE, speed_limit="0.3 m/s, set by x"))], 160)
+    assert line.endswith("; speed limit: 0.3 m/s, set by x")
 
 
 def test_without_feedback_no_speed_is_shown() -> None:

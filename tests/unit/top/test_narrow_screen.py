@@ -18,7 +18,7 @@ FULL = of(
     mode="waiting",
     reason=REASON,
     refused="source nav: the twist contains NaN or infinity",
-    certificate_expiry="ends in 12 days",
+    certificate_expiry="expires in 12 days",
     gyro="used",
     effective_track="learned 1.603 ± 0.032 (in use), configured 1.000",
     counters=STATE.counters
@@ -37,7 +37,7 @@ def test_every_figure_is_on_a_screen_of_any_width(width: int) -> None:
         "WAITING", REASON, "x +1.250 m", "y -0.500 m", "yaw +57.3°", "forward +0.500 m/s",
         "turn -0.600 rad/s", "+12.00", "+8.00", "+12.50", "-7.50", "100 never", "50 0.0 s",
         "10 3.0 s", "app has priority: wait until it is silent", "link up",
-        "ends in 12 days", "in 100.0/s of 1,300", "out 100.0/s of 1,301", "superseded 12,345",
+        "expires in 12 days", "in 100.0/s of 1,300", "out 100.0/s of 1,301", "superseded 12,345",
         "20.0/s of 220", "missed periods 3", "bus overrun 7", "malformed 30", "stale 4",
         "the twist contains NaN or infinity", "gyro used",
         "track learned 1.603 ± 0.032 (in use), configured 1.000",

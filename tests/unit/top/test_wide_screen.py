@@ -111,7 +111,7 @@ def test_what_the_gyro_does_is_told_where_there_is_one(does: str) -> None:
 
 
 def test_the_track_that_was_learned_stands_beside_the_configured_one() -> None:
-    told = "learned 1.603 ± 0.032 (only shown), configured 1.000 (in use)"
+    told = "learned 1.603 ± 0.032 (only reported), configured 1.000 (in use)"
     assert line_with("track", of(gyro="used", effective_track=told)).split(maxsplit=1)[1] == told
     assert not any("track" in line for line in lines_of(of(gyro="used")))
 

@@ -64,7 +64,7 @@ def test_without_feedback_no_speed_is_reported() -> None:
 
 def test_what_ends_a_robot_quietly_is_a_sample_of_its_own() -> None:
     own = ("robot", "acsar")
-    ends = replace(STATE, certificate_expiry="ends in 10 days", certificate_days=10.0)
+    ends = replace(STATE, certificate_expiry="expires in 10 days", certificate_days=10.0)
     got = parsed(text("acsar", "0.1.0+g1a2b3c4d5", ends, True, 0, {}, {}))
     assert got["acsard_info", frozenset({own, ("version", "0.1.0+g1a2b3c4d5")})] == 1
     warned = {dict(labels)["what"]: n for (name, labels), n in got.items() if "warning" in name}

@@ -67,7 +67,15 @@ def test_a_limit_that_contradicts_the_rest_is_dropped_and_an_event_names_it() ->
     assert dropped.text.startswith(
         "limits.linear_acceleration was lowered to 0.001 before the restart. "
     )
-    assert (
-        used.text
-        == "limits.angular_speed = 2.0 (was 4.0): lowered before the restart, still in force"
+    assert used.text == (
+        "limits.angular_speed = 2.0 (was 4.0): it was lowered before the restart and stays lowered"
+    )
+
+
+def test_several_limits_that_stay_lowered_are_reported_together() -> None:
+    kept = {"limits.linear_speed": 0.5, "limits.angular_speed": 2.0}
+    _, (event,) = with_lowered(Config(), kept)
+    assert event.text == (
+        "limits.linear_speed = 0.5 (was 1.0), limits.angular_speed = 2.0 (was 4.0): they were "
+        "lowered before the restart and stay lowered"
     )

@@ -154,7 +154,8 @@ def test_a_limit_lowers_the_setting_and_its_end_brings_the_setting_back() -> Non
     robot.step()
     assert robot.speed == 0.3
     assert (
-        robot.limiter.text == "0.3 m/s by speed_limit, unnamed (native); 1 m/s when this limit ends"
+        robot.limiter.text
+        == "0.3 m/s, set by speed_limit, unnamed (native); back to 1 m/s when this limit ends"
     )
     robot.limit(0.0)
     robot.step()

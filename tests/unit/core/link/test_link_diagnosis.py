@@ -5,6 +5,8 @@ A link that loses lines is reported once, in whichever direction they are lost.
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from acsard.core.config.settings import McuConfig
@@ -49,7 +51,7 @@ HEARD: dict[str, tuple[bytes, Look, str]] = {
     "some good": (
         STILL + b"ap?\r\n", "few", "2 lines received, only 1 good, the last bad one is `ap?`"
     ),
-    "all good": (STILL * 2, "sparse", "2 lines received, all of them good, but too few"),
+    "all good": (STILL * 2, "sparse", "2 lines received, all of them good, but too few for a link"),
 }  # fmt: skip
 
 
@@ -72,8 +74,8 @@ def test_a_link_that_fell_silent_says_so_first_and_then_what_is_heard() -> None:
     for _ in range(20):
         bench.wait(10)
     assert bench.session.words().startswith(
-        "the built-in simulator, which is a part of this program, is late, or a fault in "
-        "sim.faults silences it: "
+        "a fault in sim.faults silences the built-in simulator, or the simulator, which is a part "
+        "of the daemon, is late: "
     )
     for _ in range(302):
         bench.wait(10)
@@ -83,10 +85,10 @@ def test_a_link_that_fell_silent_says_so_first_and_then_what_is_heard() -> None:
 @pytest.mark.parametrize(
     ("apart", "longest", "told", "untold"),
     [
-        (20, 0.25, "set mcu.reply_period = 0.20", "seldom"),
-        (20, 0.15, "at least every 0.15 s", "mcu.reply_period"),
-        (74, 0.25, "at least every 0.25 s", "mcu.reply_period"),
-        (136, 0.25, "at least every 0.25 s", "mcu.reply_period"),
+        (20, 0.25, "set mcu.reply_period = 0.20", "no value"),
+        (20, 0.15, "at least every 0.15 s", "set mcu.reply_period"),
+        (74, 0.25, "at least every 0.25 s", "set mcu.reply_period"),
+        (136, 0.25, "at least every 0.25 s", "set mcu.reply_period"),
     ],
 )
 def test_lines_too_far_apart_are_reported_and_no_setting_that_would_be_refused(
@@ -95,9 +97,11 @@ def test_lines_too_far_apart_are_reported_and_no_setting_that_would_be_refused(
     bench = Bench(McuConfig(port="/dev/board"), longest_reply=longest).open()
     for tick in range(600):
         bench.wait(10, *([] if tick % apart else [GOOD]))
-    assert f"lines come {apart / 100:.2f} s apart" in bench.session.words()
-    assert told in bench.session.words()
-    assert untold not in bench.session.words()
+    words = bench.session.words()
+    seconds = f"{apart / 100:.2f} s"
+    assert re.search(rf"lines come {seconds} apart|a line only every {seconds}", words)
+    assert told in words
+    assert untold not in words
 
 
 def test_one_silence_is_no_clock_of_the_boards_own() -> None:
@@ -143,7 +147,7 @@ def test_a_board_that_does_not_answer_steps_in_time_is_silent() -> None:
 def test_a_host_stall_is_reported_with_its_length() -> None:
     for steps in ((800,), (10, 800, 10), (60, 800)):
         told = after(*steps).words("stale")
-        assert told.startswith("this computer did not run for 0.80 s")
+        assert told.startswith("this computer did not run the daemon for 0.80 s")
         assert "which other program" in told
 
 
@@ -203,6 +207,51 @@ def test_it_is_told_after_three_seconds_and_again_only_when_it_looks_otherwise()
     hearing.forget()
     assert hearing.heard is None
     assert not hearing.judge(10 * PATIENCE_NS)
+
+
+def sparse(bench: Bench) -> Heard:
+    """Return the first diagnosis of a board that sends three good lines and then nothing."""
+    for tick in range(3 * 100 + 2):
+        bench.wait(10, *([GOOD] if tick % 20 == 1 and tick < 50 else []))
+    found = bench.session._hearing.heard
+    assert found is not None
+    assert found.looks == "sparse"
+    return found
+
+
+def test_a_stall_while_the_link_was_up_does_not_explain_the_sparse_lines_of_later() -> None:
+    bench = Bench(McuConfig(port="/dev/board")).up()
+    bench.wait(2000, GOOD * 3)
+    for _ in range(500):
+        bench.wait(10, GOOD)
+    assert bench.link() == "up"
+    for _ in range(11):
+        bench.wait(10)
+    assert bench.link() == "stale"
+    assert "did not run" not in sparse(bench).words
+
+
+def test_a_closed_port_is_no_stall_of_this_computer() -> None:
+    bench = Bench(McuConfig(port="/dev/board")).up().close()
+    for _ in range(500):
+        bench.wait(10)
+    assert "did not run" not in sparse(bench.open()).words
+
+
+def test_a_stall_within_the_time_of_the_sparse_lines_explains_them() -> None:
+    bench = Bench(McuConfig(port="/dev/board")).open()
+    bench.wait(10)
+    bench.wait(800)
+    found = sparse(bench)
+    assert found.words.startswith("this computer did not run the daemon for 0.80 s")
+    assert is_ours(found.words)
+
+
+def test_lines_that_came_while_the_output_was_blocked_are_not_counted_afterwards() -> None:
+    hearing = SilenceDiagnosis()
+    hearing.now.line(STILL, good=True)
+    hearing.forget()
+    assert hearing.now == Heard()
 
 
 def events_of(every: int, windows: int = 3, period: float = 0.0, linked: bool = True) -> list[str]:

@@ -575,7 +575,7 @@ def test_the_outcome_is_an_event() -> None:
     (outcome,) = [event for event in told if event.name == "link_check"]
     assert (outcome.level, outcome.text) == (
         "info",
-        "the form of the lines on the serial port is now checked",
+        "the lines on the serial port are now checked",
     )
 
 

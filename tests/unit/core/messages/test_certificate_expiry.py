@@ -13,8 +13,8 @@ NOW_NS = 1_700_000_000_000_000_000
     [
         (400, 0, "valid for 400 days"),
         (30, 0, "valid for 30 days"),
-        (29, 1, "ends in 29 days"),
-        (0, 1, "ends in 0 days"),
+        (29, 1, "expires in 29 days"),
+        (0, 1, "expires in 0 days"),
         (-2, 2, "expired 2 days ago: TLS refuses every client"),
     ],
 )
@@ -26,7 +26,7 @@ def test_it_is_a_warning_a_month_before_and_an_error_after(
 
 def test_the_certificate_that_ends_first_is_named_unless_it_is_the_robot_s_own() -> None:
     ends = {"": NOW_NS + 10 * DAY_NS, "the authority": NOW_NS + 400 * DAY_NS}
-    assert expiry(ends, NOW_NS)[1] == "ends in 10 days"
+    assert expiry(ends, NOW_NS)[1] == "expires in 10 days"
     ends["the router tls/router.local:7447"] = NOW_NS - 3 * DAY_NS
     told = (
         "expired 3 days ago (certificate of the router tls/router.local:7447): TLS refuses every "
@@ -38,7 +38,7 @@ def test_the_certificate_that_ends_first_is_named_unless_it_is_the_robot_s_own()
 def test_an_authority_that_ends_with_the_certificates_of_a_gateway_is_named() -> None:
     """The gateway reports the earlier end of its own certificate and of its authority's."""
     ends = {"": NOW_NS + 10 * DAY_NS, "the authority": NOW_NS + 10 * DAY_NS}
-    assert expiry(ends, NOW_NS) == (1, "ends in 10 days (certificate of the authority)")
+    assert expiry(ends, NOW_NS) == (1, "expires in 10 days (certificate of the authority)")
 
 
 def test_an_end_that_nobody_can_read_is_a_warning_with_its_mend() -> None:

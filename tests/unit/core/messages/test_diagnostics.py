@@ -148,9 +148,24 @@ BATTERY = replace(CONFIG, battery=BatteryConfig(warning_below=22.0, stop_below=2
     ("level", "number", "message"),
     [
         ("ok", OK, "22.50 V, 40 %, -1.50 A"),
-        ("warning", WARN, "22.50 V, 40 %, -1.50 A; the mean is below battery.warning_below = 22 V"),
-        ("stop", ERROR, "22.50 V, 40 %, -1.50 A; the mean is below battery.stop_below = 21 V"),
-        ("unknown", WARN, "22.50 V, 40 %, -1.50 A; the level is known after 3 s of reports"),
+        (
+            "warning",
+            WARN,
+            "22.50 V, 40 %, -1.50 A; the mean of the last seconds is below battery.warning_below = "
+            "22 V",
+        ),
+        (
+            "stop",
+            ERROR,
+            "22.50 V, 40 %, -1.50 A; the mean of the last seconds is below battery.stop_below = "
+            "21 V",
+        ),
+        (
+            "unknown",
+            WARN,
+            "22.50 V, 40 %, -1.50 A; the level is not known until the board has reported for at "
+            "least 3 s",
+        ),
     ],
 )
 def test_a_battery_that_the_board_reports_has_a_row(
@@ -184,6 +199,13 @@ def test_a_router_has_its_row_before_anybody_has_looked_whether_it_is_there() ->
     assert values(one) == {"tcp/a:7447": "not connected yet"}
     looked = seen(routers=RoutersStatus(missing=("tcp/a:7447",)))
     assert [of.name for of in rows(config, snapshot=looked)] == [of.name for of in rows(config)]
+
+
+def test_a_lost_router_is_named_although_another_one_was_never_connected() -> None:
+    config = replace(CONFIG, bus=BusConfig(connect=("tcp/a:7447", "tcp/b:7447")))
+    one = row("router", config, snapshot=seen(routers=RoutersStatus(missing=("tcp/a:7447",))))
+    assert (one.level, one.message) == (WARN, "not connected to tcp/a:7447")
+    assert values(one) == {"tcp/a:7447": "not connected", "tcp/b:7447": "not connected yet"}
 
 
 # mode
@@ -285,10 +307,12 @@ def test_the_commands_show_what_each_source_waits_for_and_what_was_refused() -> 
 def test_the_commands_name_the_speed_limit_that_slows_the_robot() -> None:
     (one,) = [
         one
-        for one in diagnostics(CONFIG, OUTPUTS, SNAPSHOT, NO_CERTIFICATE, "0.3 m/s by x").status
+        for one in diagnostics(
+            CONFIG, OUTPUTS, SNAPSHOT, NO_CERTIFICATE, "0.3 m/s, set by x"
+        ).status
         if one.name == "acsard: commands"
     ]
-    assert (one.level, one.message) == (OK, "commanded by app; speed limit: 0.3 m/s by x")
+    assert (one.level, one.message) == (OK, "commanded by app; speed limit: 0.3 m/s, set by x")
 
 
 def test_two_programs_on_one_source_are_a_warning_that_names_the_source() -> None:

@@ -703,7 +703,9 @@ def test_the_track_that_the_gyro_implies_stands_beside_the_configured_one() -> N
         "learned_multiplier_std": "0.090",
     }
     assert {pair.key: pair.value for pair in row.values} == shown | {"multiplier_in_use": "1.500"}
-    assert state.effective_track == "learned 1.800 ± 0.090 (only shown), configured 1.500 (in use)"
+    assert (
+        state.effective_track == "learned 1.800 ± 0.090 (only reported), configured 1.500 (in use)"
+    )
     assert row.message == f"{WORDS['used']}; effective track: {state.effective_track}"
     state, (row,) = with_gyro(replace(learned, track_use="used"))
     assert {pair.key: pair.value for pair in row.values} == shown | {"multiplier_in_use": "1.800"}
@@ -751,7 +753,7 @@ DAY_NS = 86400 * 10**9
     [
         (400, 0, "valid for 400 days"),
         (30, 0, "valid for 30 days"),
-        (29, 1, "ends in 29 days"),
+        (29, 1, "expires in 29 days"),
         (-2, 2, "expired 2 days ago"),
     ],
 )

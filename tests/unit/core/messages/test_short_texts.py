@@ -82,8 +82,10 @@ def test_the_line_of_a_state_ends_with_its_warnings() -> None:
         Time(), "ready", "waiting for a command", 0.0, 0.0, 0.0, 0.0, 0.0, [], "up", "", [], "", {}
     )  # fmt: skip
     assert short(state).endswith("  ready: waiting for a command")
-    bad = replace(state, recording_error="the disk is full", certificate_expiry="ends in 10 days")
-    assert short(bad).endswith("  WARNING: certificate ends in 10 days, recording fails")
+    bad = replace(
+        state, recording_error="the disk is full", certificate_expiry="expires in 10 days"
+    )
+    assert short(bad).endswith("  WARNING: certificate expires in 10 days, recording fails")
     full = replace(state, battery=BatterySummary(24.5, 87.0, None, "ok"))
     assert short(full).endswith("  ready: waiting for a command  battery 87 %")
 

@@ -29,7 +29,7 @@ SENTENCES = [
     ),
     (
         Wait("neutral", "high", 0.5, shared=True),
-        "send a zero first: high must send a zero, and no speed for 0.5 s after it, before it can "
+        "send a zero first: high must send a zero, and then no speed for 0.5 s, before it can "
         "drive",
     ),
     (
@@ -57,7 +57,7 @@ SENTENCES = [
     ),
     (
         Wait("stalled", "high"),
-        "the daemon stood still: waiting for the next command of high",
+        "the daemon stalled: waiting for the next command of high",
     ),
     (Wait("higher", "high"), "high has priority: wait until it is silent"),
     (Wait("equal", "right"), "right has the same priority and came first: wait until it is silent"),

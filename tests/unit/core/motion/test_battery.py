@@ -156,12 +156,12 @@ def test_the_stop_is_reported_once_and_held_until_the_hysteresis() -> None:
     first, *_, last = pack.events
     assert first == (
         "battery_stop",
-        "20.90 V; the mean is below battery.stop_below = 21 V; charge the battery to 21.4 V, then "
-        "call srv/clear",
+        "20.90 V; the mean of the last seconds is below battery.stop_below = 21 V; charge the "
+        "battery to 21.4 V, then call srv/clear",
     )
     assert [text for _, text in pack.events if text.endswith("until srv/clear is called")] == [
-        "24.00 V; the mean is below battery.return_below = 21.5 V; the robot stays stopped until "
-        "srv/clear is called"
+        "24.00 V; the mean of the last seconds is below battery.return_below = 21.5 V; the robot "
+        "stays stopped until srv/clear is called"
     ]
     assert last[0] == "battery_stop"
 
@@ -325,7 +325,9 @@ def test_a_measure_that_falls_silent_alone_is_named_too() -> None:
 def test_the_words_before_the_level_is_known_say_so() -> None:
     pack = Pack()
     pack.at(24.0, 1.0)
-    assert words(CONFIG, pack.status) == "24.00 V; the level is known after 3 s of reports"
+    assert words(CONFIG, pack.status) == (
+        "24.00 V; the level is not known until the board has reported for at least 3 s"
+    )
 
 
 # another board

@@ -96,9 +96,9 @@ def test_every_place_has_a_direction() -> None:
         ("X...", "front bumper pressed: the robot drives only straight backwards, at most 0.1 m/s"),
         (".X..", "rear bumper pressed: the robot drives only straight forwards, at most 0.1 m/s"),
         ("..X.", "left bumper pressed: no straight motion leads away from the pressed bumpers, so "
-         "the robot stands until they are released"),
+         "the robot stands still until the bumpers are released"),
         ("XX..", "front and rear bumpers pressed: no straight motion leads away from the pressed "
-         "bumpers, so the robot stands until they are released"),
+         "bumpers, so the robot stands still until the bumpers are released"),
     ],
 )  # fmt: skip
 def test_a_pressed_bumper_that_limits_says_which_motion_it_allows(pressed: str, note: str) -> None:

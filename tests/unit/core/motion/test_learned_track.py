@@ -66,7 +66,7 @@ def test_one_that_is_too_far_from_the_configured_one_is_named_and_not_used(share
     assert track.used == CONFIGURED
     assert track.event is not None
     assert track.event.level == "warning"
-    assert "(too far off), configured 1.000 (in use)" in track.event.text
+    assert "(implausible), configured 1.000 (in use)" in track.event.text
     track.look(Track(share, SURE))
     assert told(track) is None
 
@@ -104,7 +104,7 @@ def test_one_that_is_too_far_off_is_known_until_it_is_doubted_by_far() -> None:
 @pytest.mark.parametrize(
     ("use", "says"),
     [
-        ("shown", "learned 1.800 ± 0.090 (only shown), configured 1.500 (in use)"),
+        ("shown", "learned 1.800 ± 0.090 (only reported), configured 1.500 (in use)"),
         ("uncertain", "learned 1.800 ± 0.090 (uncertain), configured 1.500 (in use)"),
         ("used", "learned 1.800 ± 0.090 (in use), configured 1.500"),
     ],

@@ -381,7 +381,7 @@ def test_a_release_that_names_another_latch_is_refused(held: Held, none: bool) -
     with pytest.raises(RefusedError) as caught:
         {"clear": clear, "activate": activate}[held.verb](life, 20.0, seen)
     assert str(caught.value) == (
-        f"this call names latch {seen}, but srv/{held.verb} would release another one; the robot "
+        f"this call names latch {seen}, but srv/{held.verb} would release another latch; the robot "
         f"is still {held.said} by joe{held.before}: look at the robot, then call srv/{held.verb} "
         "again with the present `latch` in `state`"
     )
@@ -480,7 +480,10 @@ def test_a_stop_keeps_the_fault() -> None:
     life = ready()
     life.fault("a wheel is dead", at(1.0))
     said = stop(life, 2.0)
-    assert said == "stopped and latched; call srv/clear twice: for the fault, then for the stop"
+    assert said == (
+        "stopped and latched; call srv/clear twice: the first call releases the fault, the second "
+        "the stop"
+    )
     assert mode(life) is Mode.FAULT
     clear(life, 5.0)
     assert mode(life) is Mode.STOPPED
@@ -588,7 +591,7 @@ def test_a_press_after_a_release_is_a_new_latch() -> None:
     with pytest.raises(RefusedError) as caught:
         clear(life, 9.0, seen)
     assert str(caught.value) == (
-        f"this call names latch {seen}, but srv/clear would release another one; the robot is "
+        f"this call names latch {seen}, but srv/clear would release another latch; the robot is "
         f"still stopped ({PRESSED}): look at the robot, then call srv/clear again with the present "
         "`latch` in `state`"
     )
@@ -632,7 +635,7 @@ def test_an_activate_of_an_active_robot_changes_nothing_whatever_it_names() -> N
 def test_a_robot_that_starts_switched_off_has_the_number_0() -> None:
     life = ready(active=False)
     with pytest.raises(
-        RefusedError, match="latch 7, but srv/activate would release another one; the"
+        RefusedError, match="latch 7, but srv/activate would release another latch; the"
     ):
         activate(life, 1.0, 7)
     assert activate(life, 1.0, 0)

@@ -201,7 +201,7 @@ def test_what_can_be_set_says_what_it_is_its_range_and_when() -> None:
         "limits.linear_stop_deceleration",
         DOUBLE,
         "deceleration after a stop or a fault: a number from 0.01 to 100 m/s2",
-        "raised at any time, lowered only while the robot stands",
+        "may be raised at any time, but lowered only while the robot stands",
         read_only=False,
         floating_point_range=[FloatingPointRange(0.01, 100.0, 0.0)],
     )
@@ -212,7 +212,7 @@ def test_what_takes_a_start_is_read_only_and_says_so() -> None:
         "mcu.encoder_counts",
         INTEGER,
         "a whole number from 0 to 100000 per wheel turn (0 = unknown)",
-        "only in acsard.toml, then restart the daemon",
+        "change it in acsard.toml, then restart the daemon",
         integer_range=[IntegerRange(0, 100_000, 1)],
     )
 
