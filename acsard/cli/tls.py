@@ -34,8 +34,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="make a certificate authority, the robot's certificate and a client certificate for "
         "each role",
         description="Make a certificate authority, the robot's certificate, and one certificate "
-        "each for viewer, operator and maintainer. Print the lines for acsard.toml "
-        "with which the robot uses the certificates.",
+        "each for viewer, operator and maintainer. Print the lines to write into acsard.toml, so "
+        "that the robot uses the certificates.",
     )
     init.add_argument("--force", action="store_true", help="overwrite existing files")
     init.add_argument(
@@ -203,7 +203,7 @@ def main_renew(args: argparse.Namespace) -> int:
     if args.name:
         place = certificates.renew_client(args.directory, args.name, args.address, args.days)
         files = ", ".join((CA, CERTIFICATE, KEY))
-        print(f"{place} has a new certificate. Copy {files} to the place of the old ones.\n")
+        print(f"{place} has a new certificate. Copy {files} from there over the old files.\n")
         print(TAKEN)
         return 0
     print(_certified(certificates.renew(args.directory, args.address, args.days)))
@@ -221,7 +221,7 @@ def main_router(args: argparse.Namespace) -> int:
 
 
 def _certified(names: list[str]) -> str:
-    return f"The robot's certificate is valid for {', '.join(names)} (add more with --address).\n"
+    return f"The robot's certificate is valid for {', '.join(names)} (--address adds names).\n"
 
 
 def _admit_service(directory: Path) -> None:
