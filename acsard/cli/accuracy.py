@@ -63,7 +63,7 @@ def _config(robot: Client, path: str | None) -> Config:
     except (NoAnswerError, NotPermittedError, msgspec.ValidationError):
         where, config = load(path)
         print(
-            f"acsard: the robot did not send its configuration. Instead, this command uses {where}",
+            f"acsard: the robot did not send its configuration. Using {where} instead",
             file=sys.stderr,
         )
         return config

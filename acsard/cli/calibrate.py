@@ -57,7 +57,7 @@ TRUE_POSE = "sim/pose"
 """Key of the true pose, below the robot's id. Only the built-in simulator has a true pose."""
 
 DRIVE_OPTIONS = ("method", "positions", "positions_at", "imu", "yes", "json_lines")
-"""Options that are only for a drive that this tool guides, not for a recorded drive (`--log`)."""
+"""Names of the options for a drive that this tool guides. They cannot be used with `--log`."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

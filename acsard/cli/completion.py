@@ -45,8 +45,8 @@ _acsard_recordings() {{
 }}""",
     },
 }
-"""Completion of a recording's number or file name, for each shell. shtab defines the format of this
-table."""
+"""Maps each shell to code that completes the number or the file name of a recording. shtab defines
+the format of this table."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

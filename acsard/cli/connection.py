@@ -156,10 +156,11 @@ def explained(
     receiving. A reason that is "" is not printed.
 
     Args:
-        look: Function that returns the reason. It is called if no message arrives in the first
-            `after_s` s.
-        ceased: Function that returns the reason. It is called if no further message arrives for
-            `after_s` s. If it is None, only the silence before the first message is explained.
+        look: Function that returns why no message has arrived yet. It is called if no message
+            arrives in the first `after_s` s.
+        ceased: Function that returns why no further message arrives. It is called after each
+            `after_s` s without a message, until it returns a reason. If it is None, only the
+            silence before the first message is explained.
         after_s: Shortest silence that is explained, s.
         timeout_s: Silence after which the caller ends the context, s. If no message has arrived by
             then, the reason is printed before the context ends.

@@ -152,10 +152,10 @@ def settings_file(where: str, config: Config, given: dict[str, object]) -> Setti
 
 
 def page(config: Config, where: str) -> list[str] | None:
-    """Return the arguments with which `acsard web` serves the robot's page, or None to serve none.
+    """Return the arguments with which to start `acsard web`, or None to serve no page.
 
-    The page is served if `web.page` is set, standard output is a terminal, the daemon is not a
-    systemd service, and the page's libraries are installed. `where` is the path of the
+    The robot's page is served if `web.page` is set, standard output is a terminal, the daemon is
+    not a systemd service, and the page's libraries are installed. `where` is the path of the
     configuration file.
     """
     looked_at = sys.stdout is not None and sys.stdout.isatty() and "INVOCATION_ID" not in os.environ

@@ -152,7 +152,7 @@ def main_init(args: argparse.Namespace) -> int:
     names = certificates.init(args.directory, args.address, args.days, force=args.force)
     if args.write:
         wanted = change(args.write, keys, new=True)
-        print(f"{args.write}: set bus.listen = {write(wanted['bus.listen'])} and bus.tls\n")
+        print(f"{args.write} now has bus.listen = {write(wanted['bus.listen'])} and bus.tls\n")
     _admit_service(directory)
     host, robot = socket.gethostname(), configs[-1].robot.id
     files = {"ca": CA, "certificate": CERTIFICATE, "key": KEY}
@@ -187,7 +187,7 @@ def main_add(args: argparse.Namespace) -> int:
         return 0
     if args.write:
         names = write(change(args.write, keys, new=True)[f"access.{listed}"])
-        print(f"{place} is for {args.name}; {args.write}: set access.{listed} = {names}")
+        print(f"{place} is for {args.name}; {args.write} now has access.{listed} = {names}")
     else:
         names = write(keys(config)[f"access.{listed}"])
         print(_ADDED.format(place=place, name=args.name, where=where))
@@ -207,7 +207,7 @@ def main_renew(args: argparse.Namespace) -> int:
         print(TAKEN)
         return 0
     print(_certified(certificates.renew(args.directory, args.address, args.days)))
-    print(f"{args.directory / CERTIFICATE} is new.\n\n{TAKEN}")
+    print(f"{args.directory / CERTIFICATE} is the new certificate.\n\n{TAKEN}")
     return 0
 
 
