@@ -167,7 +167,7 @@ def _invite(args: argparse.Namespace, config: Config, where: str) -> int:
     days = 0 if args.hours else args.days or USUAL_DAYS
     text, token = vault.invite(args.invite, args.name or args.invite, days, args.hours or 0)
     until = f"{_clock(token.ends)}, for {lasting(token.ends - token.made)}"
-    print(f"{token.name} is {token.role} until {until}; this link is not shown again:\n")
+    print(f"{token.name} is {token.role} until {until}; the link is not shown again:\n")
     for url in urls:
         print(f"  {url}#token={text}")
     print()
