@@ -46,7 +46,7 @@ VERBS = {
     "doctor": "find problems on this machine and say how to fix them",
     "ports": "list the serial ports, the processes that use them, and the likely MCU",
     "mcu": "test the microcontroller on your own robot with its wheels lifted",
-    "accuracy": "measure what causes the odometry error, and say how to reduce the largest cause",
+    "accuracy": "measure what causes the odometry error, and say how to reduce it",
     "calibrate": "measure wheel radii and effective track width, from a guided or a recorded drive",
     "recording": "list, show, replay, export and draw recordings",
     "tls": "make the certificates that other machines need to connect to the robot",
@@ -81,10 +81,10 @@ class _Parser(argparse.ArgumentParser):
     ) -> tuple[argparse.Namespace, list[str]]:
         """Parse the words of the command line, `args`.
 
-        If a word is unknown, end the program with an error that names the `--help` to read. Before
-        that, parse all words again with `parse_known_intermixed_args`: argparse alone does not
-        accept positional arguments on both sides of an option, such as `1` and `cal.csv` in
-        `export 1 --csv cal.csv`.
+        Argparse does not accept positional arguments on both sides of an option, such as `1` and
+        `cal.csv` in `export 1 --csv cal.csv`. If a word is unknown, this method therefore parses
+        all words again with `parse_known_intermixed_args`. If a word is unknown even then, it ends
+        the program with an error that names the `--help` to read.
         """
         if self._intermixed:
             return super().parse_known_args(args, namespace)

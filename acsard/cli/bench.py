@@ -11,8 +11,9 @@ what is measured, and between which points (all on the same clock):
                         port until a callback in this process receives the odometry of that line.
   processor, memory     of the daemon's process alone, read from /proc.
   start-up              from before fork and exec until the first byte of the first line.
-The tool recognizes a command or a feedback line by its speed, which differs from the speed before.
-A real wire adds 2.9 ms a line at 115200 baud, and an FTDI adapter adds its latency timer.
+Each command and each feedback line has another speed than the one before, so that the tool can
+recognize it. A real wire adds 2.9 ms a line at 115200 baud, and an FTDI adapter adds its latency
+timer.
 
 With --port the tool uses the real microcontroller. It sends only zero speeds, so nothing moves. The
 tool cannot observe the far end of a real wire, so it omits all times that begin or end there. Stop

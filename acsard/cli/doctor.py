@@ -1,5 +1,5 @@
 """Check the configuration, the serial port and the process that uses it, permissions, the clock,
-real-time limits, everything that can make this computer late, certificates, and the daemon if it
+real-time limits, reasons why programs on this computer run late, certificates, and the daemon if it
 runs. The tool looks for the daemon at the address in the options. Without such an option, it uses
 the address in the configuration. Each problem is printed with its fix. The exit code is 1 if a
 check fails, else 0.

@@ -86,10 +86,8 @@ _MISNAMED = {
     ("mcap", ".csv"): "add --csv to write a table, or let the name end in .mcap",
     ("csv", ".mcap"): "leave out --csv to write MCAP, or let the name end in .csv",
     ("csv", ".html"): "let the name end in .csv; `acsard recording report` writes HTML",
-    (
-        "rosbag2",
-        ".csv",
-    ): "write --csv in place of --rosbag2 to get a table, or leave out .csv to get a directory",
+    ("rosbag2", ".csv"): "write --csv in place of --rosbag2 to get a table, or leave out .csv to "
+    "get a directory",
     ("rosbag2", ".mcap"): "leave out --rosbag2 to write one MCAP file, or leave out .mcap to get a "
     "directory",
     ("html", ".csv"): "let the name end in .html; `acsard recording export --csv` writes a table",

@@ -5,7 +5,7 @@ limits of speed, acceleration and jerk are an exception: they also survive the n
 on the simulator. With --keep the robot also writes the settings into its own configuration file,
 and the answer names that file. With --write this tool writes them into the configuration file of
 this machine. Neither --keep nor --write changes the file for a source's timeout: edit
-[[commands.sources]] yourself. A robot that drives faster than a new limit decelerates to it.
+[[commands.sources]] yourself. A robot that drives faster than a new limit slows down to it.
 Without a setting, list the settings that can be changed. If --id names several robots, all of them
 get the settings at the same time, and each line has the answer of one robot. The exit code is 1 if
 a robot refuses, and 69 if a robot does not answer.

@@ -272,7 +272,10 @@ def no_command(source: str) -> str:
 
 
 def heard(state: RobotState, source: str) -> bool:
-    """Return whether, by `state`, commands of this source arrive at the daemon, even late ones."""
+    """Return whether `state` shows that commands of this source arrive at the daemon.
+
+    Late commands count too.
+    """
     return any(one.name == source and one.waits_for != "a command" for one in state.sources)
 
 

@@ -70,7 +70,8 @@ def drive(
 
     Raises:
         NotDrivenError: The robot does not follow the commands; the text is the daemon's reason. Or
-            this program sent no command for more than `GRACE_S` s while the robot had to drive.
+            this program sent no command for more than `GRACE_S` s, before it sent the zeros at the
+            end.
         NoAnswerError: The daemon is silent.
         UsageError: An argument is not a finite number, or `seconds` is not above 0.
     """

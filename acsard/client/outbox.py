@@ -1,8 +1,8 @@
 """Sends the commands of several senders from one thread, so that no caller waits for the bus.
 
 Each sender has a `Commander`, which keeps only the newest command of that sender. When a sender
-leaves, the program must call `Outbox.release()`. This sends a last zero for the sender, even if the
-bus was blocked for a long time.
+leaves, the program must call `Outbox.release()`. If the robot may still follow the sender's last
+command, the thread then sends a zero, even if the bus was blocked for a long time.
 """
 
 from __future__ import annotations
