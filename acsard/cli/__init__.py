@@ -35,7 +35,7 @@ VERBS = {
     "get": "query a Zenoh key once and print the answer as JSON",
     "hz": "measure the message rate of a Zenoh key",
     "top": "show the robot's status on one screen, live",
-    "fleet": "show one live line per robot",
+    "fleet": "show one line per robot, live",
     "foxglove": "show the robot live in Foxglove or Lichtblick",
     "drive": "drive the robot with the keyboard",
     "web": "serve the robot's page: see, stop and drive the robot in a browser",
@@ -46,8 +46,8 @@ VERBS = {
     "doctor": "find problems on this machine and say how to fix them",
     "ports": "list the serial ports, the processes that use them, and the likely MCU",
     "mcu": "test the microcontroller on your own robot with its wheels lifted",
-    "accuracy": "measure the present causes of odometry error and say how to reduce the largest",
-    "calibrate": "measure wheel radii and effective track width, by a guided or a recorded drive",
+    "accuracy": "measure what causes the odometry error, and say how to reduce it",
+    "calibrate": "measure wheel radii and effective track width, from a guided or a recorded drive",
     "recording": "list, show, replay, export and draw recordings",
     "tls": "make the certificates that other machines need to connect to the robot",
     "gateway": "run the TLS gateway, which admits clients from other machines",
@@ -73,18 +73,18 @@ try:  acsard run                (start the robot on the built-in simulator)
 
 class _Parser(argparse.ArgumentParser):
     _intermixed = False
-    """True during `parse_known_intermixed_args`, which parses the options first and the positional
-    arguments after them."""
+    """Whether `parse_known_intermixed_args` is running. That method may call `parse_known_args`,
+    which must then not start it a second time."""
 
     def parse_known_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> tuple[argparse.Namespace, list[str]]:
-        """Parse the words. For an unknown word, end with an error that names the `--help` to read.
+        """Parse the words of the command line, `args`.
 
-        Argparse does not recognize positional arguments on both sides of an option: it calls
-        `cal.csv` in `export 1 --csv cal.csv` unknown. If a word is unknown, this method therefore
-        parses all words again with `parse_known_intermixed_args`. Some versions of Python call this
-        method from there.
+        Argparse does not accept positional arguments on both sides of an option, such as `1` and
+        `cal.csv` in `export 1 --csv cal.csv`. If a word is unknown, this method therefore parses
+        all words again with `parse_known_intermixed_args`. If a word is unknown even then, it ends
+        the program with an error that names the `--help` to read.
         """
         if self._intermixed:
             return super().parse_known_args(args, namespace)
@@ -109,7 +109,10 @@ class _Parser(argparse.ArgumentParser):
 
 
 def parser(called: Collection[str] = VERBS) -> argparse.ArgumentParser:
-    """Return the parser of `acsard`, with the options of only the subcommands in `called`."""
+    """Return the parser for the command line of `acsard`.
+
+    It knows the names of all subcommands, but the options of only those in `called`.
+    """
     whole = _Parser(
         prog="acsard",
         description="The hardware interface of a four-wheel differential-drive robot. It connects "
@@ -161,9 +164,9 @@ _EXPONENT = re.compile(r"-(\d+\.?\d*|\.\d+)[eE][+-]?\d{1,3}")
 
 
 def _decimal(word: str) -> str:
-    """Write a negative number such as `-1e-3` without its exponent, as `-0.001`.
+    """Return a negative number such as `-1e-3` without its exponent, as `-0.001`.
 
-    Argparse would take `-1e-3` for an option. Other words are returned unchanged.
+    Argparse would mistake `-1e-3` for an option. Any other word is returned unchanged.
     """
     return f"{Decimal(word):f}" if _EXPONENT.fullmatch(word) else word
 

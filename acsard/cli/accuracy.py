@@ -1,9 +1,9 @@
 """Observe the robot while someone drives it, and print the odometry error that each cause alone
 would produce if the drive continued in the same way: in mm after 100 m, and in degrees after a turn
-of 360 degrees. The causes are the timing and the rounding of the feedback lines, gaps between them,
-slip, wheel radii, track width, and the gyro if there is one. The tool also says how to reduce the
-largest error. It sends no commands. While the robot stands still, the tool prints only the errors
-that follow from the settings.
+of 360 degrees. The causes are the timing and the rounding of the feedback lines, times without
+feedback lines, slip, wheel radii, track width, and the gyro if there is one. The tool also says how
+to reduce the largest error. It sends no commands. While the robot stands still, the tool prints
+only the errors that follow from the settings.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="run until Ctrl-C and print a result every S seconds (see --seconds). Each result "
         "covers the time since the start, but at most the last ten minutes",
     )
-    parser.add_argument("--json", action="store_true", help="print one JSON object a line")
+    parser.add_argument("--json", action="store_true", help="print each result as a line of JSON")
     add_bus(parser)
 
 
@@ -53,13 +53,17 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _config(robot: Client, path: str | None) -> Config:
-    """Return the daemon's configuration. If the daemon does not send it, load the local one."""
+    """Return the daemon's configuration.
+
+    If the daemon does not send it, load the configuration file of this machine instead, and say so.
+    `path` is the value of --config, or None.
+    """
     try:
         return msgspec.convert(robot.get("config"), Config)
     except (NoAnswerError, NotPermittedError, msgspec.ValidationError):
         where, config = load(path)
         print(
-            f"acsard: the robot did not send its configuration. Instead, this command uses {where}",
+            f"acsard: the robot did not send its configuration. Using {where} instead",
             file=sys.stderr,
         )
         return config

@@ -1,18 +1,19 @@
 """Measure how fast the daemon is on this machine. The tool starts its own daemon with a simulated
 microcontroller; a daemon that already runs is not disturbed. From another process, the tool sends
-commands to the new daemon, receives its messages, and prints the times. It does not judge the
-times. A busy machine gives worse times.
+commands to the new daemon, receives its messages, and prints the times listed below. It does not
+say whether they are good. On a busy machine they are longer.
 
 what is measured, and between which points (all on the same clock):
   command -> wire       from the call of put() in this process, at random times, until the first
                         byte of the line with that command can be read at the far end of the
-                        port. Add the time on a real wire (2.9 ms a line at 115200 baud).
+                        port.
   feedback -> odometry  from the write of the last byte of a feedback line at the far end of the
                         port until a callback in this process receives the odometry of that line.
   processor, memory     of the daemon's process alone, read from /proc.
   start-up              from before fork and exec until the first byte of the first line.
-Successive commands and feedback lines have different speeds, by which the tool recognizes them.
-A real wire adds its own time, and an FTDI adapter adds its latency timer.
+Each command and each feedback line has another speed than the one before, so that the tool can
+recognize it. A real wire adds 2.9 ms a line at 115200 baud, and an FTDI adapter adds its latency
+timer.
 
 With --port the tool uses the real microcontroller. It sends only zero speeds, so nothing moves. The
 tool cannot observe the far end of a real wire, so it omits all times that begin or end there. Stop
@@ -46,11 +47,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--port",
         metavar="DEVICE",
-        help="serial port of the microcontroller to measure with; acsard sends it only zero "
-        "speeds (default: sim, the built-in simulator, even if the configuration names a port)",
+        help="measure with the microcontroller at this serial port; acsard sends only zero speeds "
+        "to it (default: sim, the built-in simulator, even if the configuration names a port)",
     )
     parser.add_argument(
-        "--rate", type=float, metavar="HZ", help="control rate (default: as configured)"
+        "--rate", type=float, metavar="HZ", help="control rate, Hz (default: the configured rate)"
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
 

@@ -1,20 +1,21 @@
 """Measure the wheel radii and the effective track width, each with its standard deviation, and say
-how much they improve the odometry. The tool also estimates the noise settings of [odometry] if a
-gyro or positions show the noise. Without --log the tool drives the robot and guides a person at
+how much they improve the odometry. If the tool has data of a gyro or positions, it also estimates
+the noise settings of [odometry]. Without --log the tool drives the robot and guides a person at
 this terminal through the drive. The person stands near the robot on a free floor of 3 m x 3 m,
 starts each leg with Enter, stops it with any key, and types the tape measurements that the tool
 asks for. The robot drives for at most 90 s. With --log the tool uses a recorded drive: a black-box
 recording of a robot with a gyro, a ROS 2 bag in MCAP (its file or directory), or a CSV file with a
-header. A bag must contain the wheels as JointState, and an Imu, a PoseStamped or an Odometry to
-compare them with. The tool reads the topics that have these types, or those that --topic names. The
-CSV file has the column t (s) and the wheel speeds in rad/s, "fr,fl,rl,rr" or "left,right". It also
-has yaw_rate (rad/s, from a gyro), or x and y (m, from any source of positions) with or without yaw
-(rad), or both. If the file contains several drives, the column run names the drive of each row. The
-columns applied_linear (m/s) and applied_angular (rad/s) contain the commands, and show how fast the
-wheels respond. The columns may be in any order, and a cell is empty if its sensor has no value at
-that time. A good log begins with 3 s of standing still. It contains straight drives, turns to both
-sides, slow and fast, and curves, for 60 s or more. The exit code is 0 if the tool found the values.
-Otherwise it is 1, and a message says what to do instead.
+header. A bag must contain the wheels as JointState messages. It must also contain Imu, PoseStamped
+or Odometry messages, with which the tool compares the wheels. The tool reads the topics that have
+these types, or those that --topic names. The CSV file has the column t (s) and the columns of the
+wheel speeds (rad/s), "fr,fl,rl,rr" or "left,right". It also has yaw_rate (rad/s, from a gyro), or x
+and y (m, from any source of positions) with or without yaw (rad), or both. If the file contains
+several drives, the column run names the drive of each row. The columns applied_linear (m/s) and
+applied_angular (rad/s) contain the commands, and show how fast the wheels respond. The columns may
+be in any order, and a cell is empty if its sensor has no value at that time. A good log begins with
+3 s of standing still. Then it contains 60 s or more of straight drives, slow and fast turns to both
+sides, and curves. The exit code is 0 if the tool found the values. Otherwise it is 1, and a message
+says what to do instead.
 """
 
 from __future__ import annotations
@@ -53,10 +54,10 @@ from acsard.terminal.prompt import NobodyError, Prompt, ended_by_signals
 from acsard.terminal.terminal_prompt import NoPrompt, TerminalPrompt
 
 TRUE_POSE = "sim/pose"
-"""Key of the true pose, which only a daemon with the built-in simulator publishes."""
+"""Key of the true pose, below the robot's id. Only the built-in simulator has a true pose."""
 
 DRIVE_OPTIONS = ("method", "positions", "positions_at", "imu", "yes", "json_lines")
-"""Options that are only for a drive that this tool guides, not for a recorded drive (`--log`)."""
+"""Names of the options for a drive that this tool guides. They cannot be used with `--log`."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -66,7 +67,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--log",
         type=Path,
         metavar="FILE",
-        help="recorded drive: a CSV file, a recording of `acsard recording` or a ROS 2 bag in MCAP",
+        help="calibrate from a recorded drive, without driving: FILE is a CSV file, a recording of "
+        "`acsard recording` or a ROS 2 bag in MCAP",
     )
     parser.add_argument(
         "--topic",
@@ -201,8 +203,8 @@ def _add_drive_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--positions-at",
         metavar="ENDPOINT",
-        help="bus address that has the key of --positions, for example the address of a router; "
-        "needed only if the daemon's own bus does not have that key",
+        help="address of the bus on which the positions are published, for example of a router; "
+        "needed only if they are not on the daemon's own bus",
     )
     parser.add_argument(
         "--imu",
@@ -221,10 +223,11 @@ def _add_drive_options(parser: argparse.ArgumentParser) -> None:
 def _guided(
     args: argparse.Namespace, config: Config, where: str, lines: JsonPrompt | None
 ) -> tuple[Calibration, Config]:
-    """Drive the robot. Return a pair: the calibration, and the configuration of its daemon.
+    """Guide a person through a calibration drive of the robot.
 
-    A key press or Ctrl-C stops the robot with zero commands. `config` is the configuration in the
-    file `where`. `lines` is the prompt for --json-lines, or None without that option.
+    Return a pair: the calibration, and the configuration of the robot's daemon. A key press or
+    Ctrl-C stops the robot with zero commands. `config` is the configuration in the file `where`.
+    `lines` is the prompt for --json-lines, or None without that option.
     """
     require_one(args)
     endpoint, robot_id, tls = address_of(config, args.connect, args.id, args.tls)
@@ -269,7 +272,7 @@ def _usable(args: argparse.Namespace, odometry: str) -> None:
             "--method positions needs the Zenoh key of the positions: add --positions KEY"
         )
     if args.positions and args.method not in (None, "positions"):
-        raise UsageError(f"--positions is not for --method {args.method}: leave one out")
+        raise UsageError(f"--positions is not for --method {args.method}: leave one of them out")
     if args.positions in ("odom", odometry):
         raise UsageError(
             "the daemon computes odom from the wheels themselves: give --positions the Zenoh key "
@@ -277,7 +280,7 @@ def _usable(args: argparse.Namespace, odometry: str) -> None:
         )
     if args.imu and (args.positions or args.method not in (None, "gyro")):
         other = "--positions" if args.positions else f"--method {args.method}"
-        raise UsageError(f"--imu is for --method gyro, not for {other}: leave one out")
+        raise UsageError(f"--imu is for --method gyro, not for {other}: leave one of them out")
     if args.positions_at and not args.positions:
         raise UsageError(
             "--positions-at names the bus address of the key of --positions: give --positions KEY "
@@ -292,10 +295,10 @@ def _usable(args: argparse.Namespace, odometry: str) -> None:
 
 
 def _differing(config: Config, mine: Config, where: str) -> str:
-    """Return an error text if the daemon's wheel radius or separation is not that of the file.
+    """Compare the wheel radius and the wheel separation of two configurations.
 
-    `config` is the daemon's configuration, and `mine` is the one in the file `where`. Returns "" if
-    both have the same values.
+    `config` is the daemon's configuration, and `mine` is the configuration in the file `where`.
+    Returns an error text if they have different values, else "".
     """
     same = config.drive.wheel_radius, config.drive.wheel_separation
     if same == (mine.drive.wheel_radius, mine.drive.wheel_separation):

@@ -1,4 +1,6 @@
-"""Call a service and print its answer. The exit code is 1 if the robot refuses."""
+"""Call a service of the robot, such as stop or clear, and print the robot's answer. The exit code
+is 1 if the robot refuses.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,7 @@ def main(args: argparse.Namespace) -> int:
     wanted = _fields(args.service)
     if len(args.values) != len(wanted):
         form = " ".join(["acsard call", args.service, *(name.upper() for name in wanted)])
-        raise UsageError(f"wrong number of arguments; write: {form}")
+        raise UsageError(f"wrong number of arguments; type: {form}")
     for name, value in zip(wanted, args.values, strict=True):
         if not math.isfinite(value):
             raise UsageError(f"{name.upper()} = {value}: the number must be finite; correct it")
@@ -69,9 +71,10 @@ def _fields(service: Verb) -> tuple[str, ...]:
 
 
 def for_one(service: str, values: Sequence[float], ids: tuple[str, ...]) -> str:
-    """Return an error message: `service` can be called on only one robot at a time.
+    """Return the error text that says that `service` can be called on only one robot at a time.
 
-    The message contains the command to type for each of `ids`.
+    The text contains the command to type for each robot in `ids`. `values` are the numbers that the
+    operator typed after the service.
     """
     typed = " ".join(["acsard call", service, *(f"{value:g}" for value in values), "--id"])
     each = [one for one in ids if one != "*"] or ["robot1"]

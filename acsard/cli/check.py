@@ -1,5 +1,5 @@
-"""Print the effective configuration with all defaults. If the configuration has problems, print all
-of them, each with its fix, and exit with code 78.
+"""Print the effective configuration, including all defaults. If the configuration has problems,
+print all of them, each with its fix, and exit with code 78.
 """
 
 from __future__ import annotations

@@ -31,15 +31,15 @@ def add_config(parser: argparse.ArgumentParser) -> None:
 def add_outcome(parser: argparse.ArgumentParser, result: str) -> None:
     """Add --json, --json-lines and --write to a subcommand that asks a person questions.
 
-    `result` is a noun for the result that --write stores. It becomes a part of the help text.
+    The help text of --write is "also write {result} into the configuration file".
     """
     form = parser.add_mutually_exclusive_group()
     form.add_argument("--json", action="store_true", help="print one JSON object")
     form.add_argument(
         "--json-lines",
         action="store_true",
-        help="for a program that asks the operator the questions: write messages and "
-        "questions to standard output as JSON, one object per line, and read the answers from "
+        help="let another program ask the operator the questions: acsard writes messages and "
+        "questions to standard output as JSON, one object per line, and reads the answers from "
         "standard input in the same form (deploy/web/README.md)",
     )
     parser.add_argument(
@@ -59,7 +59,7 @@ def require_asking(args: argparse.Namespace) -> None:
 
 
 def count(text: str) -> int:
-    """Parse a whole number of at least 1, as an argparse type."""
+    """Return the whole number in `text`, which must be at least 1. This is an argparse type."""
     if not text.isascii() or not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text} is not a whole number of at least 1")
     return int(text)
@@ -105,10 +105,10 @@ def whole(units: str, most: int, hint: str = "") -> Callable[[str], int]:
 
 
 def by_environment() -> dict[str, dict[str, object]]:
-    """Return the configuration values that environment variables set, by table and key.
+    """Return the configuration tables with the values that environment variables set.
 
-    Only `ACSARD_TLS` is read, which sets `bus.tls`. A systemd unit sets this variable to the
-    directory of its credentials.
+    The only such variable is `ACSARD_TLS`, which sets `bus.tls`. A systemd unit sets this variable
+    to the directory of its credentials.
     """
     return {"bus": {"tls": os.environ["ACSARD_TLS"]}} if "ACSARD_TLS" in os.environ else {}
 
@@ -116,9 +116,10 @@ def by_environment() -> dict[str, dict[str, object]]:
 def tables(
     options: Mapping[str, object], before: Mapping[str, Mapping[str, object]]
 ) -> dict[str, dict[str, object]]:
-    """Return a copy of the configuration tables `before` with the values of `options`.
+    """Return a copy of the configuration tables `before`, overridden by `options`.
 
-    `options` maps dotted keys, such as "mcu.port", to values. None leaves a key as it is.
+    A configuration table maps keys to values. `options` maps dotted keys, such as "mcu.port", to
+    values. A value of None changes nothing.
     """
     given = {table: dict(values) for table, values in before.items()}
     for key, value in options.items():
@@ -146,8 +147,8 @@ def load(path: str | None, options: Mapping[str, object] | None = None) -> tuple
     """Return a pair: the path of the configuration file, and the configuration.
 
     `path` is the value of --config, or None. `options` maps dotted keys of `OPTIONS` to values that
-    override the file; None leaves a key as it is. If the configuration has problems, this function
-    prints each problem with the file or the option that causes it, and raises `ExitError`.
+    override the file; a value of None changes nothing. If the configuration has problems, this
+    function prints each problem with the file or the option that causes it, and raises `ExitError`.
     """
     where, text = find(path)
     given = tables(options or {}, by_environment())

@@ -23,7 +23,7 @@ SHELLS = {
     "zsh": "the file _acsard in a directory of your $fpath",
     "fish": "~/.config/fish/completions/acsard.fish",
 }
-"""Maps each shell to the place where it looks for its completion script."""
+"""Maps each shell to the file from which it loads the completion script of a program."""
 
 _NUMBERS = "acsard recording 2>/dev/null | sed -n 's/^0*\\([0-9][0-9]*\\)-.*/\\1/p'"
 """Shell command that prints the numbers of the recordings."""
@@ -45,8 +45,8 @@ _acsard_recordings() {{
 }}""",
     },
 }
-"""Completion of a recording's number or file name, for each shell. shtab defines the format of this
-table."""
+"""Maps each shell to code that completes the number or the file name of a recording. shtab defines
+the format of this table."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -106,9 +106,10 @@ def _words() -> Mapping[tuple[str, str], list[str]]:
 def _actions(
     parser: argparse.ArgumentParser, verb: str = ""
 ) -> Iterator[tuple[str, argparse.Action]]:
-    """Yield a pair for each option: the subcommand and the option.
+    """Yield a pair for each option and argument below `parser`: its subcommand, and the option.
 
-    The options of an action such as `recording show` count as options of `recording`.
+    `parser` is the parser of the subcommand `verb`, or of the whole program if `verb` is "". The
+    options of an action such as `recording show` count as options of `recording`.
     """
     for action in parser._actions:
         yield verb, action

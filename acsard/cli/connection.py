@@ -48,9 +48,9 @@ def add_bus(parser: argparse.ArgumentParser, more: str = "") -> None:
 
 @contextmanager
 def connected(args: argparse.Namespace, source: str = "app") -> Iterator[Client]:
-    """Connect to the one robot that the options name.
+    """Connect to the one robot that the options name, and yield a client.
 
-    `source` is the command source as which the client sends commands.
+    The client sends its commands as the command source `source`.
     """
     endpoint, robot_id, tls = robot_address(args)
     with connect(endpoint, robot_id=robot_id, source=source, tls=tls) as robot:
@@ -58,7 +58,10 @@ def connected(args: argparse.Namespace, source: str = "app") -> Iterator[Client]
 
 
 def robot_address(args: argparse.Namespace) -> Address:
-    """Return the robot's address. Raises `UsageError` for several robots."""
+    """Return the address of the robot that the options name.
+
+    Raises `UsageError` if `--id` names several robots.
+    """
     require_one(args)
     _, config = load(args.config)
     return address_of(config, args.connect, args.id, args.tls)
@@ -75,11 +78,11 @@ def require_one(args: argparse.Namespace) -> None:
 
 @contextmanager
 def connected_to_many(args: argparse.Namespace) -> Iterator[tuple[Client, tuple[str, ...]]]:
-    """Connect to the bus. Yield a pair: a client, and the ids if `--id` names several robots.
+    """Connect to the bus, and yield a pair: a client, and a tuple of robot ids.
 
-    If `--id` is "*", the ids are ("*",). If `--id` names one robot, the ids are () and the client
-    is for that robot. If `--id` is missing, the ids are () and the client is for the configured
-    robot.
+    If `--id` names several robots, the tuple contains their ids; for `--id '*'` it is ("*",).
+    Otherwise the tuple is empty, and the client is for the robot that `--id` names. Without `--id`,
+    the client is for the configured robot.
     """
     many = named(args.id or "")
     _, config = load(args.config)
@@ -89,20 +92,20 @@ def connected_to_many(args: argparse.Namespace) -> Iterator[tuple[Client, tuple[
 
 
 def require_followed(key: str) -> None:
-    """Raise `UsageError`, with the command to type instead, if a key never has messages.
+    """Raise `UsageError` if no messages are published on `key`.
 
-    Print a warning if the key is not in the table of keys. Without the warning, a misspelt key
-    would look like a robot that sends nothing.
+    The text of the error contains the command to type instead. If `key` is not in the topic table,
+    print a warning. Without the warning, a misspelt key would look like a robot that sends nothing.
     """
     if unknown(key):
-        words = f"{key} is not in the topic table ({key_hint(key)}); waiting for it nevertheless"
+        words = f"{key} is not in the topic table ({key_hint(key)}); waiting for messages anyway"
         print(f"acsard: {printable(words)}", file=sys.stderr)
     row = row_of(key)
     if row is None:
         return
     instead = {
-        "query": f"only answers queries: type acsard get {key}",
-        "service": f"is a service: type acsard call {key.removeprefix('srv/')}",
+        "query": f"has no messages and only answers queries: type acsard get {key}",
+        "service": f"is a service without messages: type acsard call {key.removeprefix('srv/')}",
     }.get(row.direction)
     if row.key == "alive":
         instead = (
@@ -110,7 +113,7 @@ def require_followed(key: str) -> None:
             "present"
         )
     if instead is not None:
-        raise UsageError(f"nothing is published on {key}: it {instead}")
+        raise UsageError(f"the key {key} {instead}")
 
 
 def require_asked(key: str) -> None:
@@ -130,7 +133,8 @@ def require_asked(key: str) -> None:
         raise UsageError(f"{key} is a service: type acsard call {key.removeprefix('srv/')}")
     if row.direction == "in":
         raise UsageError(
-            f"{key} is an input and does not answer queries: acsard echo {key} prints its messages"
+            f"{key} is an input and does not answer queries: type acsard echo {key} to print the "
+            "messages that arrive on it"
         )
     if row.key == "alive":
         raise UsageError(
@@ -146,16 +150,17 @@ def explained(
     after_s: float = FIRST_S,
     timeout_s: float = math.inf,
 ) -> Iterator[Callable[[], None]]:
-    """Print why no messages arrive, and yield a function that the caller calls for each message.
+    """Print why no messages arrive. Yield a function that the caller must call for each message.
 
     A separate thread finds the reason and prints it on standard error, so that the caller can go on
     receiving. A reason that is "" is not printed.
 
     Args:
-        look: Function that returns the reason. It is called if no message arrives in the first
-            `after_s` s.
-        ceased: Function that returns the reason. It is called if no further message arrives for
-            `after_s` s. If it is None, only the silence before the first message is explained.
+        look: Function that returns why no message has arrived yet. It is called if no message
+            arrives in the first `after_s` s.
+        ceased: Function that returns why no further message arrives. It is called after each
+            `after_s` s without a message, until it returns a reason. If it is None, only the
+            silence before the first message is explained.
         after_s: Shortest silence that is explained, s.
         timeout_s: Silence after which the caller ends the context, s. If no message has arrived by
             then, the reason is printed before the context ends.
@@ -227,6 +232,9 @@ def _ceased(robot: Client) -> str:
 
 
 def _of_link(where: Address) -> str:
-    """Return the fault of the TLS connection, such as an expired certificate, or ""."""
+    """Return the fault of the TLS connection to `where`, such as an expired certificate.
+
+    Returns "" if the connection has no fault, or does not use TLS.
+    """
     secured = where.tls and where.endpoint.startswith(TLS)
     return trouble(where.endpoint, where.tls) if secured else ""

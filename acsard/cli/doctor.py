@@ -1,7 +1,8 @@
 """Check the configuration, the serial port and the process that uses it, permissions, the clock,
-real-time limits, causes that make this computer late, certificates, and the daemon if it runs. The
-address of the daemon is the one in the options, otherwise the one in the configuration. Each
-problem is printed with its fix. The exit code is 1 if a check fails, else 0.
+real-time limits, reasons why programs on this computer run late, certificates, and the daemon if it
+runs. The tool looks for the daemon at the address in the options. Without such an option, it uses
+the address in the configuration. Each problem is printed with its fix. The exit code is 1 if a
+check fails, else 0.
 """
 
 from __future__ import annotations

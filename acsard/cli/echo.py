@@ -1,8 +1,8 @@
 """Print each message on a key as one line of JSON, until Ctrl-C. Every key below the robot's id
 works, for example `cmd/teleop`. --csv prints wheel speeds, gyro and position as one table for
-`acsard calibrate --log`: acsard echo wheel_states imu --csv > drive.csv. --short prints pose,
-speeds and warnings as text: acsard echo odom -n 1 --short. If --id names several robots, each line
-names its robot, and -n N prints N messages of each robot.
+`acsard calibrate --log`, for example: acsard echo wheel_states imu --csv > drive.csv. --short
+prints pose, speeds and warnings as text, for example: acsard echo odom -n 1 --short. If --id names
+several robots, each line names its robot, and -n N prints N messages of each robot.
 """
 
 from __future__ import annotations
@@ -70,11 +70,11 @@ def main(args: argparse.Namespace) -> int:
     if args.csv:
         if named(args.id or ""):
             raise UsageError(
-                "a CSV log can hold only one robot: with --csv, name one robot in --id"
+                "a CSV log can contain only one robot: with --csv, name one robot in --id"
             )
         for key in args.topic:
             if key not in KEYS:
-                raise UsageError(f"{key} cannot be in a log; --csv takes {', '.join(KEYS)}")
+                raise UsageError(f"{key} cannot be in a CSV log; --csv takes {', '.join(KEYS)}")
         with connected(args) as robot, silence_explained(robot, topic, args.timeout) as heard:
             return _record(robot, args.topic, args.n, args.timeout, heard)
     if len(args.topic) > 1:
@@ -132,11 +132,18 @@ def _print(
     timeout: float | None,
     heard: Callable[[], None],
 ) -> int:
-    """Print one line per message, and return the exit code.
+    """Print one line per message in `samples`, and return the exit code.
 
-    The function returns 0 after Ctrl-C or when `quota` is used up. It returns 1 when `samples` ends
-    or when no message was printed for `timeout` s. It prints the short form if there is a
-    `decoder`, else JSON, and calls `heard` for each message.
+    The exit code is 0 after Ctrl-C or when `quota` is used up. It is 1 when `samples` ends or when
+    no message was printed for `timeout` s.
+
+    Args:
+        samples: the messages, as they arrive.
+        decoder: decodes a message for its short form; None to print JSON.
+        quota: limits the number of lines for each robot.
+        of_many: whether each line must name its robot.
+        timeout: longest time without a line, s, or None for no limit.
+        heard: function that is called for each message.
     """
     printed_s = time.monotonic()
     try:
@@ -190,7 +197,8 @@ def _record(
 ) -> int:
     """Print the messages on `keys` as rows of one CSV log, and return the exit code.
 
-    The function returns 0 after Ctrl-C or after `most` rows, and 1 after `timeout` s of silence.
+    The exit code is 0 after Ctrl-C or after `most` rows, and 1 if no message arrives for `timeout`
+    s. None means no limit. `heard` is called for each message.
     """
     queues = [(robot.subscribe(key), decoder(key)) for key in keys]
     print(HEADER, flush=True)
@@ -211,10 +219,10 @@ def _record(
 
 
 def _expected(robot: Client, ids: tuple[str, ...]) -> Collection[str]:
-    """Return `ids`, or for "*" the ids of the robots that are present now.
+    """Return `ids`. If they contain "*", return the ids of the robots that are present now.
 
-    Also print which robots are present. Otherwise the operator could not tell a silent robot from
-    an absent robot.
+    Also print which robots are present. Otherwise the operator could not distinguish a silent robot
+    from an absent robot.
     """
     there: list[str] = []
     try:

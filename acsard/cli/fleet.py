@@ -1,11 +1,11 @@
 """Show mode, speed, link, place, version and reason of every robot that the bus or router at
 --connect knows, live; q or Ctrl-C quits. Over TLS a role may use only exact keys, so name the
 robots: --id robot1,robot2. Into a pipe, or with --once, the tool prints one table. PLACE gives x
-and y in m and the heading. SEEN gives the age of the last report. WHY begins with warnings, even if
-the robot is still ready: a certificate that expires soon, a recording or a latch file that fails, a
-wheel fault, settings that differ from the configuration file. The end of the line gives the
-details. On a narrow terminal some columns are left out and long lines are cut; `acsard fleet | cat`
-prints everything.
+and y in m and the heading. SEEN gives the age of the last report. WHY gives the warnings, then the
+reason why the robot moves or does not move, then the details of the warnings. A robot that is ready
+can have warnings too: a certificate that expires soon, a recording or a latch file that fails, a
+wheel fault, settings that differ from the configuration file. On a narrow terminal some columns are
+left out and long lines are cut; `acsard fleet | cat` prints everything.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Serve the robot's topics to Foxglove and Lichtblick (2026 and later) on this machine until
-Ctrl-C, with a service that stops the robot. With --drive, also offer the other services and the
+"""Serve the robot's topics, and the service that stops the robot, to Foxglove and Lichtblick (2026
+and later) on this machine until Ctrl-C. With --drive, also offer the other services and the
 settings, and let a Teleop panel drive the robot on /cmd_vel as source `app`. In Foxglove, open a
 connection of the type `Foxglove WebSocket`.
 """

@@ -1,6 +1,6 @@
 """Listen at the tls/ endpoints of bus.listen and pass on to the daemon only the messages that each
 client's certificate allows. `acsard run` starts this gateway by itself; its systemd service is
-acsard-gateway.service. The gateway exits with code 1 when it must be restarted.
+acsard-gateway.service. If the gateway ends with exit code 1, start it again.
 """
 
 from __future__ import annotations

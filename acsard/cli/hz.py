@@ -1,5 +1,5 @@
-"""Measure how often messages arrive on a key and how regular the gaps between them are. The tool
-prints one line per second over the last 10 s, until Ctrl-C.
+"""Measure how often messages arrive on a key, and how much the time from one message to the next
+varies. Each second until Ctrl-C, the tool prints one line about the last 10 s.
 """
 
 from __future__ import annotations
@@ -51,9 +51,11 @@ def main(args: argparse.Namespace) -> int:
 
 
 def rate(times: list[float]) -> dict[str, float]:
-    """Return the count and rate, Hz, of messages, and the gaps between them, ms.
+    """Return statistics of messages that arrived at `times`, s, in this order.
 
-    `times` are the arrival times, s. With fewer than two, the rate is 0 and the gaps are left out.
+    The statistics are the number of messages, their rate in Hz, and the minimum, percentiles,
+    maximum and standard deviation of the gap from one message to the next, ms. With fewer than two
+    messages, the rate is 0 and the gaps are left out.
     """
     if len(times) < 2 or times[-1] <= times[0]:
         return {"count": len(times), "hz": 0.0}

@@ -1,6 +1,6 @@
-"""Print a man page of all subcommands and options, for example into
-~/.local/share/man/man1/acsard.1. Needs the library argparse-manpage; if it is missing, a message
-gives the command that installs it.
+"""Print a man page of all subcommands and options. To install the page for yourself, write this
+output to ~/.local/share/man/man1/acsard.1. Needs the library argparse-manpage; if it is missing, a
+message gives the command that installs it.
 """
 
 from __future__ import annotations

@@ -87,8 +87,8 @@ def _checked(
 ) -> int:
     """Check the board, print the report, and return the exit code.
 
-    Changes are suggested to `configured`, the configuration in the file `where`. `config` is the
-    same configuration with the values of the options.
+    `config` is the configuration with the values of the options, with which the board is checked.
+    `configured` is the configuration in the file `where`. The report suggests changes to that file.
     """
     port, simulated = config.mcu.port, config.mcu.simulated
     findings: list[Finding] = []
@@ -129,7 +129,10 @@ def _checked(
 
 
 def _prompt(args: argparse.Namespace, port: str) -> TerminalPrompt | NoPrompt | JsonPrompt:
-    """Return the prompt. Raises `UsageError` if wheels could turn without a person's consent."""
+    """Return the prompt that asks the person near the robot.
+
+    Raises `UsageError` if wheels at `port` could turn without a person's consent.
+    """
     if port == SIMULATOR and args.port != SIMULATOR:
         raise UsageError(
             "no port is configured, so there is no board to check (mcu.port is the simulator, "
@@ -152,15 +155,18 @@ def _prompt(args: argparse.Namespace, port: str) -> TerminalPrompt | NoPrompt | 
     if master is None or master.name != "acsard":
         what = f"a pty of {master.name}" if master else "not a simulator of acsard"
         raise UsageError(
-            f"{port} is {what}: a robot may be behind it, and --yes would turn its wheels without "
-            "a question. Either leave --yes out, or lift the wheels, stay with the robot and add "
-            "--wheels-are-lifted",
+            f"{port} is {what}: a robot may be connected to it, and --yes would turn its wheels "
+            "without a question. Either leave --yes out, or lift the wheels, stay with the robot "
+            "and add --wheels-are-lifted",
         )
     return NoPrompt(args.json)
 
 
 def _wire(config: Config) -> Wire:
-    """Return the serial port, or the built-in simulator in virtual time, which does not wait."""
+    """Return the connection to the board: the serial port, or the built-in simulator.
+
+    The simulator runs in virtual time, so a check on it does not take real time.
+    """
     if config.mcu.port == SIMULATOR:
         return VirtualWire(FakeMcu(config))
     return BlockingPort(config.mcu.port)

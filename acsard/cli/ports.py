@@ -13,7 +13,7 @@ import msgspec
 from acsard.machine.serial_ports import serial_devices
 
 PLUGGED_IN = (
-    "check that the board is plugged in, and that its USB cable is not only for charging; "
+    "check that the board is plugged in, and that its USB cable carries data, not only power; "
     "`dmesg | tail` shows the kernel's messages about USB devices"
 )
 

@@ -1,8 +1,8 @@
 """Work with the recordings that the daemon has made. Without a subcommand, list them, oldest
-first, with the main events of each. `!` marks those with a stop, a fault or a crash. --from and
---to limit the list to the recordings of that time. The argument FILE of a subcommand is the file of
-a recording, its number in the list, or `all`. Without FILE, a subcommand uses the newest recording,
-or all recordings between --from and --to if these are dates or times.
+first, with the main events of each. `!` marks recordings with a stop, a fault or a crash. With
+--from and --to, list only the recordings from the time between them. The argument FILE of a
+subcommand is the file of a recording, its number in the list, or `all`. Without FILE, a subcommand
+uses the newest recording, or all recordings between --from and --to if these are dates or times.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ from acsard.report.page import drawn
 from acsard.terminal.output import show, table
 
 MAX_NAMES = 10
-"""Largest number of recordings that a search names. It also lists at most this many gaps."""
+"""A search prints at most this many names of recordings. It also prints at most this many gaps."""
 
 SERVICE = Path("/var/lib/acsard/record")
 """The directory in which the systemd service stores its recordings."""
@@ -86,16 +86,16 @@ _MISNAMED = {
     ("mcap", ".csv"): "add --csv to write a table, or let the name end in .mcap",
     ("csv", ".mcap"): "leave out --csv to write MCAP, or let the name end in .csv",
     ("csv", ".html"): "let the name end in .csv; `acsard recording report` writes HTML",
-    ("rosbag2", ".csv"): "write --csv in place of --rosbag2 for a table, or leave out .csv for the "
-    "name of a directory",
-    ("rosbag2", ".mcap"): "leave out --rosbag2 to write one MCAP file, or leave out .mcap for the "
-    "name of a directory",
+    ("rosbag2", ".csv"): "write --csv in place of --rosbag2 to get a table, or leave out .csv to "
+    "get a directory",
+    ("rosbag2", ".mcap"): "leave out --rosbag2 to write one MCAP file, or leave out .mcap to get a "
+    "directory",
     ("html", ".csv"): "let the name end in .html; `acsard recording export --csv` writes a table",
     ("html", ".mcap"): "let the name end in .html; `acsard recording export` writes MCAP",
     ("html", ".txt"): "let the name end in .html; `acsard recording show` prints text",
 }
-"""Maps a pair of an output format and a wrong suffix to the advice for the operator. The suffix is
-that of the file name which the operator typed."""
+"""Maps a pair to the advice for the operator. The pair consists of the output format, and of the
+suffix in the file name that the operator typed, which does not fit this format."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -107,19 +107,20 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "show",
         help="print the events of a recording as text",
         description="Print the events of a recording as text, one line per event. A line `gap` "
-        "marks missing steps, for example because the file is damaged; the exit code is still 0.",
+        "shows where steps are missing, for example because the file is damaged; the exit code is "
+        "still 0.",
     )
-    shown.add_argument("--json", action="store_true", help="print one JSON object a line")
+    shown.add_argument("--json", action="store_true", help="print each event as a line of JSON")
     shown.set_defaults(main=main_show)
     replay = actions.add_parser(
         "replay",
         help="run the recorded inputs through the program again, without a robot, and compare the "
         "results",
         description="Run the recorded inputs through the program again, without a robot, and "
-        "compare each line for the board, pose, mode, reason and event with the recorded one. "
-        "With --config, show what another configuration would have changed. A part that cannot be "
-        "read because of damage is not compared. Exit codes: 0 everything is the same, 1 something "
-        "differs, 65 a part was not compared and the rest is the same.",
+        "compare the results with the recorded ones: each line to the board, and each pose, mode, "
+        "reason and event. With --config, show what another configuration would have changed. A "
+        "part that cannot be read because of damage is not compared. Exit codes: 0 everything is "
+        "the same, 1 something differs, 65 a part was not compared and the rest is the same.",
     )
     replay.set_defaults(main=main_replay)
     recover = actions.add_parser(
@@ -137,14 +138,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     recover.set_defaults(main=main_recover)
     exported = actions.add_parser(
         "export",
-        help="write a recording as a file for Foxglove, PlotJuggler, ros2 bag, or as a table",
+        help="convert a recording to a file for Foxglove, PlotJuggler or ros2 bag, or to a table",
         description=EXPORT,
     )
     exported.set_defaults(main=main_export)
     report = actions.add_parser(
         "report",
-        help="draw a recording as one HTML file with the robot's path and speeds, the "
-        "command sources, the serial link and the events",
+        help="draw the robot's path and speeds, the command sources, the serial link and the "
+        "events of a recording, as one HTML file",
         description=REPORT,
     )
     report.set_defaults(main=main_report)
@@ -192,7 +193,7 @@ def _export_forms(parser: argparse.ArgumentParser) -> None:
         action="store_const",
         const="csv",
         default="mcap",
-        help="write a CSV table with one row per feedback line, whose first columns are those that "
+        help="write a CSV table with one row per feedback line; its first columns are those that "
         "`acsard calibrate --log` reads",
     )
     form.add_argument(
@@ -304,7 +305,10 @@ def _is_being_recorded(recording: Recording) -> bool:
 
 
 def _show(recording: Recording, part: Span, as_json: bool) -> bool:
-    """Print the events in the time span `part`. Return whether the recording has steps in it."""
+    """Print the events in the time span `part`, as JSON or as text.
+
+    Return whether the recording has steps in this span.
+    """
     story = TimelineWriter(_config_of(recording))
     found, over = False, False
     for step in steps(recording):
@@ -467,7 +471,10 @@ def _files_to_write(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
 
 
 def _parts(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
-    """Return the recordings that the arguments name, each with its span from --from to --to."""
+    """Return the recordings that the arguments name, each with the span of time to read in it.
+
+    --from and --to limit this span.
+    """
     times = [when for when in (args.begin, args.end) if when is not None]
     by_clock = bool(times) and not any(isinstance(when, Offset) for when in times)
     if args.file == "all" or (args.file is None and by_clock):
@@ -591,7 +598,7 @@ def _progress(recording: Recording) -> Iterator[Callable[[int], None]]:
 
 @contextmanager
 def _written(new: Path) -> Iterator[None]:
-    """Raise an `ExitError` with the path if the file `new` cannot be written."""
+    """Convert an `OSError` in the `with` block to an `ExitError` that names the file `new`."""
     try:
         yield
     except OSError as error:
@@ -602,8 +609,8 @@ def _written(new: Path) -> Iterator[None]:
 def _percent(recording: Recording) -> Callable[[int], None]:
     """Return a function that prints the progress in percent on standard error.
 
-    The web server reads it there. The argument of the function is the recorded wall-clock time, ns,
-    up to which the recording has been read.
+    The page's server, which starts this program, reads the percentage there. The argument of the
+    returned function is the recorded wall-clock time, ns, up to which the recording has been read.
     """
     last, began = read_end(recording.path), recording.about.wall_ns / 1e9
     end = last.last_ns / 1e9 if last else recording.path.stat().st_mtime

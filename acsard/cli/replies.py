@@ -19,7 +19,10 @@ from acsard.host.errors import Exit
 
 
 def of_robot(whose: str, line: str) -> str:
-    """Return the JSON line `{"robot": ..., "message": ...}`; `line` is the message as JSON."""
+    """Return the JSON line `{"robot": whose, "message": line}`.
+
+    `whose` is the id of a robot, and `line` is its message as JSON.
+    """
     told = {"robot": whose, "message": msgspec.Raw(line.encode())}
     return formatting.json_line(msgspec.json.encode(told).decode())
 
@@ -45,8 +48,9 @@ def of_each(
 ) -> dict[str, ServiceReply | AcsardError]:
     """Call a service of several robots at the same time, and return the replies by robot id.
 
-    `ids` names the robots; "*" in it means all robots that are present. `call` calls the service
-    with a client of one robot. Raises `NoAnswerError` if "*" is given and no robot is present.
+    `ids` names the robots; "*" in it means all robots that are present. `call` takes a client of
+    one robot, and calls the service of this robot. Raises `NoAnswerError` if "*" is given and no
+    robot is present.
     """
     wanted = present(robot.session, ids, robot.where.endpoint) if ALL in ids else list(ids)
 
@@ -65,9 +69,9 @@ def print_each(
 ) -> int:
     """Print one line for the reply of each robot, and return the exit code.
 
-    The exit code is `UNREACHABLE` if a robot did not answer. Otherwise it is `FAILURE` if a robot
-    refused, else `OK`. `ids` are the ids that the operator named. `silence` is the template of the
-    line to print for a robot that did not answer; `{error}` in it is replaced by the reason.
+    The exit code is `UNREACHABLE` if any robot did not answer. Otherwise it is `FAILURE` if any
+    robot refused, else `OK`. `ids` are the ids that the operator named. `silence` is a template for
+    the line of a robot that did not answer; `{error}` in it is replaced by the reason.
     """
     for one, reply in replies.items():
         if isinstance(reply, AcsardError):

@@ -1,6 +1,6 @@
 """Run Zenoh in router mode with a configuration file of Zenoh, such as deploy/zenoh/router.json5.
 The router is a child process. It is killed and restarted if a client takes all of the router's
-processor time or memory. It runs no plugins; for storages use zenohd.
+processor time or memory. It loads no plugins of Zenoh; if you need storages, use zenohd instead.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ def main(args: argparse.Namespace) -> int:
 
 
 async def _kept(file: str, log: Log) -> int:
-    """Keep a router process running, and return the exit code.
+    """Keep a router process with the configuration `file` running, and return the exit code.
 
-    It ends when a signal arrives, or when its configuration or certificates cannot be used.
+    Return when a signal arrives, or when the configuration or the certificates cannot be used.
     """
     keeper = asyncio.ensure_future(keep_running(["router", file], log.event, ROUTER))
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):

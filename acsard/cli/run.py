@@ -72,7 +72,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def options(args: argparse.Namespace) -> dict[str, object]:
-    """Return the value of each option by its dotted configuration key; None if it is not given."""
+    """Return a mapping from dotted configuration keys to the values of the options.
+
+    The value of an option that was not given is None.
+    """
     return {
         "mcu.port": args.port,
         "mcu.baud_rate": args.baud_rate,
@@ -139,8 +142,9 @@ def main(args: argparse.Namespace) -> int:
 def settings_file(where: str, config: Config, given: dict[str, object]) -> SettingsFile:
     """Return the `SettingsFile` of the configuration file at `where`.
 
-    It parses the file as the daemon would after a restart. `config` is the present configuration.
-    `given` maps dotted keys to the values from the command line, which override the file.
+    The result can parse the file as the daemon would after a restart. `config` is the present
+    configuration. `given` maps dotted keys to the values from the command line, which override the
+    file.
     """
     overrides = tables(given, by_environment())
     file = Path(where).absolute() if Path(where).is_file() else None
@@ -148,10 +152,10 @@ def settings_file(where: str, config: Config, given: dict[str, object]) -> Setti
 
 
 def page(config: Config, where: str) -> list[str] | None:
-    """Return the arguments with which `acsard web` serves the robot's page, or None to serve none.
+    """Return the arguments with which to start `acsard web`, or None to serve no page.
 
-    The page is served if `web.page` is set, standard output is a terminal, the daemon is not a
-    systemd service, and the page's libraries are installed. `where` is the path of the
+    The robot's page is served if `web.page` is set, standard output is a terminal, the daemon is
+    not a systemd service, and the page's libraries are installed. `where` is the path of the
     configuration file.
     """
     looked_at = sys.stdout is not None and sys.stdout.isatty() and "INVOCATION_ID" not in os.environ
@@ -195,6 +199,9 @@ def banner(
     """Return the banner that the daemon prints at its start.
 
     Args:
+        config: the daemon's configuration.
+        where: the path of the configuration file.
+        device: the path of the serial device.
         trouble: why the serial device `device` cannot be opened yet, or "".
         reach: the options that another tool needs to reach this daemon.
         served: whether the robot's web page is served.

@@ -57,7 +57,7 @@ def main_install(args: argparse.Namespace) -> int:
     )
     _do(steps, args.dry_run)
     if not args.dry_run:
-        print("\nnow set [mcu] and [robot] in /etc/acsard/acsard.toml, then:")
+        print("\nnow set [mcu] and [robot] in /etc/acsard/acsard.toml, then type:")
         print("systemctl restart acsard && acsard doctor --config /etc/acsard/acsard.toml")
     return 0
 
@@ -76,14 +76,17 @@ def main_uninstall(args: argparse.Namespace) -> int:
     _do(steps, args.dry_run)
     if sys.prefix != sys.base_prefix:  # a venv: never advise to delete a Python of the system
         print(
-            f"\nThe program itself stays in {sys.prefix}; to remove the program, delete that "
+            f"\nThe program itself is still in {sys.prefix}; to remove the program, delete that "
             "directory"
         )
     return 0
 
 
 def main_status(args: argparse.Namespace) -> int:
-    """Print the state of the service's files and units. Return 0 if the daemon's unit is active."""
+    """Print the state of the service's files and units.
+
+    Return 0 if the daemon's unit is active, else 1.
+    """
     show(table((file.condition(), str(file.path)) for file in service.files()))
     state = service.state(service.UNIT)
     print(state or "systemd does not answer: check that this machine runs systemd")

@@ -5,7 +5,7 @@ limits of speed, acceleration and jerk are an exception: they also survive the n
 on the simulator. With --keep the robot also writes the settings into its own configuration file,
 and the answer names that file. With --write this tool writes them into the configuration file of
 this machine. Neither --keep nor --write changes the file for a source's timeout: edit
-[[commands.sources]] yourself. If a speed limit is lowered, a faster robot decelerates to it.
+[[commands.sources]] yourself. A robot that drives faster than a new limit slows down to it.
 Without a setting, list the settings that can be changed. If --id names several robots, all of them
 get the settings at the same time, and each line has the answer of one robot. The exit code is 1 if
 a robot refuses, and 69 if a robot does not answer.
@@ -39,7 +39,7 @@ from acsard.host.errors import Exit, MendableError, UsageError
 from acsard.host.extras import install
 
 _CHANGE = re.compile(r"([\w.-]+) = (.+?) \(was (.+?)\)(?:, |$)")
-"""Pattern of one change in the daemon's answer."""
+"""Pattern of one change in the daemon's answer, such as "rates.state = 5 (was 10)"."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -132,7 +132,7 @@ def _require_for_many(args: argparse.Namespace, settings: dict[str, Plain]) -> N
 
 
 def _lasting(message: str) -> str:
-    """Return the daemon's answer, extended by how long the changed settings stay in force."""
+    """Return the daemon's answer, followed by how long the changed settings stay in force."""
     until = _until(message)
     return f"{message}; {until}" if until else message
 
@@ -152,20 +152,20 @@ def _until(message: str) -> str:
     except (TypeError, ValueError):  # a daemon of another version may have other limits
         kept = {}
     if not kept:
-        return "until the daemon's next start"
+        return "in force until the daemon's next start"
     if len(kept) == len(changes):
         return "a lowered limit survives a restart of the daemon, except on the simulator"
     return (
-        f"until the daemon's next start, except {', '.join(kept)}: a lowered limit survives a "
-        "restart. On the simulator, no setting survives a restart"
+        f"in force until the daemon's next start, except {', '.join(kept)}: a lowered limit "
+        "survives a restart. On the simulator, no setting survives a restart"
     )
 
 
 def _limits(pairs: Mapping[str, Sequence[str]], at: int) -> LimitsConfig:
-    """Return the limits with one value of each change.
+    """Return the limits with the new or the old values of all changed keys.
 
     `pairs` maps each changed key to the pair (new value, old value). `at` is 0 for the new values
-    and 1 for the old values. Other limits have their defaults.
+    and 1 for the old values. Limits that were not changed have their defaults.
     """
     return LimitsConfig(**{key.removeprefix(TABLE): float(pair[at]) for key, pair in pairs.items()})
 
@@ -184,7 +184,10 @@ def _set_all(
 
 
 def _file(path: str | None, settings: dict[str, Plain]) -> Path:
-    """Return the file that --write changes. Raises `UsageError` if --write cannot be used."""
+    """Return the file that --write changes; `path` is the value of --config, or None.
+
+    Raises `UsageError` if --write cannot write these `settings`.
+    """
     if not settings:
         raise UsageError("--write needs a setting: acsard set limits.linear_speed 0.8 --write")
     if any(key.startswith("commands.sources.") for key in settings):

@@ -43,9 +43,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="simulate the fault NAME; repeat the option for several faults. NAME alone: "
         f"{', '.join(FAULTS)}. NAME with motors (a to d) or numbers: {', '.join(_with_names())}; "
         "reset=SECONDS (the MCU restarts every SECONDS). START is the time in seconds until the "
-        "fault begins. If SECONDS is 0, the fault does not end. EVERY is the time in seconds from "
-        "one stall to the next. BUMPER is 1 to 4. The battery starts with PERCENT of its charge; a "
-        "full battery lasts MINUTES while the robot is at rest",
+        "fault begins, and SECONDS is its duration; 0 SECONDS means that it does not end. EVERY is "
+        "the time in seconds from the start of one stall to the start of the next. "
+        "BUMPER is 1 to 4. The battery starts with PERCENT of its charge; a full battery lasts "
+        "MINUTES while the robot is at rest",
     )
     parser.add_argument(
         "--link",
@@ -73,7 +74,10 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _make_link(link: Path, device: str) -> None:
-    """Make a symbolic link to the device. An older link is replaced, but another file is not."""
+    """Make the symbolic link `link` to `device`. Replace an existing symbolic link.
+
+    Raises `UsageError` if the link cannot be made, for example because `link` is another file.
+    """
     try:
         if link.is_symlink():
             if link.exists():
@@ -87,7 +91,10 @@ def _make_link(link: Path, device: str) -> None:
 
 
 def _remove_link(link: Path, device: str) -> None:
-    """Remove the symbolic link, unless another program has replaced it in the meantime."""
+    """Remove the symbolic link if it still leads to `device`.
+
+    Another program may have replaced it in the meantime.
+    """
     if link.is_symlink() and os.readlink(link) == device:
         link.unlink()
 

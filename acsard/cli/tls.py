@@ -34,8 +34,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="make a certificate authority, the robot's certificate and a client certificate for "
         "each role",
         description="Make a certificate authority, the robot's certificate, and one certificate "
-        "each for viewer, operator and maintainer. Print the lines for acsard.toml "
-        "with which the robot uses the certificates.",
+        "each for viewer, operator and maintainer. Print the lines to write into acsard.toml, so "
+        "that the robot uses the certificates.",
     )
     init.add_argument("--force", action="store_true", help="overwrite existing files")
     init.add_argument(
@@ -152,7 +152,7 @@ def main_init(args: argparse.Namespace) -> int:
     names = certificates.init(args.directory, args.address, args.days, force=args.force)
     if args.write:
         wanted = change(args.write, keys, new=True)
-        print(f"{args.write}: set bus.listen = {write(wanted['bus.listen'])} and bus.tls\n")
+        print(f"{args.write} now has bus.listen = {write(wanted['bus.listen'])} and bus.tls\n")
     _admit_service(directory)
     host, robot = socket.gethostname(), configs[-1].robot.id
     files = {"ca": CA, "certificate": CERTIFICATE, "key": KEY}
@@ -187,7 +187,7 @@ def main_add(args: argparse.Namespace) -> int:
         return 0
     if args.write:
         names = write(change(args.write, keys, new=True)[f"access.{listed}"])
-        print(f"{place} is for {args.name}; {args.write}: set access.{listed} = {names}")
+        print(f"{place} is for {args.name}; {args.write} now has access.{listed} = {names}")
     else:
         names = write(keys(config)[f"access.{listed}"])
         print(_ADDED.format(place=place, name=args.name, where=where))
@@ -203,11 +203,11 @@ def main_renew(args: argparse.Namespace) -> int:
     if args.name:
         place = certificates.renew_client(args.directory, args.name, args.address, args.days)
         files = ", ".join((CA, CERTIFICATE, KEY))
-        print(f"{place} has a new certificate. Copy {files} to the place of the old ones.\n")
+        print(f"{place} has a new certificate. Copy {files} from there over the old files.\n")
         print(TAKEN)
         return 0
     print(_certified(certificates.renew(args.directory, args.address, args.days)))
-    print(f"{args.directory / CERTIFICATE} is new.\n\n{TAKEN}")
+    print(f"{args.directory / CERTIFICATE} is the new certificate.\n\n{TAKEN}")
     return 0
 
 
@@ -221,7 +221,7 @@ def main_router(args: argparse.Namespace) -> int:
 
 
 def _certified(names: list[str]) -> str:
-    return f"The robot's certificate is valid for {', '.join(names)} (add more with --address).\n"
+    return f"The robot's certificate is valid for {', '.join(names)} (--address adds names).\n"
 
 
 def _admit_service(directory: Path) -> None:

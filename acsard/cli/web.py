@@ -1,6 +1,6 @@
 """Serve the robot's page for a running daemon until Ctrl-C. `acsard run` in a terminal starts this
-by itself. A browser on the robot's machine needs no token and has the role of web.local. A browser
-on another machine needs HTTPS with the robot's certificate, and a token.
+by itself. A browser on the robot's machine needs no token, and has the role that the setting
+web.local names. A browser on another machine needs HTTPS with the robot's certificate, and a token.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--address",
         action="append",
         metavar="URL",
-        help="address at which to serve the page, instead of web.address; may be repeated; "
-        "https://0.0.0.0:8443 lets browsers on other machines connect",
+        help="address at which to serve the page, instead of web.address; repeat the option for "
+        "several; https://0.0.0.0:8443 lets browsers on other machines connect",
     )
     parser.add_argument(
         "--record",
@@ -80,7 +80,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--hours",
         type=whole("hours", MOST_HOURS, "; for more use --days"),
         metavar="N",
-        help=f"instead of --days: hours until the token expires, for a visitor, 1 to {MOST_HOURS}",
+        help=f"hours until the token expires, 1 to {MOST_HOURS}; use it instead of --days, for "
+        "example for a visitor",
     )
     parser.add_argument("--supervised", action="store_true", help=argparse.SUPPRESS)
 
@@ -166,7 +167,7 @@ def _invite(args: argparse.Namespace, config: Config, where: str) -> int:
     days = 0 if args.hours else args.days or USUAL_DAYS
     text, token = vault.invite(args.invite, args.name or args.invite, days, args.hours or 0)
     until = f"{_clock(token.ends)}, for {lasting(token.ends - token.made)}"
-    print(f"{token.name} is {token.role} until {until}; the link is shown only now:\n")
+    print(f"{token.name} is {token.role} until {until}; the link is not shown again:\n")
     for url in urls:
         print(f"  {url}#token={text}")
     print()

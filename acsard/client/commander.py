@@ -1,10 +1,10 @@
 """The rules for a sender of commands: what it sends and when, and why a command has no effect.
 
-This module is pure. Every program that commands the robot uses these time limits. A program that
-forwards the commands of a person (`Wish`), for example from a panel in a browser, uses a
-`Commander`. A `Commander` never repeats a command, so the robot stops when the person, the panel or
-the network falls silent. A new command replaces a command that still waits to be sent. A zero is
-sent even if it is old. A drive ends with a zero.
+This module is pure. Every program that commands the robot uses its time limits. A program that
+forwards the commands of a person, for example from a panel in a browser, passes each command as a
+`Wish` to a `Commander`. A `Commander` never repeats a command, so the robot stops when the person,
+the panel or the network falls silent. A new command replaces a command that still waits to be sent.
+A zero is sent even if it is old. A drive ends with a zero.
 """
 
 from __future__ import annotations
@@ -33,27 +33,27 @@ whether the commands of a new sender are late. With many zeros in this time, the
 machine does not prolong the check."""
 
 OPENED_S = 4.0
-"""Time within which the daemon must accept the zeros at the beginning of a drive, s. If the source
-has a long timeout, the daemon checks the delay of a new sender for up to 2 s. The rest of the time
-lets another sender finish its drive."""
+"""Time within which the daemon must accept the zeros at the beginning of a drive, s; otherwise the
+drive fails. If the source has a long timeout, the daemon checks the delay of a new sender for up to
+2 s. In the rest of the time, another sender can finish its drive."""
 
 ZEROS = 3
-"""Number of zeros that a sender sends at the end, in case the network loses one."""
+"""Number of zeros that a sender sends at the end of a drive, in case the network loses some."""
 
 GRACE_S = 0.5
-"""Longest time for which commands may have no effect, s, before the program informs the operator or
-ends the drive. If the program itself sends no command for longer, the drive ends too. The time is
-longer than the first 0.25 s of a new sender, in which its commands have no effect yet, and longer
-than a short delay of a known sender."""
+"""Longest time for which commands may have no effect, s. After this time, the program informs the
+operator or ends the drive. A drive also ends if the program itself sends no command for longer than
+this. During the first 0.25 s, the commands of a new sender have no effect yet, so this time must be
+longer. It must also be longer than a short delay of a known sender."""
 
 SILENCE_NS = 3 * NS_PER_S // 10
 """Time without a command, ns, after which the robot is assumed to brake. It is a little longer than
 a source's default timeout of 0.25 s."""
 
 GATHER_NS = NS_PER_S // 25
-"""Time for which the first command after a silence is held, ns, to see whether a burst follows. A
+"""Time for which the first command after a silence waits, ns, to see whether a burst follows. A
 panel that sends at 20 Hz sends at most one command in this time. After a burst of more than `CROWD`
-commands, the next command is held in the same way."""
+commands, the next command waits too."""
 
 CROWD = 5
 """Largest number of commands that a panel is assumed to send within `GATHER_NS` (125 Hz). If more
@@ -83,7 +83,7 @@ class Wish(Struct, frozen=True):
     twist: Twist
     stamp_ns: int | None = None
     steady: bool = False
-    """Whether the clock of `stamp_ns` is never adjusted."""
+    """Whether `stamp_ns` is from a steady clock, which nothing adjusts."""
 
 
 class Commander:
@@ -110,7 +110,7 @@ class Commander:
         self._lead = False
         self._hold_until_ns = 0
         self._burst = 0
-        """Number of commands that arrived during the wait after a silence (see `GATHER_NS`).
+        """Number of commands that have arrived while the first of them waits (see `GATHER_NS`).
         `send()` resets it."""
         self._crowded = False
         """Whether the last burst had more than `CROWD` commands."""
@@ -143,7 +143,7 @@ class Commander:
         return silence if begins else None
 
     def due_ns(self) -> int | None:
-        """Return the monotonic time from which `send` returns a command, ns.
+        """Return the monotonic time at which the caller must call `send`, ns.
 
         Returns None if no command waits to be sent.
         """
@@ -224,7 +224,7 @@ class Sender:
 
         Args:
             stamp_ns: the time of the command on the sender's clock, ns, or None without a clock.
-            steady: whether this clock is never adjusted.
+            steady: whether this is a steady clock, which nothing adjusts.
             zero: whether the command is a zero.
         """
         self._sequence += 1
@@ -267,7 +267,7 @@ def objection(state: RobotState, source: str, sender: str) -> str:
 
 
 def no_command(source: str) -> str:
-    """Return the reason for the operator if the daemon receives no command of `source`."""
+    """Return the text that tells the operator that the daemon receives no command of `source`."""
     return (
         f"the daemon receives no command of source {source}; `acsard top` shows whether the daemon "
         "refuses commands"
@@ -275,7 +275,10 @@ def no_command(source: str) -> str:
 
 
 def heard(state: RobotState, source: str) -> bool:
-    """Return whether commands of this source arrive at the daemon. Late commands count too."""
+    """Return whether `state` shows that commands of this source arrive at the daemon.
+
+    Late commands count too.
+    """
     return any(one.name == source and one.waits_for != "a command" for one in state.sources)
 
 

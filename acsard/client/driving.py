@@ -35,18 +35,18 @@ SETTLED_S = 0.2
 after an action, the daemon sent it after the action."""
 
 STANDS = 0.01, 0.02
-"""The robot counts as standing below this linear speed, m/s, and below this turn rate, rad/s."""
+"""Linear speed, m/s, and turn rate, rad/s. The robot counts as standing if it is below both."""
 
 SLOWER, SLOWS_S = 0.97, 1.0
-"""The robot is still slowing down if, within `SLOWS_S` s, its speed falls below the fraction
-`SLOWER` of its lowest speed so far."""
+"""The robot counts as slowing down if, within `SLOWS_S` s, its speed falls below `SLOWER` times the
+lowest speed that it had since the drive ended."""
 
 
 CLOSED = "the connection to the daemon was closed while the robot was driving"
 
 
 class UnheardError(NotDrivenError):
-    """The error of a drive if the daemon receives no commands from the source of this client."""
+    """The daemon receives no commands from the source of this client, so a drive has failed."""
 
 
 class Driven(Followed, Protocol):
@@ -69,9 +69,9 @@ def drive(
     generator. `linear` is in m/s and `angular` in rad/s (left is +).
 
     Raises:
-        NotDrivenError: The robot does not follow the commands, and the text is the daemon's reason.
-            Or, before it began to stop the robot, this program sent no command for more than
-            `GRACE_S` s.
+        NotDrivenError: The robot does not follow the commands; the text is the daemon's reason. Or
+            this program sent no command for more than `GRACE_S` s, before it sent the zeros at the
+            end.
         NoAnswerError: The daemon is silent.
         UsageError: An argument is not a finite number, or `seconds` is not above 0.
     """
@@ -123,9 +123,9 @@ def _opening(checks: _Drive) -> Iterator[float]:
 
 
 def _stopping(checks: _Drive) -> Iterator[float]:
-    """Send zeros, and yield the pauses between them, s.
+    """Send zeros until the robot stands, and yield each pause between two zeros in seconds.
 
-    End when the robot stands, or when it no longer slows down, because something else moves it.
+    End also when the robot no longer slows down, because then something else moves it.
     """
     begun = since = clock.steady_s()
     watch, slowest = checks.watch, math.inf
@@ -174,7 +174,7 @@ class _Drive:
             raise NoAnswerError(CLOSED) from None
 
     def require_no_pause(self) -> None:
-        """Raise `NotDrivenError` if more than `GRACE_S` has passed since the last call.
+        """Raise `NotDrivenError` if the previous call was more than `GRACE_S` s ago.
 
         The process may have been stopped, its computer may have been suspended, or the bus may not
         have accepted the command. The received states cannot reveal such a pause, because old
@@ -190,7 +190,7 @@ class _Drive:
             )
 
     def look(self) -> None:
-        """Process the received states. Raises `NoAnswerError` if the daemon has been silent."""
+        """Process the received states. Raises `NoAnswerError` if the daemon counts as silent."""
         now, watch = clock.steady_s(), self.watch
         try:
             news = watch.look(now)

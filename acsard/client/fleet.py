@@ -38,7 +38,7 @@ class Row(Struct, frozen=True):
     seen."""
     state: RobotState | None
     age: float
-    """Age of `state`, s; inf before a state has proved that the daemon runs."""
+    """Age of `state`, s; infinite as long as no state has proved that the daemon runs."""
     version: str
     silent: bool = False
     """Whether the robot counts as silent, because no state has arrived for too long a time."""
@@ -53,9 +53,9 @@ class _Known:
         self.begin()
 
     def begin(self) -> None:
-        """Begin to follow the robot, or begin again when it reappears.
+        """Start to follow the robot, or start again when it reappears.
 
-        The queries of its keys `state` and `info` are due immediately.
+        After this call, the queries of its keys `state` and `info` are due immediately.
         """
         self.since = self.info_due = clock.steady_s()
         self.follower = Follower(self.since, FLEET_ASK_S)

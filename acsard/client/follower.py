@@ -108,7 +108,7 @@ class Follower:
 
     @property
     def patience_s(self) -> float:
-        """Age of the last state, s, above which the robot counts as silent."""
+        """Age of the newest state, s, above which the robot counts as silent."""
         # If a robot publishes seldom, only answers arrive, at intervals of `ask_s`.
         return (SILENT_S if self.heard else FIRST_S) + self._ask_s - ASK_S
 

@@ -1,8 +1,8 @@
 """Sends the commands of several senders from one thread, so that no caller waits for the bus.
 
 Each sender has a `Commander`, which keeps only the newest command of that sender. When a sender
-ends, the program must call `Outbox.release()`. The last zero of this sender is then sent, even if
-the bus was blocked for a long time.
+leaves, the program must call `Outbox.release()`. If the robot may still follow the sender's last
+command, the thread then sends a zero, even if the bus was blocked for a long time.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Outbox:
     """The senders that command the robot, and the thread that sends their commands."""
 
     def __init__(self, dropped: Callable[[], object] = lambda: None) -> None:
-        """Start the thread, which calls `dropped` for each command that is too old to be sent."""
+        """Start the thread. It calls `dropped` for each command that `Commander.send` drops."""
         self._dropped = dropped
         self._senders: dict[Commander, Put] = {}
         self._zeros: list[tuple[Put, Wish]] = []

@@ -1,4 +1,4 @@
-"""The client for scripts: each method waits until its work is done."""
+"""The client for scripts. Its methods block the calling thread until they are done."""
 
 from __future__ import annotations
 
@@ -216,7 +216,7 @@ class Client:
         `get("cmd_vel_out")` returns the applied speed.
 
         Raises:
-            NotDrivenError: The robot does not follow the commands, and the text is the daemon's
+            NotDrivenError: The robot does not follow the commands; the text is the daemon's
                 reason. Or this program sent no command for more than 0.5 s during the drive,
                 because the program was suspended or the network failed.
             NoAnswerError: The daemon is silent.

@@ -480,7 +480,7 @@ def test_set_changes_the_robot_that_runs_and_with_write_the_file(
         assert (ended.code, ended.out) == (
             0,
             'rates.state = 5.0 (was 10.0), log.level = "debug" (was "info"); '
-            "until the daemon's next start",
+            "in force until the daemon's next start",
         )
         assert bus.get("config")["rates"]["state"] == 5.0
         assert "state = 10.0  # often" in file.read_text(encoding="utf-8")

@@ -335,7 +335,9 @@ def test_set_changes_named_robots_and_prints_a_line_for_each(robots: Robots) -> 
         told = dict(line.split(": ", 1) for line in ended.out.splitlines())
         assert list(told) == [TWO, ONE]
         assert all(one.startswith(f"rates.state = {value} (was ") for one in told.values())
-        assert all(one.endswith("; until the daemon's next start") for one in told.values())
+        assert all(
+            one.endswith("; in force until the daemon's next start") for one in told.values()
+        )
     ended = robots.tool("set", "rates.state", "10.0", "--json")
     assert [json.loads(line)["robot"] for line in ended.out.splitlines()] == [ONE, TWO]
 

@@ -316,7 +316,7 @@ def driving(*words: str) -> int:
         ([], "person at the terminal"),
         (["--distance", "2.0"], "--distance needs --log"),
         (["--method", "positions"], "--positions KEY"),
-        (["--method", "tape", "--positions", "sim/pose"], "leave one out"),
+        (["--method", "tape", "--positions", "sim/pose"], "leave one of them out"),
         (["--positions-at", "tcp/127.0.0.1:7447"], "--positions KEY"),
         (["--positions", "odom"], "computes odom from the wheels themselves"),
         (["--positions", "acsard/acsar/odom"], "computes odom from the wheels themselves"),

@@ -86,7 +86,7 @@ def test_several_robots_are_refused_for_a_list_and_for_the_local_file(
 
 
 SURVIVES = "; a lowered limit survives a restart of the daemon, except on the simulator"
-ENDS = "; until the daemon's next start"
+ENDS = "; in force until the daemon's next start"
 
 
 @each(
