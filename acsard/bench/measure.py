@@ -42,10 +42,11 @@ from acsard.host.errors import MendableError
 def bench_config(config: Config, *, simulated: bool) -> Config:
     """Return `config` with a separate robot id, bus and command source for the measured daemon.
 
-    If the board is `simulated`, more settings change. The limits are so high that the daemon writes
-    the speeds of each command unchanged into its next line. Feedback that contradicts the commands
-    does not count as a fault. Lines have no sequence number, because the benchmark recognizes a
-    line by its text.
+    If the board is `simulated`, three more settings change:
+
+    - The limits are so high that the next line to the board has the speeds of a command unchanged.
+    - Feedback that contradicts the commands does not count as a fault.
+    - Lines have no sequence number, because the benchmark recognizes a line by its text.
     """
     own = replace(
         config,

@@ -142,9 +142,9 @@ def positions_of(drive: Block, driven: Sequence[Run]) -> list[Segment]:
 def folds(fit: Fit, parts: Sequence[Block], left_out: Sequence[Block], rate: Rates) -> list[Fold]:
     """Return a fold for each drive in `left_out`, with the parameters that fit all other drives.
 
-    `parts` are the blocks of the fit. A fold leaves out the blocks that overlap its drive. If no
-    block or every block overlaps a drive, this drive gets no fold. The parameters of a fold have
-    the same track for all turn rates (`with_constant_track`).
+    `parts` are the blocks of data of the fit. A fold leaves out each block that overlaps its drive
+    in time. A drive gets no fold if no block overlaps it, or if all blocks do. The parameters of a
+    fold have the same track for all turn rates (`with_constant_track`).
     """
     run, begin, end = (
         np.array(column) for column in zip(*((p.run, p.begin, p.end) for p in parts), strict=True)

@@ -106,8 +106,9 @@ def bounded(columns: dict[str, Floats]) -> Iterator[str]:
 def spikes(values: Floats, order: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
     """Return a mask of the values that are spikes. `order` contains the indices sorted by time.
 
-    A spike stands out both in the order of the file and in the order of time. A true value may
-    stand out in one of these orders, for example if the file is shuffled.
+    A spike differs from its neighbors both in the order of the file and in the order of time. A
+    correct value may differ from its neighbors in one of these orders, for example if the rows of
+    the file are shuffled.
     """
     sizes = np.abs(values)
     moving = sizes[sizes > SLOW]

@@ -303,9 +303,9 @@ class Wait(Struct, frozen=True):
 class SourceStatus(Struct, frozen=True):
     """A command source.
 
-    `age_s` is the time since the last accepted command of the source, s. Some events, such as the
-    start or a `clear`, require a zero from each sender. After such an event, the age is None until
-    the next command is accepted.
+    `age_s` is the time since the last accepted command of the source, s. After some events, such as
+    the start or a `clear`, each sender must first command zero speed. From such an event until the
+    next accepted command, the age is None.
     """
 
     name: str

@@ -214,9 +214,9 @@ class Handover:
 
     @property
     def held(self) -> bool:
-        """Whether the latches are stored and survive a kill of the process.
+        """Whether all latches that must be stored are stored, so that they survive a kill.
 
-        Always true without a keeper.
+        Without a keeper no latch must be stored, so this is always true.
         """
         return self._keeper is None or self._keeper.holds(self.latches)
 

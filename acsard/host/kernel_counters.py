@@ -107,7 +107,8 @@ def scheduled(text: bytes) -> Scheduled:
 def steal(text: str, tick_ns: int) -> tuple[int, ...]:
     """Return the steal time of each processor, ns.
 
-    `text` is the content of `/proc/stat`. `tick_ns` is the duration of its unit, a clock tick, ns.
+    `text` is the content of `/proc/stat`, which counts clock ticks. `tick_ns` is the
+    duration of a clock tick, ns.
     """
     return tuple([int(row[8]) * tick_ns for row in _processors(text) if len(row) > 8])
 

@@ -64,7 +64,7 @@ WAYS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = (
         "ok",
         "these values come from the options of `acsard run` or from another file, or the file has "
         "changed since the daemon started",
-        "to keep {which} after a restart, write these lines into the file: {lines}",
+        "to keep {which} after a restart, write these lines into the configuration file: {lines}",
     ),
     (
         lambda key: key not in OPTIONS and live(key) is None,

@@ -1,4 +1,4 @@
-"""Manages the directory of recordings, and limits its size, file ages and use of the disk.
+"""Manages the directory of recordings: its total size, the age of its files, free disk space.
 
     000012-20261121T070027Z.mcap.part   being written, or cut off
     000012-20261121T070027Z.mcap        finished

@@ -36,7 +36,7 @@ PROGRESS_STEPS = 1024
 
 
 def no_progress(wall_ns: int) -> None:
-    """Do nothing. This is the callback of a caller that shows no progress."""
+    """Do nothing. A caller that displays no progress passes this function as its callback."""
 
 
 INCOMPLETE_STATE_ERRORS = (

@@ -248,7 +248,10 @@ def part_between(found: list[Stretch], first: float, last: float) -> Span | None
 
 
 def _on(near: float, day: int, when: TimeOfDay) -> float:
-    """Return the time of day `when`, `day` days after the date of `near`. Both are s since 1970."""
+    """Return the time at which a clock shows `when`, `day` days after the date of `near`.
+
+    `near` and the result are times in s since 1970.
+    """
     date = time.localtime(near)
     return _moment((date.tm_year, date.tm_mon, date.tm_mday), when, day)
 

@@ -281,7 +281,9 @@ def _method(begin: Begin) -> list[str]:
             f"the method {POSITIONS} needs `positions`, a Zenoh key; no other method uses it",
         )
     if begin.positions and not KEY.match(begin.positions):
-        raise FrameError("begin", "`positions` must be a Zenoh key of letters, digits, _ / -")
+        raise FrameError(
+            "begin", "`positions` must be a Zenoh key of letters, digits, `_`, `-` and `/`"
+        )
     options = {"method": begin.method, "positions": begin.positions}
     return [f"--{name}={value}" for name, value in options.items() if value]
 

@@ -465,7 +465,7 @@ class Driving:
         return self._steps(squares)
 
     def missed(self) -> Steps:
-        """Return the steps with the errors that gaps in the feedback cause."""
+        """Return all steps, each with the error that gaps in the feedback have caused in it."""
         return self._steps(self._motion.filled, self._motion.unfilled)
 
     def rounded(self) -> Steps:
@@ -480,9 +480,9 @@ class Driving:
         return self._steps(np.column_stack(variances))
 
     def contradicted(self) -> Steps:
-        """Return the steps with the errors that differences between front and rear wheels show.
+        """Return all steps, each with the error that its front and rear wheels show.
 
-        On each side, one of the two wheels is assumed to be right. The mean of the two is then
+        The wheels of a side differ. One of them is assumed to be right, so the mean of both is
         wrong by half their difference.
         """
         turned = np.diff([line.positions for line in self._lines], axis=0)

@@ -73,10 +73,10 @@ LIVE: dict[str, Live] = {
     ),
     "odometry.pose_covariance_diagonal": Live(
         "always",
-        "variances of x y z roll pitch yaw: of the start pose, and of the axes without a sensor",
+        "variances (x y z roll pitch yaw) of the start pose, and of axes that no sensor measures",
     ),
     "odometry.twist_covariance_diagonal": Live(
-        "always", "variances of x y z roll pitch yaw: of the axes without a sensor"
+        "always", "variances (x y z roll pitch yaw) of the axes that no sensor measures"
     ),
     "odometry.distance_variance_per_metre": Live(
         "always", "added variance of the distance per metre driven, m2 per m"

@@ -96,7 +96,7 @@ class Lateness:
     """
 
     def __init__(self, simulated: bool, quiet_ns: int) -> None:
-        """Start before the first step.
+        """Create the initial state, in which no step has been seen.
 
         `simulated` is true if the built-in simulator takes the place of the board. `quiet_ns` is
         the duration of silence after which the link is stale, ns.
@@ -257,9 +257,10 @@ class UnansweredLines:
     """
 
     def __init__(self, reply_period: float) -> None:
-        """Start without a warning. `reply_period` is `mcu.reply_period`, s.
+        """Start before the first line was sent. `reply_period` is `mcu.reply_period`, s.
 
-        If `reply_period` is not 0, the board reports by its own clock, so there is no warning.
+        If `reply_period` is not 0, the board does not answer lines but reports by its own clock, so
+        the class never warns.
         """
         self._own_clock = reply_period > 0.0
         self._since: tuple[int, int] | None = None

@@ -341,11 +341,11 @@ class Arbiter:
 
     @property
     def forgiven_ns(self) -> int:
-        """Sum of the rises of command delays that were trusted without a visible cause, ns.
+        """Sum of the rises of command delays that the daemon took for adjusted clocks, ns.
 
-        A rise is trusted within a budget, or after a pause of the sender (`freshness.py`). If the
-        stamps of a sender show that its clock was adjusted, the rise has a visible cause and does
-        not count here.
+        The daemon does so without evidence up to a budget, and after a pause of the sender
+        (`freshness.py`). If the stamps of a sender show that its clock was adjusted, they are
+        evidence, and the rise does not count here.
         """
         return self._freshness.forgiven_ns
 

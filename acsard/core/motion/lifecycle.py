@@ -338,10 +338,11 @@ class Lifecycle:
 
 
 def with_causes(latch: Latch, before: Latch | None) -> Latch:
-    """Return `latch`, a new latch of a stop, with the causes of `before` as its earlier causes.
+    """Return `latch`, the new latch of a stop, with the causes of the latch `before` added to it.
 
-    `before` is the latch that the new one replaces. A cause that has come again appears only once,
-    as the new latch. `MAX_CLIENTS` limits how many earlier causes come from clients.
+    `before` is the latch that `latch` replaces. Its causes become earlier causes of `latch`. If
+    the cause of `latch` is one of them, it is not an earlier cause as well. Of the earlier causes
+    that came from clients, at most `MAX_CLIENTS` are kept.
     """
     causes = () if before is None else before.causes
     earlier = [replace(cause, earlier=()) for cause in causes if cause.why != latch.why]

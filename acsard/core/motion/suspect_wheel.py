@@ -59,7 +59,7 @@ WheelFault = Literal["dead", "reversed", "stuck"]
 
 WORDS: dict[WheelFault, str] = {
     "dead": "reports no motion while the other wheel on its side turns",
-    "reversed": "reports the opposite direction to the other wheel on its side",
+    "reversed": "turns opposite to the other wheel on its side, by its encoder",
     "stuck": "reports a speed that never changes",
 }
 

@@ -83,7 +83,7 @@ def test_what_run_was_told_by_an_option_is_offered_as_lines_of_the_file() -> Non
     bus = BusConfig(listen=("tcp/127.0.0.1:1", "tcp/127.0.0.1:2"))
     runs = replace(FILE, mcu=McuConfig(port="/dev/pts/3"), bus=bus)
     (finding,) = compared(running(runs), FILE)
-    keep = finding.mend.partition("into the file: ")[2]
+    keep = finding.mend.partition("into the configuration file: ")[2]
     assert parse("\n".join(re.split(r"; |(?<=]) (?=\w)", keep)).encode()) == runs
 
 

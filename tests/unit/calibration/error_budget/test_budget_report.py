@@ -75,7 +75,7 @@ def test_who_never_calibrated_is_told_so_first() -> None:
 
 
 def test_without_an_error_it_says_so() -> None:
-    assert advice(of()) == "this drive shows no error of the odometry"
+    assert advice(of()) == "the odometry shows no error on this drive"
 
 
 def test_the_table_has_every_cause_and_their_sum() -> None:
