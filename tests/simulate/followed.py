@@ -132,9 +132,10 @@ class Followed:
             priority = self._witness.priority
             if self._keeper.who == who:
                 self._go_on(at_ns)
-            elif (wish.fresh or not sample.clock) and priority[who[0]] > priority[
-                self._keeper.who[0]
-            ]:
+            elif priority[who[0]] > priority[self._keeper.who[0]] and (
+                not sample.clock
+                or wish.arrived_ns - message.sent_ns < self._witness.timeout[who[0]]
+            ):
                 # If a sender of higher priority gets the robot, also one that must send a zero, the
                 # first of the others to come gets the robot behind it. The daemon may refuse this
                 # command nevertheless.

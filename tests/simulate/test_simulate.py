@@ -1456,6 +1456,32 @@ def test_a_sender_that_goes_on_keeps_the_robot_although_its_commands_are_refused
         followed_in_turn(*sent, refused=[4.2])
 
 
+@pytest.mark.parametrize(("source", "late_s", "finding"), [
+    ("teleop", 0.01, False), ("teleop", 2.0, True), ("nav", 0.01, True),
+])  # fmt: skip
+def test_a_command_of_higher_priority_may_end_the_place_of_the_first_sender(
+    source: str, late_s: float, finding: bool
+) -> None:
+    witness = witnessed()
+    witness.priority |= {"app": 50, "teleop": 100, "nav": 10}
+    witness.timeout |= dict.fromkeys(("app", "teleop", "nav"), NS // 2)
+    followed = Followed(witness)
+    expected = pytest.raises(BrokenError, match="first of equal") if finding else nullcontext()
+    with expected:
+        for number, (at_ns, name) in enumerate(
+            [(4 * NS, "a"), (4 * NS + NS // 20, source), (4 * NS + NS // 10, "b")]
+        ):
+            sender, sent_ns = SIGNED | {"id": name}, at_ns
+            if name == source:
+                sender, sent_ns = sender | {"source": source}, at_ns - int(late_s * NS)
+            one = Message(sent_ns, at_ns, 0.3, 0.0, sent_ns, number, "")
+            found = sample(sender, one, PLAIN["config"], 0)
+            wish = witness.command(sender, one, found, at_ns)
+            followed.command(sender, one, found, at_ns, wish)
+            followed_ns = None if name == source else at_ns
+            followed.step(at_ns + 1, at_ns + 1, followed_ns, "driving", "up")
+
+
 @pytest.mark.parametrize(("flood", "finding"), [(HELD - 1, True), (HELD, False)])
 def test_a_flood_may_displace_the_commands_of_the_sender_that_goes_on(
     flood: int, finding: bool
