@@ -38,7 +38,7 @@ def usual(seed: int = 3, plan: Plan = GUIDED) -> Drive:
 def table(seen: Drive, *, gyro: bool = True, places: bool = True) -> Table:
     """Return the table that `read` makes of `seen.csv`, without the time for writing and reading.
 
-    `test_a_table_is_that_of_the_written_log` compares both.
+    `test_a_table_made_directly_equals_that_of_the_written_log` compares both.
     """
     sensors = [
         (seen.t, {"left": seen.left, "right": seen.right}, 2, True),

@@ -16,7 +16,7 @@ FOUND = calibrated(table(usual(), places=False))
 REPORT = report("a.csv", FOUND, DriveConfig(), "")
 
 
-def test_the_object_has_every_parameter_with_its_deviation() -> None:
+def test_the_report_has_every_parameter_with_its_deviation() -> None:
     made = msgspec.to_builtins(REPORT)
     for name, value, std in zip(
         NAMES, FOUND.multipliers.values, FOUND.multipliers.std, strict=True
@@ -27,18 +27,18 @@ def test_the_object_has_every_parameter_with_its_deviation() -> None:
     assert made["refused"] is None
 
 
-def test_the_lines_are_a_configuration_with_what_was_found() -> None:
+def test_the_excerpt_is_a_configuration_with_the_found_values() -> None:
     made = parse("\n".join(excerpt(keys(FOUND))).encode())
     assert made.drive.wheel_separation_multiplier == round(REPORT.wheel_separation_multiplier, 5)
     for name, value in REPORT.odometry.items():
         assert getattr(made.odometry, name) == value > 0.0
 
 
-def test_of_a_scale_that_nothing_measured_nothing_is_written() -> None:
+def test_the_deviation_of_an_unmeasured_scale_is_not_written() -> None:
     assert "distance_scale_std" not in REPORT.odometry
 
 
-def test_people_are_told_what_it_improves_and_what_remains() -> None:
+def test_the_text_states_the_improvement_and_the_remaining_error() -> None:
     told = plain(*parts(REPORT, FOUND, "acsard.toml", guided=False), width=SENTENCES)
     assert "wheel_separation_multiplier   " in told
     assert f"heading error after a turn of 360 deg: {REPORT.turn_error_before:.0f} deg now" in told

@@ -34,13 +34,13 @@ def fitted(rng: np.random.Generator, shared: float, own: float, blocks: int = 20
     return fit([source], START, places=True)
 
 
-def test_it_finds_what_is_there() -> None:
+def test_a_fit_without_noise_finds_the_true_parameters() -> None:
     assert fitted(np.random.default_rng(1), 0.0, 0.0).parameters[:3] == pytest.approx(TRUTH)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("shared", "own"), [(0.0, 0.05), (0.02, 0.0), (0.02, 0.05)])
-def test_its_deviations_cover_the_truth_however_errors_hang_together(
+def test_standard_deviations_cover_the_truth_however_errors_are_correlated(
     shared: float, own: float
 ) -> None:
     rng = np.random.default_rng(7)
@@ -52,7 +52,7 @@ def test_its_deviations_cover_the_truth_however_errors_hang_together(
     assert 0.6 < np.std(z) < 1.2
 
 
-def test_errors_that_last_for_a_run_are_seen_by_leaving_out_runs() -> None:
+def test_errors_that_last_for_a_whole_run_widen_the_deviations_by_run() -> None:
     """Each of six runs of four blocks has errors of its own, which neighbours alone do not show."""
     known, runs = np.diag([0.0] * 3 + [1.0] * (COUNT - 3)), np.repeat(np.arange(6), 4)
     normal = np.zeros((24, COUNT, COUNT))
@@ -70,7 +70,7 @@ def test_errors_that_last_for_a_run_are_seen_by_leaving_out_runs() -> None:
     assert 0.5 < with_runs < 1.0 < alone
 
 
-def test_without_a_block_is_what_a_fit_without_it_gives() -> None:
+def test_removing_a_block_gives_the_parameters_of_a_fit_without_it() -> None:
     found = fitted(np.random.default_rng(5), 0.01, 0.05)
     out = np.arange(20) == 4
     normal = found.normal[~out].sum(axis=0)[:3, :3]
@@ -103,24 +103,24 @@ def test_a_constant_track_is_the_inverse_of_the_turn() -> None:
     assert made.std == pytest.approx([0, 0, 0], abs=1e-4)
 
 
-def test_a_track_that_grows_is_taken_at_the_mean_rate() -> None:
+def test_a_track_that_grows_with_the_turn_rate_is_taken_at_the_mean_rate() -> None:
     made = multipliers_of(fit_of(0.08), Rates(0.5, 1.0))
     assert made.values[0] == pytest.approx(1.6 / (1 - 0.04))
     assert made.std == pytest.approx([0, 0, 0], abs=1e-4)
 
 
-def test_rates_are_those_of_the_turns() -> None:
+def test_the_mean_and_fastest_rates_are_those_of_the_turns() -> None:
     rows = ready(table(ideal(), places=False)).rows
     made = rates(rows, rows.turned)
     assert 0.5 < made.mean < made.fastest < 1.0
 
 
-def test_what_is_configured_is_taken_as_it_is() -> None:
+def test_configured_multipliers_are_taken_unchanged_and_without_deviation() -> None:
     assert configured(Base(0.05, 0.3, 0.9, 1.1, 1.5)).values.tolist() == [1.5, 0.9, 1.1]
     assert configured(BASE).std.tolist() == [0, 0, 0]
 
 
-def test_the_errors_of_track_ratio_and_scale_are_told_apart() -> None:
+def test_the_errors_of_track_ratio_and_scale_are_separated() -> None:
     # The scale is off by 1 %, each radius by another 0.1 %, the track by 2 %. All are independent.
     values = np.array([1.6, 1.1, 1.0])
     shares = np.diag([0.02, 0.001, 0.001]) ** 2 + 0.01**2
@@ -141,7 +141,7 @@ def test_blocks_add_up_to_the_normal_equations_of_all_rows() -> None:
     assert made.counts[6] == 0
 
 
-def test_only_what_is_far_off_counts_less() -> None:
+def test_only_large_residuals_have_less_weight() -> None:
     weights = huber(np.array([0.1, -0.5, 1.0, -20.0]), 1.0)
     assert weights[:3].tolist() == [1.0, 1.0, 1.0]
     assert weights[3] < 0.2

@@ -25,7 +25,7 @@ def test_the_bias_is_found_at_rest() -> None:
     assert headings_of(usual())[1].bias == pytest.approx(0.01, abs=0.001)
 
 
-def test_a_gyro_of_few_digits_tells_its_bias_between_them() -> None:
+def test_the_bias_of_a_coarsely_rounded_gyro_is_found_between_its_steps() -> None:
     drive = usual()
     coarse = replace(drive, gyro=np.round(drive.gyro - 0.006, 2))
     assert headings_of(coarse)[1].bias == pytest.approx(0.004, abs=0.001)
@@ -43,7 +43,7 @@ def test_a_slow_gyro_with_a_spike_in_a_short_rest_has_a_bias() -> None:
 
 
 @pytest.mark.parametrize(("noise", "walk"), [(0.05, 0.0), (0.003, 0.0003)])
-def test_how_sure_the_bias_is_covers_the_truth(noise: float, walk: float) -> None:
+def test_the_standard_deviation_of_the_bias_covers_the_truth(noise: float, walk: float) -> None:
     z = []
     for seed in range(20):
         rng = np.random.default_rng(seed)
@@ -76,13 +76,13 @@ def test_a_reversed_side_does_not_hide_the_time_offset() -> None:
     assert headings_of(replace(drive, left=-drive.left))[1].delay == pytest.approx(0.02, abs=0.02)
 
 
-def test_a_gyro_that_says_the_same_always_is_refused() -> None:
+def test_a_gyro_with_a_constant_value_is_refused() -> None:
     drive = usual()
     with pytest.raises(LogError, match="same value in every row"):
         headings_of(replace(drive, gyro=drive.gyro * 0))
 
 
-def test_rows_say_what_was_turned() -> None:
+def test_rows_add_up_to_the_turned_angle() -> None:
     drive = usual()
     runs, headings = headings_of(drive)
     found = rows(headings, runs, blocks(runs, 4.0))
@@ -122,7 +122,7 @@ def test_least_squares_find_both_sides_whatever_their_sign() -> None:
     )
 
 
-def test_slopes_are_those_of_what_the_wheels_say() -> None:
+def test_the_score_has_the_derivatives_of_the_turn_of_the_wheels() -> None:
     rows = ready(table(ideal(), places=False)).rows
     step = 1e-6
     score = heading.evidence(rows, BASE, AT, len(rows.turned)).score.sum(axis=0)

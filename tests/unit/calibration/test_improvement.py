@@ -36,13 +36,13 @@ def held(seen: Drive, *, places: bool = True) -> tuple[list[Fold], Improvement]:
     return found, improvement(found, BASE.start(), BASE, made.rows, segments, made.steps)
 
 
-def test_every_part_of_one_run_is_left_out() -> None:
+def test_every_part_of_one_run_is_left_out_in_turn() -> None:
     found, _ = held(ideal(), places=False)
     assert len(found) == 5
     assert np.all(np.sum([fold.blocks for fold in found], axis=0) >= 1)
 
 
-def test_of_three_runs_whole_ones_are_left_out() -> None:
+def test_with_three_runs_whole_runs_are_left_out() -> None:
     run = log_of(table(ideal())).runs[0]
     assert drives([run] * 3) == [Block(at, 0.0, float(run.t[-1])) for at in range(3)]
 
@@ -56,7 +56,7 @@ def test_positions_of_a_drive_are_cut_at_gaps_of_the_wheels() -> None:
 
 
 @pytest.mark.slow
-def test_an_ideal_robot_is_off_by_its_track_now_and_by_nothing_then() -> None:
+def test_an_ideal_robot_has_its_track_error_before_and_no_error_after() -> None:
     _, better = held(ideal())
     assert better.turn.before == pytest.approx(0.6 * 360, rel=0.02)
     assert better.turn.after is not None
@@ -68,7 +68,7 @@ def test_an_ideal_robot_is_off_by_its_track_now_and_by_nothing_then() -> None:
     assert better.sure
 
 
-def test_without_anything_to_tell_an_error_by_nothing_is_sure() -> None:
+def test_without_a_drive_to_leave_out_no_improvement_is_sure() -> None:
     made = ready(table(ideal(), places=False))
     rows = replace(made.rows, turned=np.zeros_like(made.rows.turned))
     better = improvement([], BASE.start(), BASE, rows, [], [])
@@ -77,21 +77,21 @@ def test_without_anything_to_tell_an_error_by_nothing_is_sure() -> None:
     assert "no drive of the log could be left out" in no_better(better)
 
 
-def test_a_slow_curve_is_no_straight() -> None:
+def test_a_slow_curve_is_not_taken_for_a_straight_drive() -> None:
     """The robot turns as slowly as a straight drive may, but turns much more in each metre."""
     _, better = held(ideal([*GUIDED, (60.0, 0.04, 0.06)]), places=False)
     assert better.straight.before is not None
     assert better.straight.before < 5.0
 
 
-def test_a_straight_of_half_a_metre_shows_no_error_after_ten() -> None:
+def test_a_straight_drive_of_half_a_metre_gives_no_error_after_ten() -> None:
     curves = [(8.0, 0.2, 1.0), (8.0, 0.2, -1.0)] * 2
     _, better = held(ideal([(3.0, 0.0, 0.0), *curves, (3.0, 0.17, 0.0), *curves]), places=False)
     assert better.straight.before is None
     assert better.turn.before is not None
 
 
-def test_one_track_for_all_rates_turns_as_far_at_the_mean_rate() -> None:
+def test_one_track_for_all_rates_gives_the_same_turn_at_the_mean_rate() -> None:
     fixed = with_constant_track(np.array([1, 1, 0.6, 0.1, 0, 0, 0]), RATE)
     assert fixed.tolist() == pytest.approx([1, 1, 0.6 * 0.95, 0, 0, 0, 0])
 

@@ -57,14 +57,14 @@ def test_a_header_may_be_the_last_comment_before_the_numbers() -> None:
     "text",
     ["t;left;right;yaw_rate\n1,5;2;3;4\n", "t\tleft\tright\tyaw_rate\n1.5\t2\t3\t4\n"],
 )
-def test_other_separators_are_known_by_the_header(text: str) -> None:
+def test_separators_and_encodings_are_recognized_from_the_header(text: str) -> None:
     assert read(text.encode()).columns["t"][0] == 1.5
     assert read(text.encode("utf-16")).columns["t"][0] == 1.5
 
 
 @each("place", ["first", "last"])
 @each("name", ["#1", "lap #2", "cw # slow", '"a, b"'])
-def test_a_run_may_have_any_sign_in_its_name(name: str, place: str) -> None:
+def test_a_run_may_have_any_character_in_its_name(name: str, place: str) -> None:
     header, row = b"t,left,right,yaw_rate", "{},2,3,4"
     cells = [f"{name},{row}" if place == "first" else f"{row},{name}"] * 3
     names = b"run," + header if place == "first" else header + b",run"
@@ -84,18 +84,18 @@ def test_a_run_may_have_any_sign_in_its_name(name: str, place: str) -> None:
         "1,2,3,4\n#9,2,3,4",
     ],
 )
-def test_a_comment_is_behind_the_numbers_or_a_line_of_its_own(row: str) -> None:
+def test_a_comment_may_follow_the_numbers_or_have_a_line_of_its_own(row: str) -> None:
     table = read(LOG_HEADER + row.encode())
     assert table.columns["yaw_rate"].tolist() == [4.0]
     assert not table.notes
 
 
-def test_a_text_that_is_not_looked_at_may_have_a_number_sign() -> None:
+def test_a_text_in_an_unused_column_may_have_a_number_sign() -> None:
     table = read(b"t,note,left,right,yaw_rate\n1,try #3,2,3,4\n")
     assert table.columns["yaw_rate"].tolist() == [4.0]
 
 
-def test_a_number_that_a_sign_spoils_is_none() -> None:
+def test_a_cell_with_a_number_sign_among_its_digits_is_not_a_number() -> None:
     """C on Windows writes NaN like this. The number before the sign is not a speed."""
     table = read(LOG_HEADER + b"1,2,3,4\n2,1.#QNAN,3,4\n3,#N/A,--,4\n")
     assert table.columns["t"].tolist() == [1.0, 3.0]
@@ -104,19 +104,19 @@ def test_a_number_that_a_sign_spoils_is_none() -> None:
     assert "not a number" in table.notes[0]
 
 
-def test_runs_are_told_apart_by_any_name() -> None:
+def test_runs_are_distinguished_by_any_name() -> None:
     table = read(b"run,t,left,right,yaw_rate\ncw 1,1,2,3,4\nccw,1,2,3,4\ncw 1,2,2,3,4\n")
     assert table.names == ("cw 1", "ccw")
     assert table.runs.tolist() == [0, 1, 0]
 
 
-def test_few_bad_rows_are_left_out_and_told() -> None:
+def test_few_bad_rows_are_left_out_and_reported() -> None:
     table = read(LOG_HEADER + b"1,2,3,4\n" * 50 + b"1,2,3,x\n" + b"1,2")
     assert len(table.columns["t"]) == 51
     assert table.notes == ('1 row left out: line 52, column yaw_rate: "x" is not a number',)
 
 
-def test_many_bad_rows_refuse_the_file() -> None:
+def test_a_file_with_many_bad_rows_is_refused() -> None:
     with pytest.raises(LogError, match="4 of 54 rows"):
         read(LOG_HEADER + b"1,2,3,4\n" * 50 + b"1,2,3,x\n" * 4)
 
@@ -173,7 +173,7 @@ FOREIGN: dict[str, bytes] = {
 
 
 @each("how", FOREIGN)
-def test_what_others_write_is_the_same_table(how: str) -> None:
+def test_a_file_of_another_logger_gives_the_same_table(how: str) -> None:
     table = read(FOREIGN[how])
     found = np.column_stack([table.columns[name] for name in NAMES])
     assert found[:40] == pytest.approx(np.array(ROWS))
@@ -211,7 +211,7 @@ def test_what_others_write_is_the_same_table(how: str) -> None:
         (b"SQLite format 3\0\0\0", "not text"),
     ],
 )
-def test_a_refusal_says_where_and_what_and_the_remedy(data: bytes, words: str) -> None:
+def test_a_refusal_names_the_place_the_error_and_the_remedy(data: bytes, words: str) -> None:
     with pytest.raises(LogError, match=r".") as refused:
         read(data)
     assert words in str(refused.value)
@@ -223,7 +223,7 @@ def test_a_unit_that_is_not_known_is_reported() -> None:
 
 
 @given(st.binary(max_size=300), st.integers(0, 100))
-def test_garbage_anywhere_is_refused_or_left_out(garbage: bytes, at: int) -> None:
+def test_garbage_bytes_anywhere_are_refused_or_left_out(garbage: bytes, at: int) -> None:
     good = LOG_HEADER + b"1,2,3,4\n" * 10
     try:
         table = read(good[:at] + garbage + good[at:])
@@ -244,7 +244,7 @@ def test_garbage_anywhere_is_refused_or_left_out(garbage: bytes, at: int) -> Non
         ("", "", ""),
     ],
 )
-def test_a_unit_stands_in_brackets(cell: str, name: str, unit: str) -> None:
+def test_a_unit_in_brackets_is_separated_from_the_column_name(cell: str, name: str, unit: str) -> None:
     assert parted(cell) == (name, unit)
 
 
@@ -262,7 +262,7 @@ def test_a_unit_stands_in_brackets(cell: str, name: str, unit: str) -> None:
         ("t", "rad", None),
     ],
 )
-def test_a_unit_is_worth_so_much(name: str, unit: str, times: float | None) -> None:
+def test_each_unit_has_its_conversion_factor(name: str, unit: str, times: float | None) -> None:
     assert factor(name, unit) == (None if times is None else pytest.approx(times))
 
 
@@ -305,7 +305,7 @@ def mostly_standing(rng: np.random.Generator) -> dict[str, Floats]:
 
 
 @pytest.mark.parametrize("order", ["as recorded", "shuffled", "beside another drive"])
-def test_the_turns_of_who_mostly_stands_are_no_spikes(order: str) -> None:
+def test_turns_of_a_robot_that_mostly_stands_still_are_not_spikes(order: str) -> None:
     rng = np.random.default_rng(1)
     columns = mostly_standing(rng)
     if order == "shuffled":
@@ -317,7 +317,7 @@ def test_the_turns_of_who_mostly_stands_are_no_spikes(order: str) -> None:
     assert list(bounded(columns)) == []
 
 
-def test_what_is_beyond_all_bounds_is_none_however_long() -> None:
+def test_impossible_values_count_as_missing_however_many_follow_each_other() -> None:
     columns = table()
     columns["left"][50:60], columns["t"][3] = np.inf, 1e21
     assert len(list(bounded(columns))) == 2
@@ -350,17 +350,17 @@ def test_each_message_is_a_row_with_its_own_time() -> None:
         assert table.columns[name] == pytest.approx(np.array(values), abs=1e-5, nan_ok=True)
 
 
-def test_the_keys_are_of_the_table() -> None:
+def test_each_key_of_the_configuration_has_its_form_in_the_table() -> None:
     assert all(by_key(key) is not None for key in KEYS)
 
 
 @pytest.mark.parametrize("message", [JointState(), ServiceReply(True, "")])
-def test_what_tells_nothing_of_wheels_or_turns_is_no_row(message: Message) -> None:
+def test_a_message_without_wheels_or_turns_is_not_a_row(message: Message) -> None:
     with pytest.raises(ValueError, match="cannot be in a log"):
         row(message, 0)
 
 
-def test_a_table_is_that_of_the_written_log() -> None:
+def test_a_table_made_directly_equals_that_of_the_written_log() -> None:
     """`cut.table` spares the other tests the text between a drive and its table."""
     seen = cut.usual()
     for gyro, places in ((False, True), (True, False), (True, True)):
@@ -371,7 +371,7 @@ def test_a_table_is_that_of_the_written_log() -> None:
             assert np.allclose(values, written.columns[name], rtol=0, atol=1e-12, equal_nan=True)
 
 
-def test_counts_are_not_proposed_as_speeds() -> None:
+def test_a_column_of_counts_is_not_proposed_as_speeds() -> None:
     with pytest.raises(LogError, match="ticks_left has counts, not speeds") as refused:
         read(b"t,ticks_left,ticks_right,yaw_rate\n0,1,1,0\n")
     assert "rename" not in str(refused.value)

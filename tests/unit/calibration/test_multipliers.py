@@ -18,14 +18,14 @@ def follow(values: np.ndarray, number: int) -> Extent:
     return Extent(5.0 * size, 5.0 * size) if number else Extent(0.1 * size, 9.0 * size)
 
 
-def test_the_scale_is_the_tape_s_and_nothing_else_changes() -> None:
+def test_the_tape_changes_only_the_scale() -> None:
     made, run = scaled(FOUND, Tape(5.1), NAMES, follow, known=False)
     assert run == "straight"
     assert made.values == pytest.approx(FOUND.values * 1.02, rel=1e-4)
     assert made.std[1] / made.values[1] == pytest.approx(np.hypot(TAPE_M / 5.1, 7e-4), rel=0.2)
 
 
-def test_positions_that_know_better_give_way_little() -> None:
+def test_a_tape_hardly_changes_the_scale_of_accurate_positions() -> None:
     sure = Multipliers(FOUND.values, FOUND.covariance * 1e-6)
     made, _ = scaled(sure, Tape(5.1), NAMES, follow, known=True)
     assert made.values == pytest.approx(FOUND.values, rel=1e-3)
@@ -38,6 +38,6 @@ def test_a_tape_that_contradicts_the_positions_is_refused(metres: float) -> None
 
 
 @pytest.mark.parametrize(("run", "words"), [("turns", "from its start"), ("no", "no run")])
-def test_a_run_that_gets_nowhere_is_refused(run: str, words: str) -> None:
+def test_a_missing_run_or_one_that_ends_near_its_start_is_refused(run: str, words: str) -> None:
     with pytest.raises(RefusedError, match=words):
         scaled(FOUND, Tape(5.0, run), NAMES, follow, known=False)

@@ -317,7 +317,7 @@ def rms(values: Floats | Sequence[float]) -> float:
 @pytest.mark.soak
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize(("name", "way"), ROWS)
-def test_a_calibration_describes_drives_that_were_not_seen(name: str, way: str) -> None:
+def test_the_noise_of_a_calibration_describes_drives_outside_of_its_log(name: str, way: str) -> None:
     """A gyro does not show errors of the distance, so only the heading is judged there."""
     shown = (name, way) in SHOWN
     row = measured(ROWS[name, way], way, ROBOTS if shown else FEWER)
@@ -343,7 +343,7 @@ def test_a_calibration_describes_drives_that_were_not_seen(name: str, way: str) 
 @pytest.mark.parametrize(
     ("name", "way"), [("differential", "both"), ("skid, grows with the rate", "gyro")]
 )
-def test_a_calibration_describes_other_drives_of_three_robots(name: str, way: str) -> None:
+def test_the_noise_of_a_calibration_describes_other_drives_of_three_robots(name: str, way: str) -> None:
     row = measured(SETS[name], way, 3)
     assert 0.5 < row.heading < 2.0
     assert way == "gyro" or 0.4 < row.distance < 2.0
@@ -359,7 +359,7 @@ def found() -> Calibration:
 
 
 @pytest.mark.slow
-def test_noise_is_written_beside_the_geometry_and_told(found: Calibration) -> None:
+def test_noise_is_written_beside_the_geometry_and_reported(found: Calibration) -> None:
     before, after = OdometryConfig(), configs(found)[1]
     assert after.yaw_variance_per_metre < before.yaw_variance_per_metre
     assert after.yaw_variance_per_radian < before.yaw_variance_per_radian / 10
@@ -373,7 +373,7 @@ def test_noise_is_written_beside_the_geometry_and_told(found: Calibration) -> No
 
 
 @pytest.mark.slow
-def test_noise_that_is_right_already_stays(found: Calibration) -> None:
+def test_noise_that_is_already_right_stays_as_configured(found: Calibration) -> None:
     """The geometry of the log is wrong again, and only it is written."""
     log = log_of_runs(LOG)
     again = calibrate(log, DriveConfig(), None, configs(found)[1])
@@ -398,7 +398,7 @@ def test_noise_of_a_robot_whose_geometry_is_right_is_written_alone(found: Calibr
     assert written.wheel_radius_ratio_std >= 0.002
 
 
-def test_a_gyro_shows_no_noise_of_the_distance() -> None:
+def test_a_log_with_only_a_gyro_gives_no_distance_noise() -> None:
     made = SETS["differential"].calibration(LOG, "gyro")
     assert "yaw_variance_per_metre" in made.odometry
     assert not {"distance_variance_per_metre", "wheel_slip_std"} & set(made.odometry)

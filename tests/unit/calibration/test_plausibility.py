@@ -94,7 +94,7 @@ WRONG = {
         ("later", True, False, "does not follow the wheels"),
     ],
 )
-def test_it_is_refused_by_its_name(what: str, gyro: bool, places: bool, words: str) -> None:
+def test_a_wrong_sign_unit_or_clock_is_refused_by_name(what: str, gyro: bool, places: bool, words: str) -> None:
     with pytest.raises(RefusedError) as refused:
         calibrated(table(WRONG[what], gyro=gyro, places=places))
     assert words in str(refused.value)
@@ -120,14 +120,14 @@ def odometry(robot: Drive) -> Drive:
 
 @pytest.mark.variations(2)
 @pytest.mark.parametrize(("gyro", "places"), [(True, False), (False, True)])
-def test_what_was_made_of_the_same_wheels_is_reported(gyro: bool, places: bool) -> None:
+def test_a_reference_computed_from_the_same_wheels_is_reported(gyro: bool, places: bool) -> None:
     log = table(odometry(DRIVE), gyro=gyro, places=places)
     assert any("computed from the same wheels" in note for note in calibrated(log).notes)
     usual_log = table(DRIVE, gyro=gyro, places=places)
     assert not any("same wheels" in note for note in calibrated(usual_log).notes)
 
 
-def test_an_imu_that_lies_on_its_side_is_asked_for_its_upright_axis() -> None:
+def test_an_imu_that_lies_on_its_side_is_refused() -> None:
     """The noise of its wrong axis adds up to less than a turn, although the robot turned."""
     rng = np.random.default_rng(0)
     lying = replace(DRIVE, gyro=rng.normal(0.0, 0.05, len(DRIVE.gyro)))
@@ -142,7 +142,7 @@ def test_positions_alone_are_not_called_a_yaw_in_degrees() -> None:
     assert "yaw" not in str(refused.value)
 
 
-def test_motion_capture_on_a_good_floor_is_believed() -> None:
+def test_motion_capture_on_a_good_floor_is_not_taken_for_wheel_odometry() -> None:
     """It differs from the wheels of a robot that hardly slips by a millimetre."""
     robot = Robot(
         chi=1.0, rate=0.0, slip=0.0005, place_noise=0.0005, outliers=0.0, place_hz=20.0,
@@ -160,13 +160,13 @@ def test_positions_of_another_drive_are_refused() -> None:
         calibrated(table(still, gyro=False))
 
 
-def test_multipliers_that_cannot_be_written_are_refused() -> None:
+def test_multipliers_outside_of_the_configurable_range_are_refused() -> None:
     in_range(np.array([2.51, 1.0, 1.0]))
     with pytest.raises(RefusedError, match=r"from 0\.1 to 10"):
         in_range(np.array([12.0, 1.0, 1.0]))
 
 
-def test_what_is_unusual_is_reported() -> None:
+def test_unusual_values_are_reported() -> None:
     told = list(
         remarks({"yaw_rate": 0.6}, 0.2, np.ones(5), np.array([5.0, 2, 2]), BASE, sized=True)
     )
@@ -186,14 +186,14 @@ def test_sides_of_different_size_are_reported() -> None:
 
 @pytest.mark.variations(3)
 @pytest.mark.parametrize(("gyro", "places"), [(True, False), (False, True), (True, True)])
-def test_it_begins_near_the_truth(gyro: bool, places: bool) -> None:
+def test_the_starting_point_is_near_the_truth(gyro: bool, places: bool) -> None:
     made = ready(table(usual(), gyro=gyro, places=places))
     assert len(made.sources) == gyro + places
     assert made.start[[P.LEFT, P.RIGHT]] == pytest.approx([1.0, 1.0], abs=0.05)
     assert 1 / made.start[P.INVERSE_TRACK] == pytest.approx(1.66, abs=0.15)
 
 
-def test_sensors_of_another_time_are_refused() -> None:
+def test_positions_from_another_time_are_refused() -> None:
     drive = usual()
     other = replace(drive, place_t=drive.place_t + 1000.0, gyro=np.zeros(0), gyro_t=np.zeros(0))
     with pytest.raises(RefusedError, match="same clock"):
@@ -216,7 +216,7 @@ def test_turns_and_straight_drives_are_enough() -> None:
     ("left", "right"),
     [([9, 9, 9], [9, 9, 9]), ([9, -9, 9], [-9, 9, -9]), ([5, 5, 5], [15, 15, 15])],
 )
-def test_one_movement_only_is_refused_with_what_to_drive(
+def test_a_log_of_only_one_movement_is_refused_with_a_drive_to_make(
     left: list[float], right: list[float]
 ) -> None:
     with pytest.raises(RefusedError) as refused:
@@ -224,7 +224,7 @@ def test_one_movement_only_is_refused_with_what_to_drive(
     assert "a drive of 60 s" in str(refused.value)
 
 
-def test_little_of_it_is_refused() -> None:
+def test_too_little_turning_or_driving_is_refused() -> None:
     with pytest.raises(RefusedError, match="57 deg"):
         turns_enough(np.array([0.5, -0.5]))
     with pytest.raises(RefusedError, match="only 8 s"):
@@ -238,13 +238,13 @@ def test_turns_on_the_spot_are_enough_for_a_heading_sensor() -> None:
         rolls_enough(spins)
 
 
-def test_what_is_unsure_is_named_with_its_deviation() -> None:
+def test_an_uncertain_parameter_is_named_with_its_deviation() -> None:
     apart = Multipliers(np.array([1.6, 1, 1]), np.diag([0, 1e-3, 1e-3]))
     assert unsure(apart, 0.01) == {RATIO: pytest.approx(0.0447, abs=1e-4)}
     assert TRACK in unsure(Multipliers(np.array([1.6, 1, 1]), np.eye(3) * 1e-6), np.nan)
 
 
-def test_turns_while_driving_ahead_only_do_not_separate_the_wheels() -> None:
+def test_equal_columns_of_the_fit_do_not_separate_the_track() -> None:
     made = ready(table(usual(), places=False))
     fitted = fit(made.sources, made.start, places=False)
     assert separates_track(fitted)

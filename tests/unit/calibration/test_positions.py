@@ -24,19 +24,19 @@ def of(drive: Drive):  # type: ignore[no-untyped-def]
     return runs[0], positions.segments(runs, parts)
 
 
-def test_the_true_parameters_leave_nothing() -> None:
+def test_the_true_parameters_leave_no_residual() -> None:
     run, segments = of(ideal())
     paths = [positions.path(positions.wheel_steps(run), BASE, TRUE)]
     assert positions.spread(segments, paths, TRUE) < 0.001
 
 
-def test_a_path_without_slopes_is_the_same_path() -> None:
+def test_a_path_without_derivatives_is_the_same_path() -> None:
     run, _ = of(ideal())
     steps = positions.wheel_steps(run)
     assert np.allclose(positions.place(steps, BASE, TRUE), positions.path(steps, BASE, TRUE).place)
 
 
-def test_slopes_are_those_of_where_the_sensor_is() -> None:
+def test_derivatives_are_those_of_the_position_of_the_sensor() -> None:
     run, _ = of(ideal())
     steps, t = positions.wheel_steps(run), np.arange(5.0, 20.0, 0.7)
     place, derivatives = positions.path(steps, BASE, OFF).at(t, OFF)
@@ -57,14 +57,14 @@ def test_a_jump_of_the_source_costs_no_more_than_its_block_s_alignment() -> None
     assert positions.spread(segments, paths, TRUE) < 0.001
 
 
-def test_outliers_are_taken_out() -> None:
+def test_outliers_are_removed() -> None:
     run, segments = of(usual())
     assert len(positions.jumps(run)) >= 4
     paths = [positions.path(positions.wheel_steps(run), BASE, TRUE)]
     assert positions.spread(segments, paths, TRUE) < 0.05
 
 
-def test_evidence_leads_to_the_truth() -> None:
+def test_one_step_by_the_evidence_reaches_the_true_parameters() -> None:
     run, segments = of(ideal())
     near = TRUE + np.array([0.002, -0.001, 0.002, 0, 0, 0, 0])
     made = positions.evidence(
@@ -82,7 +82,7 @@ def begun(seen: Drive, base: Base = BASE, sides: Floats | None = None) -> Starti
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("separation", [0.15, 0.3, 0.9])
 @pytest.mark.parametrize("radius", [0.02, 0.05, 0.2])
-def test_it_begins_near_the_truth(separation: float, radius: float) -> None:
+def test_the_search_finds_a_starting_point_near_the_truth(separation: float, radius: float) -> None:
     found = begun(usual(), Base(radius, separation, 1.0, 1.0, 1.0))
     assert found.unexplained < 0.05
     assert found.parameters[P.LEFT] == pytest.approx(0.05 / radius, rel=0.1)
@@ -99,7 +99,7 @@ def test_a_reversed_side_and_a_mirrored_path_show_in_the_signs() -> None:
     assert begun(mirrored).parameters[P.INVERSE_TRACK] < 0
 
 
-def test_late_positions_are_found() -> None:
+def test_the_delay_of_late_positions_is_found() -> None:
     seen = usual()
     late = replace(seen, place_t=seen.place_t + 0.9)
     assert begun(late).parameters[P.DELAY] == pytest.approx(0.9, abs=0.15)
@@ -117,7 +117,7 @@ def squares(chi: float) -> Plan:
 @pytest.mark.slow
 @pytest.mark.parametrize("chi", [1.3, 1.6, 2.0])
 @pytest.mark.parametrize("lever", [0j, 0.1 + 0.1j])
-def test_a_turn_in_place_is_taken_for_the_likelier_one(chi: float, lever: complex) -> None:
+def test_an_ambiguous_turn_in_place_is_taken_for_the_likeliest_angle(chi: float, lever: complex) -> None:
     """Positions alone cannot distinguish turns of 90 deg left, 270 deg right and 450 deg left."""
     robot = Robot(chi=chi, rate=0.0, lever=lever, slip=0.02)
     seen = drive(robot, squares(chi))

@@ -47,7 +47,7 @@ def finite(bag: Table, name: str) -> int:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("speeds", [False, True])
-def test_a_bag_calibrates_as_the_csv_of_the_same_drive_does(speeds: bool) -> None:
+def test_a_bag_gives_the_same_calibration_as_the_csv_of_the_drive(speeds: bool) -> None:
     seen = usual()
     bag = of(joint_states(seen, speeds=speeds), imu(seen), poses(seen))
     expected = calibrated(csv_table(seen))
@@ -99,7 +99,7 @@ def test_the_columns_follow_the_joints(names: tuple[str, ...], columns: set[str]
     assert angle == pytest.approx(SHORT.right.sum() * 0.01, abs=0.2)
 
 
-def test_the_configured_joints_come_before_what_names_show() -> None:
+def test_configured_joints_have_priority_over_joint_names() -> None:
     names = ("b", "c", "a", "d")
     bag = table(
         in_order(joint_states(SHORT, names=names), imu(SHORT)), ("a", "b", "c", "d"), Choice()
@@ -126,14 +126,14 @@ def test_angles_within_one_turn_are_unwrapped() -> None:
     assert total(t, wrapped) == pytest.approx(99.9, abs=0.2)
 
 
-def test_a_driver_that_begins_again_at_0_has_not_turned_back() -> None:
+def test_an_angle_that_restarts_at_0_is_not_a_turn_backward() -> None:
     t = [k * 0.01 for k in range(2000)]
     angles = [5.0 * at for at in t]
     angles[1000:] = [angle - angles[1000] for angle in angles[1000:]]
     assert total(t, angles) == pytest.approx(99.9, abs=0.3)
 
 
-def test_angles_that_never_change_give_way_to_speeds() -> None:
+def test_speeds_are_used_if_the_angles_never_change() -> None:
     def both() -> Iterator[RosMessage]:
         for at, left, right in zip(SHORT.t, SHORT.left, SHORT.right, strict=True):
             yield message(
@@ -156,13 +156,13 @@ def test_several_topics_of_a_type_are_named_and_one_can_be_chosen() -> None:
     assert "/imu/raw" in bag.notes[0]
 
 
-def test_a_named_sensor_is_the_only_one() -> None:
+def test_only_the_sensor_that_is_named_is_used() -> None:
     bag = of(joint_states(SHORT), imu(SHORT), poses(SHORT), use=["/slam/pose"])
     assert "yaw_rate" not in bag.columns
     assert finite(bag, "x") == len(SHORT.place)
 
 
-def test_a_few_messages_make_no_candidate() -> None:
+def test_a_topic_with_few_messages_is_not_a_candidate() -> None:
     few = list(imu(SHORT, "/imu/raw"))[:5]
     assert "/imu/data" in of(joint_states(SHORT), imu(SHORT), iter(few)).notes[0]
 
@@ -223,7 +223,7 @@ def test_a_tilted_pose_gives_the_yaw_of_its_quaternion() -> None:
 
 
 @each(("axis", "sign", "option"), [(0, 1.0, "x"), (0, -1.0, "-x"), (1, 1.0, "y"), (1, -1.0, "-y")])
-def test_an_imu_on_its_side_is_told_with_the_axis_that_follows_the_wheels(
+def test_an_imu_on_its_side_is_refused_with_the_axis_that_follows_the_wheels(
     axis: int, sign: float, option: str
 ) -> None:
     with pytest.raises(
@@ -244,7 +244,7 @@ def test_an_imu_upside_down_is_turned_by_the_option() -> None:
 # the clocks
 
 
-def test_stamps_of_another_clock_are_moved_to_that_of_the_recording() -> None:
+def test_stamps_of_another_clock_are_moved_to_the_clock_of_the_recording() -> None:
     bag = of(joint_states(SHORT), imu(SHORT, late=1e6))
     assert "different clocks, 1e+06 s apart" in bag.notes[1]
     gyro = bag.columns["t"][np.isfinite(bag.columns["yaw_rate"])]
@@ -293,24 +293,24 @@ def again(seen: Drive) -> Iterator[RosMessage]:
         ([again(SHORT), imu(SHORT)], "go back by 15 s in the middle"),
     ],
 )
-def test_what_a_bag_lacks_is_told(topics: list[Iterator[RosMessage]], why: str) -> None:
+def test_a_bag_that_lacks_data_is_refused_with_the_reason(topics: list[Iterator[RosMessage]], why: str) -> None:
     with pytest.raises(LogError, match=why):
         of(*[iter(list(topic)) for topic in topics])
 
 
-def test_a_topic_that_is_not_there_is_told_with_those_that_are() -> None:
+def test_a_missing_topic_is_refused_with_a_list_of_the_topics_in_the_bag() -> None:
     with pytest.raises(
         LogError, match=r"no topic /imu that can be used. The bag contains .*/imu/data"
     ):
         of(joint_states(SHORT), imu(SHORT), use=["/imu"])
 
 
-def test_an_axis_without_an_imu_is_told() -> None:
+def test_an_axis_option_without_an_imu_is_refused() -> None:
     with pytest.raises(LogError, match="the tool uses no IMU"):
         of(joint_states(SHORT), poses(SHORT), axis="x")
 
 
-def test_wheels_that_never_move_are_told() -> None:
+def test_wheels_that_never_move_are_refused() -> None:
     still = usual(plan=[(10, 0, 0)])
     still = Drive(**{**vars(still), "left": still.left * 0, "right": still.right * 0})
     with pytest.raises(LogError, match="neither positions nor velocities that change"):

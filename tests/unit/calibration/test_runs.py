@@ -21,7 +21,7 @@ def of(lines: list[str]) -> tuple[list[str], list[float], tuple[str, ...]]:
     return [r.name for r in log.runs], [float(r.t[-1]) for r in log.runs], log.notes
 
 
-def test_rows_in_no_order_are_sorted_and_told() -> None:
+def test_unordered_rows_are_sorted_and_reported() -> None:
     mixed = list(np.random.default_rng(1).permutation(rows(1.7e9, 1000)))
     names, ends, notes = of(mixed)
     assert names == ["1"]
@@ -29,13 +29,13 @@ def test_rows_in_no_order_are_sorted_and_told() -> None:
     assert any("out of order" in note for note in notes)
 
 
-def test_repeated_times_are_taken_once_and_told() -> None:
+def test_rows_with_repeated_times_are_taken_once_and_reported() -> None:
     log = runs(read((HEADER + "\n".join(rows(0) + rows(0))).encode()))
     assert len(log.runs[0].t) == 100
     assert any("an earlier row has the same time" in note for note in log.notes)
 
 
-def test_a_time_that_begins_anew_begins_a_run() -> None:
+def test_a_time_that_restarts_begins_a_new_run() -> None:
     names, ends, notes = of(rows(0, 500) + rows(0, 300))
     assert (names, len(ends)) == (["1", "2"], 2)
     assert any("the time in the log jumps back; number of jumps: 1" in note for note in notes)
@@ -45,11 +45,11 @@ def test_halves_of_a_drive_in_the_wrong_order_stay_one_run() -> None:
     assert of(rows(10, 500) + rows(0, 500))[0] == ["1"]
 
 
-def test_runs_are_told_apart_by_their_column() -> None:
+def test_runs_are_distinguished_by_the_run_column() -> None:
     assert of(rows(0, run="a") + rows(0, run="b"))[0] == ["a", "b"]
 
 
-def test_a_run_with_too_few_rows_is_left_out_and_told() -> None:
+def test_a_run_with_too_few_rows_is_left_out_and_reported() -> None:
     names, _, notes = of(rows(0, run="a") + rows(0, 3, run="b"))
     assert names == ["a"]
     assert any("fewer than 20 rows of wheel speeds: 1" in note for note in notes)
@@ -60,40 +60,40 @@ def test_rows_without_a_time_are_reported() -> None:
 
 
 @pytest.mark.parametrize("rate", [20, 100, 500, 1000])
-def test_milliseconds_are_told_from_seconds(rate: int) -> None:
+def test_times_in_milliseconds_are_refused(rate: int) -> None:
     with pytest.raises(LogError, match="t must be in seconds"):
         of(rows(0, step=1000.0 / rate))
 
 
 @pytest.mark.parametrize("per_second", [1e6, 1e9])
-def test_stamps_in_ns_and_us_since_1970_are_told_from_seconds(per_second: float) -> None:
+def test_stamps_in_ns_and_us_since_1970_are_refused(per_second: float) -> None:
     lines = [f"{(1.7e9 + i / 100) * per_second:.0f},{i},{i},{i}," for i in range(100)]
     with pytest.raises(LogError, match="t must be in seconds"):
         of(lines)
 
 
 @pytest.mark.parametrize("form", ["{:g}", "{:.0f}"])
-def test_times_that_were_rounded_away_are_reported(form: str) -> None:
+def test_times_rounded_too_coarsely_are_refused(form: str) -> None:
     lines = [f"{form.format(1.7e9 + i / 100)},{i},{i},{i}," for i in range(3000)]
     with pytest.raises(LogError, match="write t in seconds with 3 decimals"):
         of(lines)
 
 
-def test_a_stamp_of_1970_makes_no_drive_of_fifty_years() -> None:
+def test_a_zero_stamp_before_a_drive_is_left_out() -> None:
     names, ends, notes = of(["0,0,0,0,", *rows(1.7e9, 500)])
     assert names == ["1"]
     assert ends == pytest.approx([4.99])
     assert any("fewer than 20 rows of wheel speeds" in note for note in notes)
 
 
-def test_a_pause_of_a_day_parts_two_drives() -> None:
+def test_a_pause_of_a_day_separates_two_drives() -> None:
     names, ends, notes = of(rows(0, 500) + rows(86_400, 300))
     assert names == ["1", "2"]
     assert ends == pytest.approx([4.99, 2.99])
     assert any("over 60 s in the wheel speeds; number of gaps: 1" in note for note in notes)
 
 
-def test_a_column_without_any_number_is_named() -> None:
+def test_a_column_without_any_number_is_refused_by_name() -> None:
     with pytest.raises(LogError, match="column right has no number in any row"):
         of([f"{i},1,,{i}," for i in range(100)])
 
@@ -110,23 +110,23 @@ FOUR = "t,fr,fl,rl,rr,yaw_rate\n"
         ("9,9,0.1,9", "rl hardly turns while fl does"),
     ],
 )
-def test_front_and_rear_that_contradict_each_other_are_reported(wheels: str, words: str) -> None:
+def test_front_and_rear_wheels_that_contradict_each_other_are_refused(wheels: str, words: str) -> None:
     text = FOUR + "".join(f"{i / 100},{wheels},0\n" for i in range(500))
     with pytest.raises(LogError, match=words):
         runs(read(text.encode()))
 
 
-def test_front_and_rear_that_differ_are_reported() -> None:
+def test_front_and_rear_wheels_that_differ_slightly_are_reported() -> None:
     text = FOUR + "".join(f"{i / 100},9,9,9,7,0\n" for i in range(500))
     assert any("fr and rr differ by 22%" in n for n in runs(read(text.encode())).notes)
 
 
-def test_a_run_for_each_row_is_none() -> None:
+def test_a_run_column_with_a_new_name_in_each_row_is_refused() -> None:
     with pytest.raises(LogError, match="each name must stand for a drive"):
         of([f"{i / 100},{i},{i},{i},{i}" for i in range(2000)])
 
 
-def test_wheels_of_few_counts_do_not_contradict_each_other() -> None:
+def test_wheels_with_coarse_encoders_do_not_contradict_each_other() -> None:
     rng, step = np.random.default_rng(1), 2 * np.pi / 16
     angles = np.linspace(0, 40, 1001)[:, None] + rng.uniform(0, 1, 4)
     wheels = np.diff(np.floor(angles / step), axis=0) * step / 0.01
@@ -152,7 +152,7 @@ def test_four_wheels_are_the_means_of_two_sides() -> None:
     assert run.place[2] == 2 - 2j
 
 
-def test_positions_that_a_logger_says_again_until_the_next_one_are_taken_once() -> None:
+def test_positions_that_a_logger_repeats_until_the_next_sample_are_taken_once() -> None:
     """The logger repeats positions of 5 Hz in rows of 100 Hz, so that every cell is filled."""
     rows = [f"{i / 100},{4 * (i >= 300)},{4 * (i >= 300)},{max(0, i // 20 - 15) * 0.04:.3f},0"
             for i in range(1000)]  # fmt: skip
@@ -181,7 +181,7 @@ def test_positions_of_half_the_rate_are_recognized_in_one_note_for_all_runs() ->
     )
 
 
-def test_what_happens_in_many_runs_is_one_note_with_its_sum() -> None:
+def test_one_note_sums_an_event_over_all_runs() -> None:
     notes = Notes(["columns not used: a"])
     for count in (3, 0, 4):
         notes.add("{} rows of yaw are out of order", count)
@@ -219,20 +219,20 @@ def test_angles_are_sums_of_speeds() -> None:
     assert np.allclose(right, [0, -10, -18])
 
 
-def test_nothing_is_known_of_a_gap() -> None:
+def test_angles_stay_constant_over_a_gap() -> None:
     turned = log_of(drive((0, 5, 2.0), (8, 10, 2.0))).runs[0]
     assert turned.gaps.shape == (1, 2)
     left, _ = turned.angles(np.array([4.99, 8.0]))
     assert left[0] == left[1]
 
 
-def test_no_stretch_across_a_gap_is_inside() -> None:
+def test_an_interval_that_overlaps_a_gap_is_not_inside() -> None:
     holes = gaps(np.concatenate((np.arange(0, 5, 0.1), np.arange(7, 9, 0.1))))
     begin, end = np.array([1.0, 4.0, 5.5, 7.5]), np.array([2.0, 6.0, 6.5, 8.0])
     assert inside(begin, end, holes).tolist() == [True, False, False, True]
 
 
-def test_a_rest_is_where_all_wheels_stand_long_enough() -> None:
+def test_a_rest_is_an_interval_in_which_all_wheels_stand_long_enough() -> None:
     run = log_of(drive((0, 2, 0.0), (2, 4, 1.0), (4, 4.5, 0.0), (4.5, 6, 1.0), (6, 8, 0.01))).runs[
         0
     ]

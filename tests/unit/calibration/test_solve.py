@@ -138,7 +138,7 @@ def test_standard_deviations_are_as_wide_as_the_errors(kind: str, way: str) -> N
 @pytest.mark.variations(3)
 @so_many
 @each_way
-def test_what_is_said_to_remain_is_what_remains(way: str, count: int) -> None:
+def test_the_reported_remaining_error_is_the_error_that_remains(way: str, count: int) -> None:
     for c, _ in robots(way, count):
         worth = c.improvement
         for error in (worth.heading, worth.place):
@@ -173,7 +173,7 @@ def slow_drives(seed: int, **other: float) -> list[Drive]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 3, 6])
-def test_slow_squares_of_a_sound_robot_make_it_no_worse(seed: int) -> None:
+def test_slow_squares_do_not_worsen_the_odometry_of_a_sound_robot(seed: int) -> None:
     """The errors of the wheels hide the small turns of a short block, so its track is too wide."""
     log = log_of_runs(slow_drives(seed, wheel_noise=0.05), gyro=False)
     elsewhere = slow_drives(seed + 100, wheel_noise=0.05)
@@ -187,7 +187,7 @@ def test_slow_squares_of_a_sound_robot_make_it_no_worse(seed: int) -> None:
 
 
 @pytest.mark.slow
-def test_slow_squares_of_a_robot_that_is_off_make_it_better() -> None:
+def test_slow_squares_improve_the_odometry_of_a_miscalibrated_robot() -> None:
     fixed = {"chi": 1.1, "left": 0.98, "right": 1.02, "wheel_noise": 0.02}
     values = calibrated(log_of_runs(slow_drives(0, **fixed), gyro=False)).multipliers.values
     elsewhere = slow_drives(100, **fixed)
@@ -284,7 +284,7 @@ def test_bias_and_time_offset_are_reported(count: int) -> None:
 
 
 @pytest.mark.slow
-def test_a_bias_that_is_badly_seen_makes_unsure_what_it_bends() -> None:
+def test_an_uncertain_bias_widens_the_deviation_of_left_to_right() -> None:
     """A gyro bias looks like a curve to one side that is equal in every block."""
     z = []
     for seed in range(12):
@@ -297,7 +297,7 @@ def test_a_bias_that_is_badly_seen_makes_unsure_what_it_bends() -> None:
     assert np.sqrt(np.mean(np.square(z))) < 1.4
 
 
-def test_coarse_encoders_at_a_high_rate_bend_no_track() -> None:
+def test_coarse_encoders_at_a_high_rate_do_not_distort_the_track() -> None:
     """At 1 kHz, 20 counts per turn read as 0 or 314 rad/s.
 
     The mean of their squares therefore says nothing.
@@ -316,7 +316,7 @@ def test_coarse_encoders_at_a_high_rate_bend_no_track() -> None:
 
 @pytest.mark.variations(2)
 @pytest.mark.parametrize("places", [False, True])
-def test_a_gyro_that_says_too_much_is_allowed_for(places: bool) -> None:
+def test_the_deviation_of_the_track_covers_a_scale_error_of_the_gyro(places: bool) -> None:
     """A scale error of 1 % is normal for a gyro. Only positions reveal it."""
     robot = Robot(rate=0.0, slip=0.002, place_noise=0.003, rng=np.random.default_rng(1))
     seen = drive(robot, wander(robot.rng, 300.0))
@@ -328,7 +328,7 @@ def test_a_gyro_that_says_too_much_is_allowed_for(places: bool) -> None:
 
 
 @pytest.mark.slow
-def test_what_it_is_worth_is_told_by_the_gyro_as_it_was_put_right() -> None:
+def test_the_remaining_turn_error_uses_the_gyro_with_its_scale_corrected() -> None:
     robot = Robot(rate=0.0, slip=0.002, place_noise=0.003, rng=np.random.default_rng(1))
     seen = drive(robot, wander(robot.rng, 300.0))
     worth = calibrated(table(replace(seen, gyro=seen.gyro * 1.02))).improvement
@@ -336,7 +336,7 @@ def test_what_it_is_worth_is_told_by_the_gyro_as_it_was_put_right() -> None:
 
 
 @pytest.mark.slow
-def test_positions_that_tell_no_side_contradict_no_gyro() -> None:
+def test_positions_that_do_not_show_the_direction_do_not_contradict_the_gyro() -> None:
     """The robot drives one small square. Pieces of four seconds are straights and noise."""
     side: Plan = [(4, 0.3, 0), (0.5, 0, 0), (4, 0, np.pi / 2 * 1.5 / 4), (0.5, 0, 0)]
     robot = Robot(chi=1.5, rate=0.0, outliers=0.0, lever=0j, rng=np.random.default_rng(3))
@@ -350,7 +350,7 @@ AHEAD: Plan = [
 """The robot never rests, always drives forward and mostly turns left, so no mean is zero."""
 
 
-def test_a_log_without_a_rest_tells_the_same_of_the_drive_as_one_with_rests() -> None:
+def test_a_log_without_a_rest_gives_the_same_drive_statistics_and_turn_error() -> None:
     rests: Plan = [(3, 0, 0), *AHEAD, (3, 0, 0)]
     moving, resting = (
         calibrated(table(drive(Robot(rng=np.random.default_rng(4)), plan), places=False))
@@ -377,7 +377,7 @@ def test_a_tape_measures_the_wheels() -> None:
 
 @pytest.mark.slow
 @each_way
-def test_much_slip_makes_it_unsure_and_not_refused(way: str) -> None:
+def test_much_slip_widens_the_deviation_and_is_not_refused(way: str) -> None:
     gyro, places = WAYS[way]
     rng = np.random.default_rng(5)
     made = drive(Robot(slip=0.05, rng=rng), wander(rng, 120.0))
@@ -394,7 +394,7 @@ def test_coarse_positions_are_compared_over_a_longer_time() -> None:
 
 
 @pytest.mark.slow
-def test_order_repetition_standstill_and_epoch_change_nothing() -> None:
+def test_order_repetition_and_standstill_do_not_change_the_multipliers() -> None:
     made = drive(Robot(rng=np.random.default_rng(4)), [(200, 0, 0), *GUIDED, (100, 0, 0)], 1.7e9)
     head, *body = made.csv(places=False).splitlines()
     mixed = list(np.random.default_rng(1).permutation(body + body[:500]))
@@ -423,14 +423,14 @@ TOO_LITTLE = [[(3, 0, 0), (30, 0.3, 0)], [(3, 0, 0), (60, 0.3, 0.8)], [(60, 0, 0
     ("way", "plan"),
     [*((way, plan) for plan in TOO_LITTLE for way in WAYS), ("positions", SPIN), ("both", SPIN)],
 )
-def test_a_drive_that_tells_too_little_is_refused(way: str, plan: list[tuple[float, ...]]) -> None:
+def test_a_drive_with_too_few_movements_is_refused(way: str, plan: list[tuple[float, ...]]) -> None:
     gyro, places = WAYS[way]
     with pytest.raises(RefusedError, match="a drive of 60 s"):
         calibrated(table(drive(Robot(), plan), gyro=gyro, places=places))  # type: ignore[arg-type]
 
 
 @pytest.mark.slow
-def test_a_million_rows_are_calibrated_with() -> None:
+def test_a_log_of_a_million_rows_is_calibrated() -> None:
     rng = np.random.default_rng(1)
     text = drive(Robot(rng=rng), wander(rng, 4900.0)).csv()
     assert text.count("\n") > 1_000_000

@@ -78,7 +78,7 @@ def driven() -> Told:
     return drives.rounded(1, 10.0)
 
 
-def test_a_robot_that_stands_is_told_its_settings_and_no_more() -> None:
+def test_the_budget_of_a_standing_robot_has_only_shares_from_settings() -> None:
     still = [Line(n / 100, (0.0,) * 4, (1.0,) * 4, 0.0, 0.0) for n in range(300)]
     known = replace(CONFIG, odometry=OdometryConfig(wheel_separation_multiplier_std=0.02))
     found = budget(Received(still, []), known)
@@ -92,29 +92,29 @@ def test_a_robot_that_stands_is_told_its_settings_and_no_more() -> None:
     assert found.at_rest[1] > 0.0
 
 
-def test_without_lines_it_is_the_same() -> None:
+def test_without_lines_the_robot_counts_as_standing_still() -> None:
     assert budget(Received([], []), CONFIG).still
 
 
-def test_parameters_that_nobody_measured_are_unknown_and_not_nothing() -> None:
+def test_parameters_that_were_not_measured_have_an_unknown_share_and_not_zero() -> None:
     found = share(budget(Received(driven().lines, []), CONFIG), "parameters")
     assert (found.basis, found.mm_per_100_m, found.deg_per_turn) == ("unknown", None, None)
 
 
-def test_the_track_that_a_gyro_implies_is_a_measured_error() -> None:
+def test_a_track_learned_by_the_gyro_is_a_measured_error() -> None:
     found = share(budget(Received(driven().lines, [], learned=1.1), CONFIG), "parameters")
     assert found.basis == "measured"
     assert found.deg_per_turn == pytest.approx(36.0, rel=0.02)
 
 
-def test_a_learned_track_that_is_in_use_errs_by_its_own_deviation() -> None:
+def test_the_error_of_a_learned_track_in_use_is_its_own_deviation() -> None:
     received = Received(driven().lines, [], learned=1.1, deviation=0.02, used=True)
     found = share(budget(received, CONFIG), "parameters")
     assert found.basis == "measured"
     assert found.deg_per_turn == pytest.approx(7.2, rel=0.02)
 
 
-def test_the_track_that_a_gyro_implies_is_a_multiplier_as_the_configured_one() -> None:
+def test_the_learned_track_is_given_as_a_multiplier_like_the_configured_one() -> None:
     config = replace(CONFIG, drive=replace(CONFIG.drive, wheel_separation_multiplier=1.5))
     found = budget(Received(driven().lines, [], learned=1.1, deviation=0.02), config)
     assert found.multiplier == 1.5
@@ -123,7 +123,7 @@ def test_the_track_that_a_gyro_implies_is_a_multiplier_as_the_configured_one() -
     assert budget(Received(driven().lines, []), config).learned is None
 
 
-def test_with_a_gyro_no_wheel_turns_the_heading() -> None:
+def test_with_a_gyro_no_error_of_the_wheels_changes_the_heading() -> None:
     lines = [replace(line, yaw_variance=1e-6 * n) for n, line in enumerate(driven().lines)]
     found = budget(Received(lines, [], gyro=True), CONFIG)
     for cause in ("time", "quantization", "gaps", "slip"):
@@ -149,13 +149,13 @@ def with_a_gyro(lines: list[Line], before: float = 0.0) -> Share:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("before", [-10, 10])
-def test_what_a_gyro_costs_a_turn_does_not_depend_on_what_was_turned_before(before: int) -> None:
+def test_the_error_of_a_gyro_per_turn_does_not_depend_on_earlier_turns(before: int) -> None:
     found, fresh = (with_a_gyro(driven().lines, turns) for turns in (before, 0.0))
     assert found.deg_per_turn == pytest.approx(fresh.deg_per_turn, rel=0.02)
 
 
 @pytest.mark.slow
-def test_at_rest_a_gyro_costs_nothing_and_says_nothing_of_a_drive() -> None:
+def test_a_rest_before_the_drive_does_not_change_the_error_of_the_gyro() -> None:
     lines = driven().lines
     still = [
         replace(lines[0], at=lines[0].at - 3.0 + n / 100, speeds=(0.0,) * 4) for n in range(300)
@@ -164,7 +164,7 @@ def test_at_rest_a_gyro_costs_nothing_and_says_nothing_of_a_drive() -> None:
     assert rested.deg_per_turn == pytest.approx(found.deg_per_turn, rel=0.05)
 
 
-def test_of_one_long_spin_nobody_knows_what_is_noise_and_what_scale() -> None:
+def test_one_long_spin_does_not_separate_gyro_noise_from_its_scale_error() -> None:
     line = driven().lines[0]
     spin = [
         replace(line, at=n / 100, yaw=n / 100, positions=(0.01 * n, -0.01 * n, -0.01 * n, 0.01 * n),
@@ -174,7 +174,7 @@ def test_of_one_long_spin_nobody_knows_what_is_noise_and_what_scale() -> None:
     assert with_a_gyro(spin, 10.0).basis == "unknown"
 
 
-def test_counts_leave_time_and_gaps_without_a_share_and_a_count_for_quantization() -> None:
+def test_with_counts_the_shares_of_time_and_gaps_are_zero_and_quantization_remains() -> None:
     counted = replace(CONFIG, mcu=McuConfig(link_check="require", encoder_counts=400))
     found = budget(Received(drives.late(1, 10.0, "batches").lines, [], counted=True), counted)
     assert share(found, "time").mm_per_100_m == share(found, "gaps").mm_per_100_m == 0.0
@@ -182,7 +182,7 @@ def test_counts_leave_time_and_gaps_without_a_share_and_a_count_for_quantization
     assert found.counts == 400
 
 
-def test_of_lines_that_did_not_all_come_here_nothing_is_told_of_time() -> None:
+def test_if_lines_are_missing_here_the_shares_of_time_and_gaps_are_unknown() -> None:
     found = budget(Received(driven().lines, [], whole=False), CONFIG)
     assert {share(found, cause).basis for cause in ("time", "quantization", "gaps")} == {"unknown"}
 
@@ -198,7 +198,7 @@ def test_a_wheel_that_contradicts_its_neighbour_is_measured_slip() -> None:
     assert (found.mm_per_100_m or 0.0) > 10_000
 
 
-def test_the_largest_is_of_the_place_and_else_of_the_heading() -> None:
+def test_the_largest_cause_is_chosen_among_the_requested_bases() -> None:
     found = budget(Received(driven().lines, []), CONFIG)
     quantization, slip = found.largest("measured"), found.largest("measured", "settings")
     assert quantization is not None

@@ -42,7 +42,7 @@ KNOWN: tuple[Cause, float, Basis] = ("parameters", 5.0, "settings")
         ("parameters", "acsard calibrate"),
     ],
 )
-def test_one_sentence_says_what_to_do_about_the_largest_that_was_measured(
+def test_one_sentence_advises_on_the_largest_measured_cause(
     cause: Cause, says: str
 ) -> None:
     told = advice(of((cause, 100.0, "measured"), KNOWN))
@@ -50,17 +50,17 @@ def test_one_sentence_says_what_to_do_about_the_largest_that_was_measured(
     assert says in told
 
 
-def test_coarse_encoders_are_named() -> None:
+def test_the_counts_of_coarse_encoders_are_named() -> None:
     assert "40 counts" in advice(of(("quantization", 100.0, "measured"), KNOWN, counts=40))
 
 
-def test_coarse_encoders_whose_counts_nobody_knows_come_first() -> None:
+def test_coarse_encoders_without_configured_counts_come_first() -> None:
     told = advice(of(("time", 100.0, "measured"), KNOWN, coarse=True))
     assert told.startswith("the encoders are coarse")
     assert "as mcu.encoder_counts" in told
 
 
-def test_what_is_only_declared_does_not_hide_what_was_measured() -> None:
+def test_a_larger_cause_from_the_settings_does_not_hide_the_measured_one() -> None:
     told = advice(of(("slip", 900.0, "settings"), ("time", 50.0, "measured"), KNOWN))
     assert told.startswith(
         "according to the settings in [odometry], the largest cause of errors is slip"
@@ -68,13 +68,13 @@ def test_what_is_only_declared_does_not_hide_what_was_measured() -> None:
     assert "the largest measured cause of errors is time" in told
 
 
-def test_who_never_calibrated_is_told_so_first() -> None:
+def test_the_advice_for_a_robot_without_calibration_comes_first() -> None:
     told = advice(of(("time", 50.0, "measured"), ("parameters", None, "unknown")))
     assert told.startswith("the errors of the configured wheel radii and track width are unknown")
     assert "the largest measured cause of errors is time" in told
 
 
-def test_without_an_error_it_says_so() -> None:
+def test_the_advice_says_if_there_is_no_error() -> None:
     assert advice(of()) == "the odometry shows no error on this drive"
 
 
@@ -86,14 +86,14 @@ def test_the_table_has_every_cause_and_their_sum() -> None:
     assert max(map(len, rows)) <= SENTENCES
 
 
-def test_what_this_driving_does_not_tell_is_a_dash_and_what_is_tiny_no_zero() -> None:
+def test_an_unknown_share_is_a_dash_and_a_tiny_share_is_not_a_zero() -> None:
     rows = text(of(("time", 0.01, "measured"), ("gaps", None, "unknown"))).splitlines()
     assert next(row for row in rows if row.startswith("time")).split()[1] == "<1"
     assert next(row for row in rows if row.startswith("gaps")).split()[1:3] == ["-", "-"]
 
 
 @pytest.mark.parametrize("still", [False, True])
-def test_the_track_that_a_gyro_implies_stands_beside_the_configured_one(still: bool) -> None:
+def test_the_table_states_the_track_learned_by_the_gyro_and_the_configured_one(still: bool) -> None:
     found = of(KNOWN, learned=1.7, learned_std=0.05, multiplier=1.5, still=still)
     told = " ".join(text(found).split())
     assert (
@@ -107,7 +107,7 @@ def test_the_track_that_a_gyro_implies_stands_beside_the_configured_one(still: b
     assert "the configured value is 1.500." in told
 
 
-def test_a_robot_that_stands_is_told_what_settings_tell_and_to_drive() -> None:
+def test_the_table_of_a_standing_robot_has_the_shares_by_settings_and_asks_to_drive() -> None:
     told = text(of(("parameters", 7.2, "settings"), still=True))
     assert "stands still" in told
     assert "0.10 mm/s" in told

@@ -58,7 +58,7 @@ def odom(seconds: float, yaw: float = 0.5) -> Odometry:
     return Odometry(wheels(seconds).header, "base_link", pose, twist)
 
 
-def test_a_line_has_the_parts_of_both_messages_of_its_stamp_in_any_order() -> None:
+def test_two_messages_of_one_stamp_make_a_line_in_any_order() -> None:
     feed = Feed(Config(), state(10))
     for message in (wheels(0.01), odom(0.01), odom(0.02, 1.5), wheels(0.02)):
         feed.add(message)
@@ -69,7 +69,7 @@ def test_a_line_has_the_parts_of_both_messages_of_its_stamp_in_any_order() -> No
     assert other.yaw == pytest.approx(1.5)
 
 
-def test_half_a_line_is_none_and_is_not_kept_for_ever() -> None:
+def test_half_a_line_is_not_a_line_and_is_dropped_in_time() -> None:
     feed = Feed(Config(), state(0))
     for n in range(1000):
         feed.add(wheels(n / 100))
@@ -78,7 +78,7 @@ def test_half_a_line_is_none_and_is_not_kept_for_ever() -> None:
     assert feed.received(state(0), diagnostics()).lines == []
 
 
-def test_the_lines_that_left_are_those_of_the_applied_commands() -> None:
+def test_the_times_of_the_sent_lines_are_the_stamps_of_the_applied_commands() -> None:
     feed = Feed(Config(), state(0))
     feed.add(TwistStamped(wheels(0.25).header, ZERO))
     assert feed.received(state(0), diagnostics()).sent == [0.25]
@@ -87,7 +87,7 @@ def test_the_lines_that_left_are_those_of_the_applied_commands() -> None:
 @pytest.mark.parametrize(
     ("lines", "impossible", "whole"), [(102, 0, True), (140, 0, False), (140, 40, True)]
 )
-def test_lines_of_the_daemon_that_did_not_come_are_noticed(
+def test_lines_that_the_daemon_counted_but_did_not_arrive_here_are_noticed(
     lines: int, impossible: int, whole: bool
 ) -> None:
     feed = Feed(Config(), state(0))
@@ -106,12 +106,12 @@ def test_coarse_encoders_are_noticed_by_the_lines_that_state_counts(
     assert Feed(Config(), state(0)).received(last, diagnostics()).coarse is coarse
 
 
-def test_who_has_rates_limited_does_not_send_all_lines() -> None:
+def test_a_daemon_with_a_limited_rate_does_not_send_all_lines() -> None:
     slow = replace(Config(), rates=RatesConfig(odom=10.0))
     assert not Feed(slow, state(0)).received(state(0), diagnostics()).whole
 
 
-def test_counts_are_in_force_only_where_the_link_says_so() -> None:
+def test_counts_are_in_force_only_if_the_link_check_has_samples() -> None:
     asked = replace(Config(), mcu=McuConfig(link_check="auto", encoder_counts=400))
     for check, counted in (("checked with samples", True), ("plain", False)):
         assert Feed(asked, state(0)).received(state(0), diagnostics(check=check)).counted is counted
@@ -122,7 +122,7 @@ def test_the_heading_is_the_gyros_where_it_is_used(does: str, used: bool) -> Non
     assert Feed(Config(), state(0)).received(state(0, does), diagnostics()).gyro is used
 
 
-def test_the_track_that_a_gyro_learned_is_a_share_of_the_configured_one() -> None:
+def test_a_learned_track_is_relative_to_the_configured_one() -> None:
     both = {"wheel_separation_multiplier": "1.500", "learned_multiplier": "1.650"}
     both["learned_multiplier_std"] = "0.033"
     for in_use, used in (("1.500", False), ("1.650", True)):

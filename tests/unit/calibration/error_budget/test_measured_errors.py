@@ -27,7 +27,7 @@ NONE = np.zeros(0)
 EVEN = np.asarray(np.arange(600) * PERIOD, dtype=np.float64)
 
 
-def test_even_lines_are_in_their_places() -> None:
+def test_evenly_spaced_lines_are_neither_late_nor_missing() -> None:
     found = line_times(EVEN, NONE)
     assert np.abs(found.late).max() < 1e-9
     assert found.period == pytest.approx(PERIOD)
@@ -35,7 +35,7 @@ def test_even_lines_are_in_their_places() -> None:
 
 
 @each("period", [0.00997, 0.01, 0.0102, 0.05])
-def test_the_period_need_not_be_known(period: float) -> None:
+def test_the_period_is_found_from_the_times_of_the_lines(period: float) -> None:
     t = np.asarray(np.arange(400) * period, dtype=np.float64)
     assert line_times(t, NONE).period == pytest.approx(period, rel=1e-6)
 
@@ -49,14 +49,14 @@ def test_a_line_that_is_read_late_is_late_and_not_missing() -> None:
     assert abs(found.late[400]) < 0.002
 
 
-def test_an_adapter_that_holds_lines_loses_none() -> None:
+def test_lines_that_an_adapter_holds_back_are_not_missing() -> None:
     found = line_times(np.ceil(EVEN / 0.016) * 0.016, NONE)
     assert not found.missing.any()
     assert 0.003 < float(np.std(found.late)) < 0.006  # a uniform delay over 16 ms has 4.6
 
 
 @each("gone", [1, 2, 5, 20])
-def test_lines_that_do_not_come_are_missing_where_they_were(gone: int) -> None:
+def test_missing_lines_are_counted_at_their_place(gone: int) -> None:
     rng = np.random.default_rng(1)
     kept = np.delete(EVEN, np.arange(300, 300 + gone)) + rng.uniform(0, 0.001, 600 - gone)
     found = line_times(np.sort(kept), NONE)
@@ -65,7 +65,7 @@ def test_lines_that_do_not_come_are_missing_where_they_were(gone: int) -> None:
     assert np.abs(found.late).max() < 0.002
 
 
-def test_lines_that_answer_others_belong_behind_those_however_uneven_they_left() -> None:
+def test_replies_are_timed_from_their_sent_lines_however_unevenly_these_left() -> None:
     rng = np.random.default_rng(2)
     sent = np.cumsum(rng.choice([0.004, 0.01, 0.013], 600))
     found = line_times(sent[3:] + 0.006, sent)
@@ -74,7 +74,7 @@ def test_lines_that_answer_others_belong_behind_those_however_uneven_they_left()
     assert not line_times(np.delete(sent[3:], 200) + 0.002, sent).missing[:190].any()
 
 
-def test_lines_of_one_stamp_are_no_error() -> None:
+def test_lines_with_equal_stamps_raise_no_error() -> None:
     assert len(line_times(np.zeros(40), NONE).late) == 40
 
 
@@ -102,7 +102,7 @@ def test_distance_and_time_are_those_of_the_drive() -> None:
     assert not found.late.any() or np.abs(found.late).max() < 1e-12
 
 
-def test_a_gap_in_which_the_pose_stood_is_all_the_way_that_was_driven_in_it() -> None:
+def test_a_gap_without_motion_of_the_pose_is_unfilled_by_the_way_driven_in_it() -> None:
     at = even(100) + [1.5 + t for t in even(100)]
     moved = [SPEED * PERIOD] * 200
     moved[100] = 0.0
@@ -112,7 +112,7 @@ def test_a_gap_in_which_the_pose_stood_is_all_the_way_that_was_driven_in_it() ->
     assert found.unseen == pytest.approx(0.51)
 
 
-def test_lines_that_are_missing_are_a_doubt_where_the_pose_went_on() -> None:
+def test_missing_lines_over_which_the_pose_continued_make_a_filled_gap() -> None:
     at, moved = even(200), [SPEED * PERIOD] * 197
     del at[100:103]
     moved[100] = 4 * SPEED * PERIOD
@@ -123,7 +123,7 @@ def test_lines_that_are_missing_are_a_doubt_where_the_pose_went_on() -> None:
     assert not found.unfilled.any()
 
 
-def test_lines_that_only_we_have_missed_are_no_gap() -> None:
+def test_lines_that_only_this_program_missed_are_not_a_gap() -> None:
     at, moved = even(200), [SPEED * PERIOD] * 197
     del at[100:103]
     moved[100] = 4 * SPEED * PERIOD
@@ -131,7 +131,7 @@ def test_lines_that_only_we_have_missed_are_no_gap() -> None:
     assert (found.missing, found.unseen) == (0, 0.0)
 
 
-def test_lines_that_are_late_at_one_speed_change_nothing() -> None:
+def test_late_lines_at_a_constant_speed_cause_no_error() -> None:
     rng = np.random.default_rng(1)
     at = np.sort(np.array(even(300)) + rng.exponential(0.002, 300)).tolist()
     found = motion(ahead(at), NONE, KINEMATICS, whole=True)
@@ -148,7 +148,7 @@ def four(*columns: Floats) -> Floats:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("ripple", [0.0, 0.03])
-def test_the_variance_is_that_of_the_rounding_errors_sum(ripple: float) -> None:
+def test_the_variance_is_that_of_the_sum_of_the_rounding_errors(ripple: float) -> None:
     """A steady wheel has the same rounding error all the time.
 
     A wheel that trembles has a new one in each line.
@@ -163,26 +163,26 @@ def test_the_variance_is_that_of_the_rounding_errors_sum(ripple: float) -> None:
     assert np.mean(np.square(errors)) == pytest.approx(np.mean(told), rel=0.6)
 
 
-def test_a_wheel_that_passes_through_its_speeds_hardly_errs() -> None:
+def test_the_rounding_errors_of_a_wheel_with_changing_speed_cancel_out() -> None:
     true = np.linspace(0.0, 10.0, 20_000)  # twenty lines for each hundredth
     said = np.round(true, 2)
     found = rounding(four(said, said, said, said), PERIOD)
     assert math.sqrt(found.variance[:, 0].sum()) < 20 * 0.01 * PERIOD
 
 
-def test_wheels_that_always_say_the_same_err_together_and_others_by_themselves() -> None:
+def test_only_wheels_with_equal_speeds_have_equal_rounding_errors() -> None:
     rng = np.random.default_rng(2)
     one, other = (np.round(rng.uniform(5, 9, COUNT), 2) for _ in range(2))
     alike = rounding(four(one, other, other, one), PERIOD).alike
     assert alike.tolist() == [[1, 0, 0, 1], [0, 1, 1, 0], [0, 1, 1, 0], [1, 0, 0, 1]]
 
 
-def test_a_wheel_that_stands_does_not_err() -> None:
+def test_a_standing_wheel_has_no_rounding_error() -> None:
     assert not rounding(np.zeros((COUNT, 4)), PERIOD).variance.any()
 
 
 @each("counts", [96, 400, 1000, 4000])
-def test_a_firmware_that_counts_in_each_period_is_told_by_its_speeds(counts: int) -> None:
+def test_firmware_that_counts_in_each_period_is_recognized_by_its_speeds(counts: int) -> None:
     rng = np.random.default_rng(counts)
     step = math.tau / counts
     turned = np.cumsum(8.0 + 6.0 * np.sin(np.arange(COUNT) / 300) + rng.normal(0, 0.1, COUNT))
@@ -194,7 +194,7 @@ def test_a_firmware_that_counts_in_each_period_is_told_by_its_speeds(counts: int
 
 
 @each("seed", range(20))
-def test_a_firmware_that_filters_is_not_taken_for_one_that_counts(seed: int) -> None:
+def test_firmware_that_filters_is_not_taken_for_firmware_that_counts(seed: int) -> None:
     rng = np.random.default_rng(seed)
     said: Floats = np.cumsum(rng.normal(0, 0.2, (300, 4)), axis=0).round(2)
     assert rounding(said, PERIOD).count == 0.0
@@ -211,7 +211,7 @@ def told() -> Told:
     return rounded(1, 10.0)
 
 
-def test_the_steps_are_the_way(told: Told) -> None:
+def test_the_steps_add_up_to_the_driven_way_and_heading(told: Told) -> None:
     rows = driving(told).plain().rows
     assert len(rows) == pytest.approx(100, abs=1)
     first, last = told.lines[0], told.lines[-1]
@@ -220,31 +220,31 @@ def test_the_steps_are_the_way(told: Told) -> None:
     assert rows[:, 1].sum() == pytest.approx(last.yaw - first.yaw)
 
 
-def test_rounding_is_in_every_step_that_moves(told: Told) -> None:
+def test_every_step_that_moves_has_a_rounding_error(told: Told) -> None:
     rows = driving(told).rounded().rows
     assert rows[np.abs(rows[:, 0]) > 0.01, 2].all()
 
 
-def test_the_time_of_lines_is_in_blocks() -> None:
+def test_time_errors_occur_in_blocks() -> None:
     assert 10 <= np.count_nonzero(driving(late(1, 10.0, "batches")).late().rows[:, 2]) <= 21
 
 
-def test_nothing_is_missed_where_all_lines_came(told: Told) -> None:
+def test_no_step_has_a_gap_error_if_all_lines_came(told: Told) -> None:
     assert not driving(told).missed().rows[:, 2:].any()
 
 
-def test_wheels_of_a_side_that_agree_contradict_nobody(told: Told) -> None:
+def test_wheels_of_a_side_that_agree_show_no_slip(told: Told) -> None:
     assert not driving(told).contradicted().rows[:, 2:].any()
 
 
-def test_where_a_gyro_turns_no_wheel_errs_in_the_heading(told: Told) -> None:
+def test_if_a_gyro_gives_the_heading_rounding_changes_only_the_distance(told: Told) -> None:
     steps = driving(told, gyro=True).rounded()
     assert steps.by_gyro
     assert steps.rows[:, 2].any()
     assert not steps.rows[:, 3].any()
 
 
-def test_to_the_left_a_step_turns_by_as_much_and_errs_to_the_other_side() -> None:
+def test_a_step_to_the_right_is_mirrored_into_a_step_to_the_left() -> None:
     right = [0.1, -0.2, 1.0, 2.0, 0.3, 0.4, 5.0, 6.0, 7.0]
     left = [0.1, 0.2, 1.0, 2.0, 0.3, -0.4, 5.0, 6.0, 7.0]
     assert Steps(np.array([right, left])).to_the_left().rows.tolist() == [left, left]

@@ -36,16 +36,16 @@ def test_the_step_of_whole_counts_is_found(counts: int, seed: int, fastest: floa
 
 
 @given(seed=st.integers(0, 10_000), fastest=st.floats(1.0, 40.0))
-def test_speeds_that_lie_anywhere_have_none(seed: int, fastest: float) -> None:
+def test_random_speeds_have_no_quantization_step(seed: int, fastest: float) -> None:
     dice = random.Random(seed)
     assert found([round(dice.uniform(0.03, fastest), 2) for _ in range(100)]) == 0.0
 
 
-def test_a_few_damaged_lines_hide_no_step_and_many_do() -> None:
+def test_a_few_damaged_lines_do_not_hide_the_step_but_many_do() -> None:
     true = reported(quantum_of(3200), list(range(1, 400)))
     assert found([*true, 0.05]) == pytest.approx(quantum_of(3200), abs=1e-4)
     assert found([*true, *[0.83 + 0.1 * i for i in range(50)]]) == 0.0
 
 
-def test_none_is_finer_than_chance_would_have_it() -> None:
+def test_a_step_that_chance_could_explain_is_not_found() -> None:
     assert found(reported(FINEST * 0.95, list(range(1, 120)))) == 0.0

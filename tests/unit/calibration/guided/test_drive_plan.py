@@ -39,7 +39,7 @@ def robot(
     angular=st.floats(0.3, 10.0),
     wheel=st.floats(3.0, 60.0),
 )
-def test_no_command_is_beyond_the_limits_or_faster_than_slow(
+def test_no_command_exceeds_the_limits_or_the_slow_speed_of_the_plan(
     rate: float, separation: float, multiplier: float, linear: float, angular: float, wheel: float
 ) -> None:
     limits = LimitsConfig(linear_speed=linear, angular_speed=angular, wheel_speed=wheel)
@@ -59,7 +59,7 @@ RADIUS = st.floats(0.8, 1.3)
 @given(
     angle=SPIN, track=st.floats(1.0, 2.5), multiplier=st.floats(0.5, 2.5), left=RADIUS, right=RADIUS
 )
-def test_a_turn_by_the_true_track_is_the_angle_whatever_is_configured(
+def test_a_turn_planned_with_the_true_track_has_its_angle_whatever_is_configured(
     angle: float, track: float, multiplier: float, left: float, right: float
 ) -> None:
     config = robot(multiplier=multiplier)
@@ -86,12 +86,12 @@ def test_every_point_of_the_robot_stays_in_the_room(
             assert beyond(way, made, track, min(2.5, track * off), bend) <= 1e-6, (track, off)
 
 
-def test_a_robot_that_would_leave_the_room_is_found() -> None:
+def test_a_plan_too_long_for_the_room_is_found_to_leave_the_room() -> None:
     made = msgspec.structs.replace(setup(Config()), length=2.6)
     assert beyond("gyro", made, 1.0, 1.0, 0.0) > 0.05
 
 
-def test_a_robot_too_large_for_the_room_is_told_what_to_do() -> None:
+def test_a_robot_too_large_for_the_room_is_refused_with_the_option_log() -> None:
     with pytest.raises(GuideError, match="--log"):
         setup(robot(1.4))
 

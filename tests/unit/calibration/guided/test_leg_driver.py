@@ -70,7 +70,7 @@ def changed(**fields: object) -> Late:
     return lambda state: msgspec.structs.replace(state, **fields)
 
 
-def test_it_opens_with_zeros_drives_the_moves_and_ends_when_the_wheels_stand() -> None:
+def test_a_leg_begins_with_zeros_drives_its_moves_and_ends_when_the_wheels_stand() -> None:
     world = World(LEG).run(5.0)
     times = {said: world.said.count(said) * TICK for said in world.said}
     assert world.said[0] == REST
@@ -80,7 +80,7 @@ def test_it_opens_with_zeros_drives_the_moves_and_ends_when_the_wheels_stand() -
     assert world.driver.progress(world.now) == 1.0
 
 
-def test_wheels_that_follow_their_command_by_the_configured_radii_are_no_deviation() -> None:
+def test_wheels_that_follow_their_command_by_the_configured_radii_do_not_halt_the_leg() -> None:
     leg, size = Leg("", "", (Move(4.0, 0.3, 0.0),)), 0.6
     world = World(leg)
     drive = DriveConfig(left_wheel_radius_multiplier=size, right_wheel_radius_multiplier=size)
@@ -92,7 +92,7 @@ def test_wheels_that_follow_their_command_by_the_configured_radii_are_no_deviati
     assert (world.driver.phase, world.driver.halted) == (Phase.DONE, "")
 
 
-def test_nothing_moves_until_zeros_count() -> None:
+def test_nothing_moves_until_the_daemon_accepts_the_zeros() -> None:
     world = World(LEG)
     waiting = [SourceState("app", 50, 0.01, "send a zero first: app must send a zero")]
     world.tells = changed(sources=waiting, mode="ready", source="", sender="")
@@ -131,7 +131,7 @@ PASSING = {
 
 
 @each("why", STOPS)
-def test_what_is_not_as_it_must_be_stops_it_for_good(why: str) -> None:
+def test_a_leg_that_halts_on_a_fault_never_moves_again(why: str) -> None:
     """Only a passing disturbance lets the leg be repeated."""
     world = World(Leg("", "", (Move(10.0, 0.3),))).until_moving().run(2.0)
     world.tells = STOPS[why]
@@ -165,11 +165,11 @@ def test_a_link_that_was_lost_because_this_computer_did_not_run_is_a_passing_dis
     assert world.run(1.0).driver.disturbed
 
 
-def test_of_two_calibrations_the_one_that_is_followed_goes_on() -> None:
+def test_the_calibration_that_the_daemon_follows_continues_beside_another_one() -> None:
     assert of_two(LEG, US).run(5.0).driver.phase is Phase.DONE
 
 
-def test_of_two_calibrations_the_other_says_who_drives_and_moves_nothing() -> None:
+def test_a_calibration_that_must_wait_names_the_driving_program_and_moves_nothing() -> None:
     world = of_two(LEG, OTHER).run(OPENED_S + 0.5)
     assert set(world.said) == {REST}
     assert world.driver.halted.startswith(
@@ -178,20 +178,20 @@ def test_of_two_calibrations_the_other_says_who_drives_and_moves_nothing() -> No
     assert "end that program, or wait" in world.driver.halted
 
 
-def test_one_whose_robot_another_takes_on_the_way_says_so_at_once() -> None:
+def test_a_calibration_that_loses_the_robot_to_another_program_names_it_in_one_tick() -> None:
     world = of_two(LEG, US).until_moving()
     world.tells = changed(sources=TWO, sender=OTHER)
     world.run(TICK)
     assert OTHER in world.driver.halted
 
 
-def test_a_program_that_leaves_while_zeros_go_out_is_waited_for() -> None:
+def test_a_calibration_waits_for_a_program_that_leaves_during_the_zeros() -> None:
     world = of_two(LEG, OTHER).run(1.0)
     world.tells = changed(sender=US)
     assert world.run(5.0).driver.phase is Phase.DONE
 
 
-def test_a_daemon_that_falls_silent_stops_it() -> None:
+def test_a_daemon_that_falls_silent_halts_the_leg() -> None:
     world = World(Leg("", "", (Move(10.0, 0.3),))).until_moving()
     world.speaks = False
     world.run(QUIET_S + 2 * TICK)
@@ -204,14 +204,14 @@ def test_a_daemon_that_falls_silent_stops_it() -> None:
     assert not world.driver.disturbed
 
 
-def test_a_calibration_that_was_not_let_run_stops_and_does_not_blame_the_daemon() -> None:
+def test_a_calibration_that_was_held_up_halts_and_does_not_blame_the_daemon() -> None:
     world = World(Leg("", "", (Move(10.0, 0.3),))).until_moving()
     assert world.driver.step(world.now + QUIET_S + TICK) == REST
     assert world.driver.halted == HELD_UP
     assert world.driver.disturbed
 
 
-def test_one_that_stood_still_drives_on_by_nothing_that_has_waited_for_it() -> None:
+def test_a_calibration_that_was_held_up_does_not_continue_on_queued_messages() -> None:
     """The process stands still after Ctrl-Z, after Ctrl-S, or when it gets no core.
 
     It receives the messages of that time when it continues.
@@ -224,7 +224,7 @@ def test_one_that_stood_still_drives_on_by_nothing_that_has_waited_for_it() -> N
     assert set(world.run(3.0).said[-100:]) == {REST}
 
 
-def test_one_that_stood_still_before_its_first_move_does_not_begin_it() -> None:
+def test_a_calibration_that_was_held_up_before_its_first_move_does_not_start_it() -> None:
     world = World(LEG).run(0.1)
     world.now += 1.5
     assert set(world.run(3.0).said) == {REST}
@@ -232,7 +232,7 @@ def test_one_that_stood_still_before_its_first_move_does_not_begin_it() -> None:
     assert world.driver.disturbed
 
 
-def test_a_key_pressed_while_it_stood_still_is_no_end_of_a_turn() -> None:
+def test_a_key_pressed_while_the_calibration_was_held_up_does_not_end_a_turn_well() -> None:
     world = World(TURN).until_moving()
     world.now += 1.5
     world.driver.key(" ", world.now)
@@ -240,7 +240,7 @@ def test_a_key_pressed_while_it_stood_still_is_no_end_of_a_turn() -> None:
     assert not world.driver.disturbed  # the person may have wanted it to stop
 
 
-def test_a_daemon_that_waits_for_us_for_a_moment_goes_on() -> None:
+def test_a_leg_continues_after_a_brief_interruption_of_its_commands() -> None:
     world = World(Leg("", "", (Move(10.0, 0.3),))).until_moving()
     world.tells = changed(sources=[SourceState("app", 50, 0.4, "")], wheels=[0.0] * 4)
     world.run(0.3)
@@ -248,20 +248,20 @@ def test_a_daemon_that_waits_for_us_for_a_moment_goes_on() -> None:
     assert not world.run(3.0).driver.halted
 
 
-def test_progress_is_the_share_of_the_time() -> None:
+def test_progress_is_the_elapsed_share_of_the_time() -> None:
     world = World(LEG).until_moving()
     told = [world.run(0.5).driver.progress(world.now) for _ in range(5)]
     assert told == pytest.approx([share / 6 for share in range(1, 6)], abs=0.02)
 
 
-def test_a_key_stops_it_in_the_same_step() -> None:
+def test_a_key_halts_the_leg_in_the_same_step() -> None:
     world = World(LEG).until_moving()
     world.driver.key(" ", world.now)
     assert world.driver.step(world.now) == REST
     assert world.driver.phase is Phase.HALTED
 
 
-def test_the_hand_that_lies_on_enter_while_zeros_go_out_stops_nothing() -> None:
+def test_enter_pressed_during_the_opening_zeros_does_not_halt_the_leg() -> None:
     world = World(LEG).run(0.1)
     world.driver.key("\n", world.now)
     world.until_moving()
@@ -269,7 +269,7 @@ def test_the_hand_that_lies_on_enter_while_zeros_go_out_stops_nothing() -> None:
 
 
 @pytest.mark.parametrize("leg", [LEG, TURN], ids=["leg", "turn"])
-def test_any_other_key_meanwhile_keeps_it_from_moving_at_all(leg: Leg) -> None:
+def test_any_other_key_during_the_opening_zeros_halts_the_leg_before_it_moves(leg: Leg) -> None:
     world = World(leg).run(0.1)
     world.driver.key(" ", world.now)
     world.run(3.0)
@@ -277,7 +277,7 @@ def test_any_other_key_meanwhile_keeps_it_from_moving_at_all(leg: Leg) -> None:
     assert world.driver.phase is Phase.HALTED
 
 
-def test_a_turn_that_a_key_ends_ends_well_by_it() -> None:
+def test_a_key_ends_a_turn_with_success() -> None:
     world = World(TURN).until_moving()
     world.run(1.0)
     world.driver.key(" ", world.now)
@@ -285,13 +285,13 @@ def test_a_turn_that_a_key_ends_ends_well_by_it() -> None:
     assert world.run(1.0).driver.phase is Phase.DONE
 
 
-def test_a_turn_that_nobody_ends_is_no_measurement() -> None:
+def test_a_turn_without_a_key_press_is_halted() -> None:
     world = World(TURN).run(8.0)
     assert world.said[-1] == REST
     assert "no key was pressed" in world.driver.halted
 
 
-def test_a_gyro_that_sees_less_than_the_wheels_do_is_no_disobedience() -> None:
+def test_a_gyro_that_shows_less_turn_than_the_wheels_does_not_halt_the_leg() -> None:
     world = World(LEG)
     world.tells = changed(angular=0.2, linear=0.3)
     assert world.run(5.0).driver.phase is Phase.DONE

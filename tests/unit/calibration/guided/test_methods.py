@@ -90,7 +90,7 @@ def test_ninety_seconds_of_driving_are_enough(way: str, count: int) -> None:
 
 @each_way
 @pytest.mark.parametrize("separation", [0.15, 0.3, 0.6])
-def test_no_track_makes_it_longer_than_it_may_be(way: str, separation: float) -> None:
+def test_no_track_makes_a_method_longer_than_its_limit(way: str, separation: float) -> None:
     made = setup(Config(drive=DriveConfig(wheel_separation=separation)))
     tracks = [1.0 + 0.05 * step for step in range(31)]
     longest = max(sum(leg.seconds for leg in METHODS[way].legs(made, track)) for track in tracks)
@@ -98,7 +98,7 @@ def test_no_track_makes_it_longer_than_it_may_be(way: str, separation: float) ->
 
 
 @each_way
-def test_what_it_improves_is_reported(way: str) -> None:
+def test_the_improvement_is_reported(way: str) -> None:
     for _, found, _, _ in robots(way, FEW):
         worth = found.improvement
         # Only a heading sensor or a tape measures a turn itself.
@@ -150,7 +150,7 @@ def test_a_person_reads_what_is_needed_and_how_long_each_leg_takes(way: str) -> 
 
 
 @each_way
-def test_the_names_of_a_table_are_its_own(way: str) -> None:
+def test_the_names_of_a_method_are_unique_and_refer_to_its_earlier_legs(way: str) -> None:
     table = METHODS[way]
     legs = table.legs(usual_setup(), 1.6)
     names = [leg.name for leg in legs]
@@ -184,7 +184,7 @@ class Hasty(Player):
         return super()._round_s(angular) / 2.3
 
 
-def test_a_first_turn_that_was_ended_half_way_is_found_out() -> None:
+def test_a_first_turn_that_was_ended_half_way_is_refused() -> None:
     with pytest.raises(GuideError, match="exactly one turn"):
         play("tape", Hasty(Robot(chi=1.7)))
 
@@ -195,7 +195,7 @@ def test_short_lengths_are_asked_in_mm_and_the_long_one_in_m() -> None:
     assert set(units) == {"mm", "m"}
 
 
-def test_left_and_right_come_apart_by_what_is_driven_between_two_half_turns() -> None:
+def test_a_drive_between_two_half_turns_separates_left_from_right() -> None:
     robot = anyone(1)
     robot.left, robot.right = 1.005, 0.995
     found = play("wall", Player(robot)).multipliers
@@ -203,7 +203,7 @@ def test_left_and_right_come_apart_by_what_is_driven_between_two_half_turns() ->
     assert ratio == pytest.approx(1.01, abs=0.006)
 
 
-def test_it_stops_short_of_the_wall_it_comes_back_to() -> None:
+def test_the_return_leg_stops_short_of_the_wall() -> None:
     for name in ("half round to the left", "round at the wall"):
         moves = leg("wall", name).moves
         ways = [move.linear * move.seconds for move in moves if move.linear]
@@ -223,7 +223,7 @@ class Exact(Player):
         return super().answer(ask)
 
 
-def test_for_small_errors_it_is_what_borenstein_and_feng_have() -> None:
+def test_small_errors_give_the_ratio_of_borenstein_and_feng() -> None:
     """Compare with the equations for E_d and E_b of Borenstein and Feng.
 
     They use the mean ends of left and right squares.
@@ -243,7 +243,7 @@ def test_for_small_errors_it_is_what_borenstein_and_feng_have() -> None:
     assert found.values[2] / found.values[1] - 1 == pytest.approx(2 * ratio, abs=1.2e-3)
 
 
-def test_two_squares_close_enough_to_be_measured() -> None:
+def test_two_squares_end_near_enough_to_their_start_to_be_measured() -> None:
     rng = np.random.default_rng(4)
     player = Exact(Robot(chi=1.8, rng=rng))
     play("umbmark", player)
@@ -265,13 +265,13 @@ def test_a_tape_beside_the_gyro_measures_the_wheels() -> None:
     assert found.multipliers.values[1] == pytest.approx(0.95, rel=0.02)
 
 
-def test_without_a_tape_the_size_of_the_wheels_stays_as_configured() -> None:
+def test_without_a_tape_the_mean_wheel_radius_stays_as_configured() -> None:
     found = play("gyro", Blind(anyone(3), gyro=True))
     assert found.scale == ""
     assert found.multipliers.values[1:].mean() == pytest.approx(1.0, abs=1e-6)
 
 
-def test_a_gyro_that_says_one_and_the_same_is_refused() -> None:
+def test_a_gyro_with_a_constant_value_is_refused() -> None:
     robot = replace(anyone(3), gyro_noise=0.0, gyro_hz=0.001)
     with pytest.raises((LogError, RefusedError), match=r"gyro|record"):
         play("gyro", Blind(robot, gyro=True))

@@ -63,7 +63,7 @@ def recorded() -> Recorder:
     return recorder
 
 
-def test_samples_are_as_far_apart_as_their_stamps_say_and_the_soonest_came_at_once() -> None:
+def test_sample_times_follow_their_stamps_and_the_least_delayed_sample() -> None:
     run = recorded().log().runs[0]
     assert np.diff(run.t) == pytest.approx(0.02)
     # The gyro began at 10.0 s on this computer's clock, the wheels 0.1 s later.
@@ -73,7 +73,7 @@ def test_samples_are_as_far_apart_as_their_stamps_say_and_the_soonest_came_at_on
     assert set(run.gyro) == {0.5}
 
 
-def test_stamps_that_jump_are_not_believed() -> None:
+def test_arrival_times_replace_stamps_that_jump() -> None:
     samples = [Sample(float(k), k + (100.0 if k > 5 else 0.0), ()) for k in range(10)]
     assert list(times(samples)) == [float(k) for k in range(10)]
 
@@ -91,7 +91,7 @@ def test_positions_are_taken_from_a_pose_and_from_odometry_alike() -> None:
         assert recorder.samples["places"] == [Sample(5.0, 1.0, (1.0, 2.0))]
 
 
-def test_the_commands_of_the_wheels_are_part_of_the_run() -> None:
+def test_the_applied_commands_are_part_of_the_run() -> None:
     recorder = recorded()
     for k in range(100):
         twist = Twist(Vector3(x=0.4), Vector3(z=-0.5))
@@ -101,11 +101,11 @@ def test_the_commands_of_the_wheels_are_part_of_the_run() -> None:
     assert run.commands_t[0] == pytest.approx(0.0)
 
 
-def test_the_fastest_wheel_is_told_whichever_way_it_turns() -> None:
+def test_the_speed_of_the_fastest_wheel_is_returned_for_either_direction() -> None:
     assert Recorder(JOINTS).wheels(wheels(1.0, 1.0, -4.0), 1.0) == 4.0
 
 
-def test_without_wheels_there_is_no_run() -> None:
+def test_a_recording_without_wheels_is_refused() -> None:
     with pytest.raises(LogError):
         Recorder(JOINTS).log()
 
@@ -174,7 +174,7 @@ class States:
         return sample_of(telling(Command(laptop.sent[-1] if laptop.sent else 0.0, 0.0)))
 
 
-def test_a_leg_does_not_go_on_after_a_suspend(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_leg_does_not_continue_after_a_suspend(monkeypatch: pytest.MonkeyPatch) -> None:
     laptop: Any = Laptop(monkeypatch)
     robot = RobotOnBus(laptop, Config(), laptop)
     with pytest.raises(DisturbedError, match=HELD_UP):

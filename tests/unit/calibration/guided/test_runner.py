@@ -33,7 +33,7 @@ SET_BACK_RAD = 0.3
                                              "square to the right"),
     ],
 )  # fmt: skip
-def test_a_drive_goes_on_from_the_last_leg_whose_measurement_stands_alone(
+def test_a_drive_resumes_at_the_last_leg_whose_measurement_stands_alone(
     way: str, leg: str, again: str
 ) -> None:
     method = METHODS[way]
@@ -89,7 +89,7 @@ def test_a_leg_that_is_disturbed_three_times_ends_the_drive() -> None:
     assert drive.driven == ["straight", *["turns"] * (MOST_REPEATS + 1)]
 
 
-def test_on_the_simulator_a_leg_is_repeated_more_often_and_nobody_sets_it_back(
+def test_on_the_simulator_a_leg_is_repeated_more_often_without_putting_it_back(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     drive = Disturbed("gyro", "turns", MOST_SIMULATED_REPEATS)

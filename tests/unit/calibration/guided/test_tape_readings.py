@@ -62,7 +62,7 @@ def readings() -> list[Reading]:
     ]
 
 
-def test_exact_readings_give_the_robot() -> None:
+def test_exact_readings_give_the_parameters_of_the_robot() -> None:
     told = fit_readings(readings(), BASE)
     assert 1 / told.parameters[P.INVERSE_TRACK] == pytest.approx(1.5, rel=2e-3)
     assert told.parameters[P.LEFT] == pytest.approx(0.98, rel=1e-3)
@@ -92,7 +92,7 @@ def test_derivatives_are_those_of_small_steps(what: Quantity) -> None:
         assert told.derivatives[index] == pytest.approx(derivative, rel=0.02)
 
 
-def test_rides_that_follow_each_other_are_one() -> None:
+def test_rides_that_follow_each_other_are_joined_into_one() -> None:
     spin, _, turned = driven(SPIN)
     straight, end, bent = driven(STRAIGHT)
     parameters = np.array([0.98, 1.01, 1 / 1.5, 0.0, 0.0, 0.0, 0.0])
@@ -105,7 +105,7 @@ def test_rides_that_follow_each_other_are_one() -> None:
     assert predicted(steps, "ahead", BASE, parameters).value == pytest.approx(there.real, abs=5e-3)
 
 
-def test_readings_that_contradict_each_other_are_less_sure() -> None:
+def test_readings_that_contradict_each_other_widen_the_deviation() -> None:
     exact, worse = readings(), readings()
     spin, _, turned = driven(SPIN)
     for measured, wrong in ((exact, 0.0), (worse, 0.6)):
@@ -117,12 +117,12 @@ def test_readings_that_contradict_each_other_are_less_sure() -> None:
     assert unsure > 4 * sure
 
 
-def test_a_robot_that_never_turned_tells_nothing_of_the_track() -> None:
+def test_readings_without_a_turn_are_refused() -> None:
     with pytest.raises(RefusedError, match="hardly turned"):
         fit_readings([one for one in readings() if one.quantity == "distance"], BASE)
 
 
-def test_a_turn_that_the_wheels_deny_is_refused() -> None:
+def test_a_turn_to_the_other_side_than_that_of_the_wheels_is_refused() -> None:
     given = readings()
     given[0] = Reading(given[0].rides, "turned", -given[0].value, 0.01)
     with pytest.raises(RefusedError, match="to the left"):
@@ -130,26 +130,26 @@ def test_a_turn_that_the_wheels_deny_is_refused() -> None:
 
 
 @given(angle=st.floats(-1.3, 1.3), apart=st.floats(0.1, 1.0))
-def test_two_distances_from_a_line_are_an_angle(angle: float, apart: float) -> None:
+def test_two_distances_from_a_line_give_the_angle_to_it(angle: float, apart: float) -> None:
     """A turn to the left brings the front closer to a line on the robot's left."""
     half = apart / 2 * math.sin(angle)
     assert slant(1.0 - half, 1.0 + half, apart) == pytest.approx(angle, abs=1e-9)
 
 
-def test_distances_that_no_robot_can_have_are_refused() -> None:
+def test_impossible_distances_from_a_line_are_refused() -> None:
     with pytest.raises(RefusedError, match="measure again"):
         slant(0.1, 0.5, 0.25)
 
 
 @pytest.mark.parametrize("track", [1.0, 1.7, WIDEST])
-def test_a_first_turn_has_the_time_that_the_widest_track_takes(track: float) -> None:
+def test_a_first_turn_lasts_long_enough_for_the_widest_track(track: float) -> None:
     move = once_round(usual_setup(), "").moves[-1]
     assert move.angular * move.seconds / track > 2 * math.pi
 
 
 @pytest.mark.parametrize("track", [1.0, 1.7, WIDEST])
 @pytest.mark.parametrize("rate", [0.6, 1.2])
-def test_there_is_time_for_the_turns(track: float, rate: float) -> None:
+def test_the_number_of_turns_fits_into_the_time_for_turning(track: float, rate: float) -> None:
     setup = usual_setup()
     count = turns(setup, rate, track, 3)
     assert 1 <= count <= 3
@@ -165,7 +165,7 @@ def once(chi: float) -> Reading:
 
 @pytest.mark.parametrize("chi", [1.0, 1.6, 2.4])
 @pytest.mark.parametrize("multiplier", [1.0, 1.6])
-def test_one_turn_tells_the_track_whatever_is_configured(chi: float, multiplier: float) -> None:
+def test_one_turn_gives_the_track_whatever_is_configured(chi: float, multiplier: float) -> None:
     drive = DriveConfig(wheel_separation_multiplier=multiplier)
     assert track_ratio(once(chi), drive) == pytest.approx(chi, rel=1e-3)
 
@@ -179,7 +179,7 @@ def test_a_turn_that_was_not_a_full_circle_is_reported() -> None:
 DRIVE = DriveConfig()
 
 
-def test_errors_are_those_of_what_is_configured_and_of_what_was_found() -> None:
+def test_the_errors_before_and_after_are_those_of_the_configured_and_found_values() -> None:
     made = calibrated("a tape", readings(), DRIVE, OdometryConfig())
     assert made.improvement.turn.before == pytest.approx(180, rel=0.05)
     assert made.improvement.turn.after is not None
@@ -188,7 +188,7 @@ def test_errors_are_those_of_what_is_configured_and_of_what_was_found() -> None:
     assert made.drives.turns == pytest.approx(15 * 1.2 / 1.5 / 2 / np.pi, rel=0.15)
 
 
-def test_people_read_it_and_the_configuration_takes_it() -> None:
+def test_the_report_names_the_tape_and_the_configuration_accepts_the_result() -> None:
     made = calibrated("a tape", readings(), DRIVE, OdometryConfig())
     told = plain(*parts(report("the drive", made, DRIVE, ""), made, "acsard.toml", guided=True))
     assert "compared with a tape" in told
@@ -198,7 +198,7 @@ def test_people_read_it_and_the_configuration_takes_it() -> None:
     assert 0 < config.odometry.wheel_separation_multiplier_std < 0.2
 
 
-def test_readings_that_tell_too_little_are_refused() -> None:
+def test_inaccurate_readings_are_refused() -> None:
     vague = [Reading(one.rides, one.quantity, one.value, 100 * one.deviation) for one in readings()]
     with pytest.raises(RefusedError, match="too inaccurate"):
         calibrated("a tape", vague, DRIVE, OdometryConfig())
