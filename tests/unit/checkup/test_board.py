@@ -14,7 +14,7 @@ from acsard.host.errors import MendableError
 from tests.unit.checkup.robots import Nobody, Robot
 
 
-def test_a_line_that_does_not_open_is_sent_nothing() -> None:
+def test_no_line_is_sent_if_the_serial_line_does_not_open() -> None:
     class Held(Robot):
         def open(self, baud_rate: int) -> None:
             raise MendableError("held")
@@ -25,7 +25,7 @@ def test_a_line_that_does_not_open_is_sent_nothing() -> None:
     assert robot.sent == []
 
 
-def test_a_line_speaks_of_motors_whatever_the_wheels_are() -> None:
+def test_a_line_commands_motors_whatever_wheels_are_configured() -> None:
     robot = Robot()
     with robot.board() as board:
         assert board.line((1.0, -2.0, 0.0, 3.0)) == b"ap01.00,bn02.00,cp00.00,dp03.00\r\n"
@@ -34,7 +34,7 @@ def test_a_line_speaks_of_motors_whatever_the_wheels_are() -> None:
         assert board.line(ZERO).startswith(b"ap00.00,bp00.00,cp00.00,dp00.00#01S*")
 
 
-def test_driving_gives_an_answer_to_every_line_and_the_speeds_it_says() -> None:
+def test_driving_returns_a_reply_to_every_line_with_the_measured_speeds() -> None:
     robot = Robot()
     with robot.board() as board:
         before = len(robot.sent)
@@ -47,7 +47,7 @@ def test_driving_gives_an_answer_to_every_line_and_the_speeds_it_says() -> None:
         assert board.turning() == []
 
 
-def test_answers_come_at_the_time_they_were_complete() -> None:
+def test_replies_have_the_time_at_which_they_were_complete() -> None:
     robot = Robot()
     with robot.board() as board:
         replies = board.drive(ZERO, 0.3)
@@ -69,7 +69,7 @@ def test_a_last_motor_that_keeps_its_speed_is_stopped_by_the_other_comma(sent: b
     assert robot.later() == [0.0] * 4
 
 
-def test_a_motor_that_no_zeros_stop_ends_the_check() -> None:
+def test_a_motor_that_zeros_do_not_stop_ends_the_check() -> None:
     class Deaf(Robot):
         def send(self, data: bytes) -> None:
             super().send(data)
@@ -90,7 +90,7 @@ def test_a_motor_that_no_zeros_stop_ends_the_check() -> None:
     assert len(robot.sent) == sent
 
 
-def test_one_damaged_answer_is_no_runaway_and_three_are() -> None:
+def test_one_damaged_reply_is_not_a_runaway_but_three_are() -> None:
     robot = Robot("mute")
     wild = b"ap80.00,bp00.00,cp00.00,dp00.00\r\n"
     still = wild.replace(b"80", b"00")
@@ -115,7 +115,7 @@ def test_one_damaged_answer_is_no_runaway_and_three_are() -> None:
         answered(*quiet, wild, wild, wild)
 
 
-def test_silence_ends_it_only_while_somebody_drives() -> None:
+def test_silence_ends_the_check_only_during_a_drive() -> None:
     robot = Robot("plain_only")
     with robot.board() as board:
         board.listen(5.0)
@@ -126,7 +126,7 @@ def test_silence_ends_it_only_while_somebody_drives() -> None:
     assert robot.later() == [0.0] * 4
 
 
-def test_short_drives_that_nobody_answers_add_up_unless_an_answer_comes_between() -> None:
+def test_short_drives_without_a_reply_add_up_unless_a_reply_arrives_between_them() -> None:
     robot = Robot("plain_only")
     with robot.board() as board:
         for _ in range(10):
@@ -143,7 +143,7 @@ def test_short_drives_that_nobody_answers_add_up_unless_an_answer_comes_between(
 
 
 @pytest.mark.parametrize("sent", [False, True])
-def test_wheels_that_slow_down_are_waited_for_and_no_comma_is_blamed(sent: bool) -> None:
+def test_the_check_waits_for_wheels_that_slow_down_and_blames_no_comma(sent: bool) -> None:
     config = Config(sim=SimConfig(motor_time_constant=1.5))
     robot = Robot("plain_only", config=config, trailing_comma=sent)
     with robot.board() as board:
@@ -167,7 +167,7 @@ def test_the_wait_for_wheels_that_slow_down_has_an_end() -> None:
         assert not board.comma
 
 
-def test_the_virtual_wire_is_a_wire_and_nobody_an_operator() -> None:
+def test_the_virtual_wire_is_a_wire_and_the_absent_operator_is_an_operator() -> None:
     wire: Wire = VirtualWire(FakeMcu(Config()))
     operator: Operator = Nobody()
     assert wire.now_ns() == 0

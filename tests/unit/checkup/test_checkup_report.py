@@ -15,7 +15,7 @@ from tests.unit.checkup.robots import configured
 RATE = Finding("baud rate", "PASS", keys={"mcu.baud_rate": 57600})
 
 
-def test_a_board_passes_that_answered_and_failed_in_nothing() -> None:
+def test_a_board_passes_if_it_answered_and_no_step_failed() -> None:
     late = Finding("watchdog", "FAIL")
     assert report("sim", [RATE], {}, "", "").passed
     assert not report("sim", [RATE, late], {}, "", "").passed
@@ -31,11 +31,11 @@ def test_a_board_passes_that_answered_and_failed_in_nothing() -> None:
         ([Finding("round trip", "SKIPPED")], True),
     ],
 )
-def test_what_was_not_judged_or_not_tried_has_not_passed(more: list[Finding], passed: bool) -> None:
+def test_a_check_with_a_step_not_judged_or_not_tried_has_not_passed(more: list[Finding], passed: bool) -> None:
     assert report("sim", [RATE, *more], {}, "", "").passed is passed
 
 
-def test_the_end_says_how_many_were_not_judged_and_what_to_do() -> None:
+def test_the_summary_counts_the_steps_not_judged_and_advises_to_repeat() -> None:
     late = [lateness.finding(name, 0.08) for name in ("watchdog", "lost lines")]
     told = summary(report("sim", [RATE, *late], {}, "", ""), "acsard.toml").splitlines()
     assert told[1:3] == [
@@ -45,7 +45,7 @@ def test_the_end_says_how_many_were_not_judged_and_what_to_do() -> None:
     ]
 
 
-def test_the_end_counts_the_verdicts_and_has_the_lines_of_toml() -> None:
+def test_the_summary_counts_the_verdicts_and_has_the_lines_of_toml() -> None:
     found = report("sim", [RATE, Finding("watchdog", "FAIL")], {"mcu.baud_rate": 57600}, "", "")
     told = "\n1 PASS, 1 FAIL\n\nfor acsard.toml:\n[mcu]\nbaud_rate = 57600"
     assert summary(found, "acsard.toml") == told
@@ -56,12 +56,12 @@ def found(**keys: object) -> list[Finding]:
     return [Finding(k, "PASS", keys={f"mcu.{k}": v}) for k, v in keys.items()]
 
 
-def test_only_what_differs_is_to_be_written() -> None:
+def test_only_settings_that_differ_are_proposed() -> None:
     findings = found(baud_rate=115200, trailing_comma=True, reply_period=0.0)
     assert checkup_report.changes(findings, Config()) == {"mcu.trailing_comma": True}
 
 
-def test_longer_lines_are_not_advised_where_the_wire_has_no_room() -> None:
+def test_longer_lines_are_not_proposed_if_the_wire_has_no_room() -> None:
     wanted = found(link_check="auto", encoder_counts=3200)
     assert len(checkup_report.changes(wanted, Config())) == 2
     slow = configured(Config(), baud_rate=57600)
@@ -70,7 +70,7 @@ def test_longer_lines_are_not_advised_where_the_wire_has_no_room() -> None:
     assert checkup_report.changes(wanted, slower) == {}
 
 
-def test_a_slow_wire_takes_the_rate_with_it() -> None:
+def test_a_slow_wire_also_changes_the_control_rate() -> None:
     keys = checkup_report.changes(found(baud_rate=9600, link_check="auto"), Config())
     assert keys == {"mcu.baud_rate": 9600, "control.rate": "auto"}
     config = checkup_report.applied(keys, Config())
@@ -78,18 +78,18 @@ def test_a_slow_wire_takes_the_rate_with_it() -> None:
     assert contradictions(config) == []
 
 
-def test_what_is_in_use_is_not_taken_away() -> None:
+def test_settings_in_use_are_not_removed() -> None:
     text = b'[mcu]\nlink_check = "require"\nencoder_counts = 3200\n'
     keys = checkup_report.changes(found(baud_rate=38400, link_check="require", encoder_counts=3200),
                           parse(text))  # fmt: skip
     assert keys == {"mcu.baud_rate": 38400, "control.rate": "auto"}
 
 
-def test_a_value_that_no_key_takes_is_seen() -> None:
+def test_a_value_that_its_key_does_not_accept_is_refused() -> None:
     assert checkup_report.applied({"mcu.baud_rate": 300}, Config()) is None
 
 
-def test_a_port_is_written_that_a_board_answered_at() -> None:
+def test_the_port_at_which_a_board_answered_is_proposed() -> None:
     assert checkup_report.changes(found(trailing_comma=True), Config(), "/dev/one") == {
         "mcu.trailing_comma": True
     }

@@ -15,7 +15,7 @@ from tests.unit.checkup.robots import Robot
 
 @pytest.mark.parametrize("comma", [False, True])
 @pytest.mark.parametrize("sealed", [False, True])
-def test_none_of_the_broken_lines_is_a_line(comma: bool, sealed: bool) -> None:
+def test_the_parser_refuses_every_broken_line(comma: bool, sealed: bool) -> None:
     lines = damage.broken_lines(comma, sealed, [0, 1, 2, 3])
     assert len(lines) == (12 if sealed else 10)
     assert all(any(line.endswith(end) for _, line in lines) for end in (b"dp03.0\r\n", b"dp0\r\n"))
@@ -36,7 +36,7 @@ def test_none_of_the_broken_lines_is_a_line(comma: bool, sealed: bool) -> None:
         ("comma_latched", "FAIL"),
     ],
 )
-def test_firmware_that_takes_parts_is_reported(fault: str, verdict: str) -> None:
+def test_firmware_that_obeys_parts_of_lines_is_reported(fault: str, verdict: str) -> None:
     robot = Robot(fault, "no_watchdog", trailing_comma=True)
     with robot.board() as board:
         dialect.check(board)
@@ -59,7 +59,7 @@ def test_firmware_that_reads_a_last_number_that_is_cut_is_reported() -> None:
     assert finding.text.count("cut inside the last number") == 1
 
 
-def test_motors_that_do_not_turn_as_told_are_left_out() -> None:
+def test_motors_that_do_not_turn_as_commanded_are_left_out() -> None:
     lines = damage.broken_lines(False, False, [1])
     assert all(b"ap03" not in line for _, line in lines)
     assert any(b"bp03" in line for _, line in lines)

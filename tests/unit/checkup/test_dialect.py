@@ -17,7 +17,7 @@ from tests.unit.checkup.robots import Checked, Robot
 
 
 @pytest.mark.parametrize("rate", [9600, 19200, 38400, 57600])
-def test_the_rate_it_speaks_at_is_found_and_used(rate: Any) -> None:
+def test_the_baud_rate_of_the_board_is_found_and_used(rate: Any) -> None:
     with Robot(config=Config(mcu=McuConfig(baud_rate=rate)), baud_rate=115200).board(
         rest=False
     ) as board:
@@ -34,7 +34,7 @@ def test_garbage_is_distinguished_from_silence() -> None:
         assert end.value.finding.figure.startswith(word)
 
 
-def test_a_board_that_sends_status_lines_but_hears_nothing_has_an_outcome_of_its_own() -> None:
+def test_a_board_that_sends_status_lines_but_receives_nothing_has_its_own_outcome() -> None:
     robot = Robot("estop")
     with (
         robot.mcu.lost_commands(every=1),
@@ -52,7 +52,7 @@ def test_every_diagnosis_of_the_received_bytes_has_an_outcome_of_its_own() -> No
         assert finding.verdict == "FAIL", look
 
 
-def test_the_identification_is_kept_and_missed_without_fault() -> None:
+def test_a_board_passes_with_and_without_an_identification() -> None:
     with Robot().board() as board:
         assert dialect.identity(board).figure == "acsard-mcu 1"
         assert board.identity["counts"] == "3200"
@@ -69,7 +69,7 @@ def test_the_identification_is_kept_and_missed_without_fault() -> None:
         (("unpadded", "trailing_comma"), "unpadded, trailing comma"),
     ],
 )
-def test_the_form_of_its_replies_is_reported(faults: tuple[str, ...], figure: str) -> None:
+def test_the_form_of_the_replies_is_reported(faults: tuple[str, ...], figure: str) -> None:
     with Robot(*faults).board() as board:
         assert dialect.replies(board).figure == figure
 
@@ -86,7 +86,7 @@ class Particular(Robot):
         super().send(b"".join(s for s in lines if s.endswith(b",\r\n") == self._comma))
 
 
-def test_firmware_that_refuses_plain_lines_is_found_and_checked_to_the_end() -> None:
+def test_firmware_that_refuses_plain_lines_is_checked_to_the_end() -> None:
     class Refuses(Robot):
         def send(self, data: bytes) -> None:
             super().send(b"".join(s for s in data.splitlines(keepends=True) if b"p" not in s
@@ -96,7 +96,7 @@ def test_firmware_that_refuses_plain_lines_is_found_and_checked_to_the_end() -> 
 
 
 @pytest.mark.parametrize("comma", [False, True])
-def test_a_form_of_line_that_is_not_answered_is_left_for_the_other(comma: bool) -> None:
+def test_if_one_form_of_line_is_not_answered_the_other_form_is_used(comma: bool) -> None:
     with Particular(comma, trailing_comma=comma).board() as board:
         assert dialect.form(board) is None
     robot = Particular(comma)
@@ -118,7 +118,7 @@ def test_a_form_of_line_that_is_not_answered_is_left_for_the_other(comma: bool) 
         (("comma_latched",), "require", "FAIL", {"mcu.link_check": "auto"}),
     ],
 )
-def test_the_check_is_used_where_it_is_known(
+def test_the_link_check_is_used_if_the_board_supports_it(
     faults: tuple[str, ...], wanted: str, verdict: str, keys: dict[str, object]
 ) -> None:
     with Robot(*faults, link_check=wanted).board() as board:
@@ -138,7 +138,7 @@ def test_the_check_is_used_where_it_is_known(
         (("free_running",), {"reply_period": 0.1}, "PASS", True),
     ],
 )
-def test_the_pace_is_judged_by_what_the_host_waits_for(
+def test_the_reply_rate_is_judged_by_the_period_that_the_host_expects(
     faults: tuple[str, ...], mcu: dict[str, Any], verdict: str, own: bool
 ) -> None:
     with Robot(*faults, **mcu).board() as board:
@@ -150,7 +150,7 @@ def test_the_pace_is_judged_by_what_the_host_waits_for(
 
 
 @pytest.mark.parametrize("period_s", [0.26, 0.74])
-def test_no_setting_is_advised_that_would_be_refused(period_s: float) -> None:
+def test_a_reply_period_that_the_configuration_refuses_is_not_advised(period_s: float) -> None:
     with Robot().board() as board, board.wire.mcu.sparse_replies(period_s):  # type: ignore[attr-defined]
         board.armed = False
         rate = dialect.rate(board)
@@ -159,7 +159,7 @@ def test_no_setting_is_advised_that_would_be_refused(period_s: float) -> None:
     assert rate.mend.endswith("at least every 0.25 s")
 
 
-def test_what_is_advised_is_never_rounded_above_the_limit() -> None:
+def test_the_advised_reply_period_is_not_rounded_above_the_limit() -> None:
     with Robot().board() as board, board.wire.mcu.sparse_replies(0.12):  # type: ignore[attr-defined]
         board.longest_reply_s = 0.15
         rate = dialect.rate(board)

@@ -27,14 +27,14 @@ def replies(per_turn: float, speed: float = 3.0, start: int = 65000) -> list[Rep
 
 @each("per_turn", [64, 3200, 40000])
 @each("speed", [3.0, -3.0])
-def test_counts_per_turn_come_out_over_wraps_of_clock_and_counts(
+def test_counts_per_turn_are_measured_over_wraps_of_clock_and_counts(
     per_turn: int, speed: float
 ) -> None:
     measured = encoder_counts.per_turn(replies(per_turn, speed), [0])
     assert measured == pytest.approx(per_turn, rel=0.02)
 
 
-def test_too_little_turned_says_nothing() -> None:
+def test_too_short_a_turn_gives_no_counts_per_turn() -> None:
     assert encoder_counts.per_turn(replies(3200)[:20], [0]) is None
     assert encoder_counts.per_turn(replies(3200), [1]) is None
     assert encoder_counts.per_turn(replies(3200), []) is None
@@ -49,7 +49,7 @@ def test_too_little_turned_says_nothing() -> None:
         (3210, False, "PASS", {"mcu.encoder_counts": 3210}),
     ],
 )
-def test_what_is_said_of_the_configured_counts(
+def test_configured_counts_pass_unless_they_differ_from_the_identified_counts(
     configured: int, identified: bool, verdict: str, keys: dict[str, object]
 ) -> None:
     with Robot(link_check="auto", encoder_counts=configured).board() as board:
@@ -64,7 +64,7 @@ def test_what_is_said_of_the_configured_counts(
 
 
 @pytest.mark.parametrize("counts", [16, 20, 40, 96])
-def test_coarse_encoders_without_counts_are_named(counts: int) -> None:
+def test_coarse_encoders_without_configured_counts_are_a_warning(counts: int) -> None:
     with Robot(config=Config(sim=SimConfig(encoder_counts=counts))).board() as board:
         for motor in range(4):
             turn(board, motor, 3.0)
@@ -77,14 +77,14 @@ def test_coarse_encoders_without_counts_are_named(counts: int) -> None:
 
 
 @pytest.mark.parametrize(("counts", "configured"), [(16, 16), (3200, 0)])
-def test_counts_that_are_configured_or_fine_are_not_asked_for(counts: int, configured: int) -> None:
+def test_configured_counts_and_fine_encoders_need_no_further_counts(counts: int, configured: int) -> None:
     config = Config(sim=SimConfig(encoder_counts=counts))
     with Robot(config=config, encoder_counts=configured).board() as board:
         turn(board, 0, 3.0)
         assert encoder_counts.finding(board, [0]).verdict == "SKIPPED"
 
 
-def test_counts_that_are_not_as_identified_are_a_fault() -> None:
+def test_counts_that_differ_from_the_identification_are_a_fault() -> None:
     with Robot(config=Config(sim=SimConfig(encoder_counts=2000))).board() as board:
         check(board)
         board.identity = {"counts": "3200"}
@@ -95,7 +95,7 @@ def test_counts_that_are_not_as_identified_are_a_fault() -> None:
     assert not finding.keys
 
 
-def test_counts_against_the_speeds_are_a_fault() -> None:
+def test_counts_that_run_against_the_speeds_are_a_fault() -> None:
     robot = Robot()
     with robot.board() as board:
         board.sampled = True
@@ -108,7 +108,7 @@ def test_counts_against_the_speeds_are_a_fault() -> None:
     ("share", "words"),
     [(-1.0, "motor b (front left) run against"), (0.0, "do not change"), (2.0, "do not agree")],
 )
-def test_the_wrong_counts_of_one_motor_do_not_hide_in_the_mean(share: float, words: str) -> None:
+def test_wrong_counts_of_one_motor_are_found(share: float, words: str) -> None:
     with Robot().board() as board:
         board.sampled = True
         board.replies = []
@@ -124,14 +124,14 @@ def test_the_wrong_counts_of_one_motor_do_not_hide_in_the_mean(share: float, wor
     assert words in finding.text
 
 
-def test_more_counts_than_the_host_takes_are_a_warning() -> None:
+def test_more_counts_than_the_host_accepts_are_a_warning() -> None:
     with Robot().board() as board:
         board.sampled, board.identity = True, {"counts": "400000"}
         assert encoder_counts.finding(board, []).verdict == "WARN"
 
 
 @pytest.mark.parametrize("configured", [1600, 2700, 3700, 12800])
-def test_a_wrong_key_is_found_by_the_speeds_alone_and_mended(configured: int) -> None:
+def test_wrong_configured_counts_are_found_by_the_speeds_and_corrected(configured: int) -> None:
     with Robot("no_sample", link_check="auto", encoder_counts=configured).board() as board:
         board.sampled = True
         board.replies = replies(3200)
@@ -141,7 +141,7 @@ def test_a_wrong_key_is_found_by_the_speeds_alone_and_mended(configured: int) ->
     assert "every distance would be wrong by" in finding.text
 
 
-def test_counts_that_stand_while_the_wheels_turn_are_to_be_left_unused() -> None:
+def test_counts_that_do_not_change_while_the_wheels_turn_are_to_be_switched_off() -> None:
     with Robot(encoder_counts=3200).board() as board:
         board.sampled = True
         board.replies = [Reply(r.at_s, r.motors, b"", Reading(20 * n % 65536, (7, 7, 7, 7)))
@@ -158,7 +158,7 @@ def test_counts_that_stand_while_the_wheels_turn_are_to_be_left_unused() -> None
         (3210, "PASS", {"mcu.encoder_counts": 3210}),
     ],
 )
-def test_where_lines_are_lost_no_counts_are_proposed_but_those_that_are_configured(
+def test_if_lines_are_lost_only_configured_or_identified_counts_are_proposed(
     configured: int, verdict: str, keys: dict[str, object]
 ) -> None:
     with Robot("no_sample", link_check="auto", encoder_counts=configured).board() as board:

@@ -59,13 +59,13 @@ def test_each_input_is_pressed_in_turn_and_passes() -> None:
     assert shown == [f"press the {name} and release it, within 20 s" for name in ALL]
 
 
-def test_an_emergency_stop_that_is_only_reported_is_pressed_too() -> None:
+def test_an_emergency_stop_that_is_reported_but_not_configured_is_pressed_too() -> None:
     assert checked("estop", presses=ALL)[0].figure == "emergency stop"
     off = SafetyConfig(estop="off", bumpers=TWO, bumper="off")
     assert checked("estop", "bumpers", presses=ALL, safety=off)[0].verdict == "SKIPPED"
 
 
-def test_bumpers_that_are_only_reported_are_pressed_by_their_numbers() -> None:
+def test_bumpers_that_are_reported_but_not_configured_are_pressed_by_number() -> None:
     presses = {"bumper 1": 1, "bumper 2": 2}
     assert checked("bumpers", presses=presses)[0].figure == "bumper 1, bumper 2"
     found, _ = checked("bumpers", presses={"bumper 1": 2, "bumper 2": 2})
@@ -104,7 +104,7 @@ def test_swapped_and_dead_inputs_are_named(presses: Mapping[str, int], text: str
     assert (found.verdict, found.text) == ("FAIL", text)
 
 
-def test_an_input_that_stays_pressed_or_comes_with_another_one_is_named() -> None:
+def test_an_input_that_stays_pressed_or_also_reports_another_input_is_named() -> None:
     safety, presses = SafetyConfig(bumpers=TWO), {"front bumper": 1, "rear bumper": 2}
     found, _ = checked("bumper_pressed=2:0:0", presses=presses, safety=safety)
     assert found.text == (

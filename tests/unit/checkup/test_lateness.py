@@ -13,7 +13,7 @@ from tests.each import each
 from tests.unit.checkup.robots import Busy, Robot, Starved
 
 
-def test_the_most_since_a_moment_is_reported() -> None:
+def test_the_largest_lateness_since_a_time_is_reported() -> None:
     lateness = Lateness()
     for late_s, now_s in ((0.3, 1.0), (0.02, 2.0), (0.05, 3.0), (LEAST_S / 2, 4.0)):
         lateness.look(late_s, now_s)
@@ -35,7 +35,7 @@ def test_the_most_since_a_moment_is_reported() -> None:
         ("motor: size", 0.5, True),
     ],
 )
-def test_only_what_a_late_computer_can_make_is_doubted(
+def test_only_outcomes_that_a_late_computer_can_cause_are_doubted(
     outcome: str, late_s: float, doubted: bool
 ) -> None:
     seen: dict[str, Any] = dict.fromkeys(
@@ -47,7 +47,7 @@ def test_only_what_a_late_computer_can_make_is_doubted(
     assert (isinstance(found, Unsure) and spoilt(found, late_s)) is doubted
 
 
-def test_what_is_not_judged_is_no_fault_and_has_no_keys() -> None:
+def test_a_step_that_is_not_judged_is_a_warning_without_keys() -> None:
     found = finding("watchdog", 0.085)
     assert (found.name, found.verdict, found.keys) == ("watchdog", "WARN", {})
     told = "this computer was late by up to 85 ms, so the check does not judge this step"
@@ -56,7 +56,7 @@ def test_what_is_not_judged_is_no_fault_and_has_no_keys() -> None:
     assert judged(find("baud rate: right", rate=9600))
 
 
-def test_a_board_is_seen_to_be_waited_for_too_long_however_long_is_listened() -> None:
+def test_lateness_is_measured_for_every_duration_of_listening() -> None:
     for seconds in (PERIOD_S, 0.5):
         with Busy(late_s=0.08, every=7).board(rest=False) as board:
             for _ in range(7):
@@ -67,7 +67,7 @@ def test_a_board_is_seen_to_be_waited_for_too_long_however_long_is_listened() ->
         assert board.lateness.since(0.0) == pytest.approx(0.08)
 
 
-def test_what_it_takes_to_ask_a_person_is_no_lateness() -> None:
+def test_the_time_to_ask_a_person_is_not_lateness() -> None:
     robot = Robot()
     with robot.board() as board:
         board.drive((0.0, 0.0, 0.0, 3.0), 0.3)

@@ -34,7 +34,7 @@ def known(board: Board) -> None:
         (("bit_errors",), "FAIL", 0.25),
     ],
 )
-def test_lost_lines_are_counted_and_other_ways_of_answering_are_none(
+def test_lost_lines_are_counted_and_other_reply_styles_are_not_losses(
     faults: tuple[str, ...], outcome: str, share: float
 ) -> None:
     with Robot(*faults).board() as board:
@@ -47,7 +47,7 @@ def test_lost_lines_are_counted_and_other_ways_of_answering_are_none(
 
 @pytest.mark.parametrize(("every", "verdict"), [(25, "FAIL"), (40, "FAIL"), (70, "PASS")])
 @pytest.mark.parametrize("way", ["lose_reply", "lose_command"])
-def test_above_two_in_a_hundred_it_fails(way: str, every: int, verdict: str) -> None:
+def test_a_loss_of_more_than_two_percent_fails(way: str, every: int, verdict: str) -> None:
     robot = Robot()
     setattr(robot.mcu, way, every)
     with robot.board() as board:
@@ -62,7 +62,7 @@ def test_a_slow_wire_loses_nothing(baud: int) -> None:
         assert (line_loss.finding(board).verdict, board.lost) == ("PASS", 0.0)
 
 
-def test_plain_lines_that_come_damaged_turn_no_motor() -> None:
+def test_a_board_whose_plain_lines_arrive_damaged_ends_the_check_before_motors_turn() -> None:
     class Noisy(Robot):
         pieces = 0
 
@@ -81,7 +81,7 @@ def test_plain_lines_that_come_damaged_turn_no_motor() -> None:
     assert robot.mcu.vehicle.angles == [0.0] * 4
 
 
-def test_silences_are_told_for_what_they_are() -> None:
+def test_a_silence_is_reported_as_a_silence() -> None:
     with Robot("stalls=1:0.2").board() as board:
         known(board)
         found = line_loss.finding(board)
@@ -117,7 +117,7 @@ def found(board: Board, motors: list[int], lost: float = 0.2) -> Finding | None:
         (4, 3, "", "first the ground of board and computer"),
     ],
 )
-def test_the_way_is_told_by_what_the_motors_did(
+def test_the_lossy_direction_is_found_by_the_motion_of_the_motors(
     firmware: str, command: int, reply: int, figure: str, mend: str
 ) -> None:
     robot = Robot(firmware, trailing_comma=firmware == "comma_latched")
@@ -134,7 +134,7 @@ def test_the_way_is_told_by_what_the_motors_did(
     ("fault", "verdict"),
     [("lost_commands", "FAIL"), ("lost_replies", "SKIPPED"), ("spaces", "PASS")],
 )
-def test_commands_lost_to_a_board_that_reports_by_its_own_clock_are_seen(
+def test_commands_lost_to_a_free_running_board_are_found(
     fault: str, verdict: str
 ) -> None:
     assert check("free_running", fault, reply_period=0.1)["lost where"].verdict == verdict
@@ -142,7 +142,7 @@ def test_commands_lost_to_a_board_that_reports_by_its_own_clock_are_seen(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("earlier", range(1, 5))
-def test_it_does_not_matter_which_of_the_lines_is_the_first_that_is_lost(earlier: int) -> None:
+def test_lost_commands_are_found_whichever_line_is_lost_first(earlier: int) -> None:
     class Spoken(Robot):
         def open(self, baud_rate: int) -> None:
             super().open(baud_rate)
@@ -159,7 +159,7 @@ def test_it_does_not_matter_which_of_the_lines_is_the_first_that_is_lost(earlier
 @pytest.mark.parametrize(
     ("fault", "right"), [("lost_replies", "the board's TX"), ("lost_commands", "the computer's TX")]
 )
-def test_slow_motors_and_coarse_encoders_blame_no_wrong_way(
+def test_slow_motors_and_coarse_encoders_do_not_blame_the_wrong_direction(
     lag: float, per_turn: int, fault: str, right: str
 ) -> None:
     config = Config(sim=SimConfig(motor_time_constant=lag, encoder_counts=per_turn))
@@ -170,21 +170,21 @@ def test_slow_motors_and_coarse_encoders_blame_no_wrong_way(
         assert not board.turning()
 
 
-def test_without_a_motor_that_turns_the_way_is_not_told() -> None:
+def test_without_a_motor_that_turns_the_lossy_direction_is_skipped() -> None:
     with Robot("lost_replies").board() as board:
         finding = found(board, [])
     assert finding is not None
     assert finding.verdict == "SKIPPED"
 
 
-def test_where_nothing_is_lost_nothing_is_turned() -> None:
+def test_if_no_lines_are_lost_no_motor_turns() -> None:
     robot = Robot()
     with robot.board() as board:
         assert found(board, ALL, line_loss.MOST) is None
     assert robot.mcu.vehicle.angles == [0.0] * 4
 
 
-def test_no_pulse_feeds_a_motor_for_longer_than_the_watchdog_allows() -> None:
+def test_the_test_of_the_lossy_direction_leaves_no_motor_turning() -> None:
     robot = Robot("lost_commands", "no_watchdog")
     with robot.board() as board:
         assert found(board, ALL) is not None

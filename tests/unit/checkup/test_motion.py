@@ -29,7 +29,7 @@ def course(
 @pytest.mark.parametrize("sampled", [False, True])
 @pytest.mark.parametrize("per_turn", [16, 24, 48, 64, 96, 3200])
 @pytest.mark.parametrize("period_ms", [10, 20, 100])
-def test_a_coarse_encoder_is_no_runaway_and_a_runaway_is_one(
+def test_a_coarse_encoder_is_not_a_runaway_but_a_real_runaway_is_found(
     sampled: bool, per_turn: int, period_ms: int
 ) -> None:
     for speed in (3.0, -3.0):
@@ -43,7 +43,7 @@ def test_a_coarse_encoder_is_no_runaway_and_a_runaway_is_one(
 
 
 @pytest.mark.parametrize("sampled", [False, True])
-def test_a_sudden_runaway_is_told_by_its_third_reply(sampled: bool) -> None:
+def test_a_sudden_runaway_is_found_by_its_third_reply(sampled: bool) -> None:
     replies = course(1.0, 3200, 20, 1.0, sampled)
     for _ in range(3):
         assert motion.fastest(replies, 6.0) is None
@@ -54,20 +54,20 @@ def test_a_sudden_runaway_is_told_by_its_third_reply(sampled: bool) -> None:
     assert motion.fastest(replies, 6.0) is not None
 
 
-def test_no_replies_say_nothing() -> None:
+def test_without_replies_there_is_no_runaway_no_angle_and_no_trend() -> None:
     assert motion.fastest([], 6.0) is None
     assert motion.covered([], 0) == (0.0,) * 4
     assert motion.trend([], 0, 0.02) == (1.0,) * 4
 
 
 @pytest.mark.parametrize("per_turn", [24, 3200])
-def test_the_angle_covered_is_the_speeds_over_time(per_turn: int) -> None:
+def test_the_covered_angle_is_the_sum_of_the_speeds_over_time(per_turn: int) -> None:
     replies = course(3.0, per_turn)
     assert motion.covered(replies, 0)[1] == pytest.approx(2.94, abs=math.tau / per_turn)
     assert motion.covered(replies, 0.5)[1] == pytest.approx(1.44, abs=2 * math.tau / per_turn)
 
 
-def test_a_trend_is_the_share_of_the_speed_before() -> None:
+def test_a_trend_is_the_ratio_to_the_earlier_speed() -> None:
     speeds = [3.0 * 0.99**n for n in range(100)]
     replies = [Reply(n * 0.02, (0.0, -s, 3.0, 0.0), b"") for n, s in enumerate(speeds)]
     a, b, c, d = motion.trend(replies, replies[-1].at_s, 0.02)

@@ -13,7 +13,7 @@ from tests.each import each
 
 
 @each("outcome", MANUAL)
-def test_every_outcome_is_whole(outcome: str) -> None:
+def test_every_outcome_has_complete_texts(outcome: str) -> None:
     found = find(outcome, {"mcu.baud_rate": 9600}, **dict.fromkeys(SEEN, Seen()))
     assert found.name == outcome.partition(":")[0]
     assert found.keys == {"mcu.baud_rate": 9600}
@@ -38,14 +38,14 @@ SEEN = {part.partition("}")[0].partition(":")[0].partition("!")[0]
         for part in OUTCOMES.split("{")[1:]}  # fmt: skip
 
 
-def test_the_watchdog_it_advises_is_that_of_the_contract() -> None:
+def test_the_advised_watchdog_time_is_that_of_the_contract() -> None:
     entries = [entry for name, entry in MANUAL.items() if name.startswith("watchdog:")]
     told = " ".join(part for entry in entries for part in (entry.text, entry.mend))
     times = {f"{1000 * seconds:g}" for seconds in (WATCHDOG_S, WATCHDOG_MOST_S)}
     assert set(re.findall(r"(\d+) ms", told)) == times
 
 
-def test_every_step_can_pass_or_be_left_out() -> None:
+def test_every_step_can_pass_or_be_skipped_and_can_fail_or_warn() -> None:
     for step in STEPS:
         name = "motor" if step == "motors" else step
         verdicts = {o.verdict for key, o in MANUAL.items() if key.startswith(f"{name}:")}
@@ -53,7 +53,7 @@ def test_every_step_can_pass_or_be_left_out() -> None:
         assert verdicts & {"FAIL", "WARN"}, step
 
 
-def test_a_motor_bears_its_name_and_the_figures_are_as_they_are_written() -> None:
+def test_an_outcome_has_the_name_of_its_motor_and_its_figures_formatted() -> None:
     found = find("motor: right", name="motor d (rear right)", figure="+3.00 -3.00 rad/s")
     assert (found.name, found.verdict) == ("motor d (rear right)", "PASS")
     found = find("runaway: along", letter="a", told=3, seen=9.04, most=6.0, motor="motor a")
@@ -61,7 +61,7 @@ def test_a_motor_bears_its_name_and_the_figures_are_as_they_are_written() -> Non
     assert found.text == "the encoder of motor a reports more than 6 rad/s"
 
 
-def test_a_runaway_against_the_command_is_crossed_leads() -> None:
+def test_a_runaway_against_the_command_is_blamed_on_the_leads() -> None:
     seen: dict[str, Any] = {
         "letter": "b",
         "told": 3.0,

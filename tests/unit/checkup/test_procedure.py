@@ -53,7 +53,7 @@ GOOD: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {
 @pytest.mark.variations(3)
 @pytest.mark.parametrize(("faults", "mcu"), GOOD.values(), ids=GOOD)
 @pytest.mark.parametrize("person", [False, True])
-def test_a_robot_that_is_right_passes(
+def test_a_robot_without_faults_passes(
     faults: tuple[str, ...], mcu: dict[str, Any], person: bool
 ) -> None:
     checked = check(*faults, person=person, **mcu)
@@ -73,7 +73,7 @@ def test_a_slow_wire_passes(baud: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("lag", [0.0, 0.2])
-def test_quick_and_slow_motors_pass_and_show_their_watchdog(lag: float) -> None:
+def test_quick_and_slow_motors_pass_and_their_watchdog_is_measured(lag: float) -> None:
     for faults in ((), ("plain_only",), ("free_running",)):
         checked = check(*faults, config=Config(sim=SimConfig(motor_time_constant=lag)))
         assert set(checked.failed) <= {"reply rate"}
@@ -82,14 +82,14 @@ def test_quick_and_slow_motors_pass_and_show_their_watchdog(lag: float) -> None:
 
 @pytest.mark.parametrize("per_turn", [16, slow(24), slow(48), slow(64)])
 @pytest.mark.parametrize("fault", [(), ("no_check",)])
-def test_a_coarse_encoder_is_no_runaway(per_turn: int, fault: tuple[str, ...]) -> None:
+def test_a_coarse_encoder_is_not_a_runaway(per_turn: int, fault: tuple[str, ...]) -> None:
     config = Config(sim=SimConfig(encoder_counts=per_turn))
     assert check(*fault, config=config).failed == []
 
 
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("per_turn", [16, 48, 400])
-def test_what_a_coarse_encoder_shows_late_is_not_blamed_on_a_broken_line(per_turn: int) -> None:
+def test_a_late_count_of_a_coarse_encoder_is_not_blamed_on_a_broken_line(per_turn: int) -> None:
     config = Config(sim=SimConfig(encoder_counts=per_turn))
     checked = check("plain_only", "no_watchdog", config=config)
     assert checked["damaged lines"].verdict == "PASS"
@@ -98,7 +98,7 @@ def test_what_a_coarse_encoder_shows_late_is_not_blamed_on_a_broken_line(per_tur
 @pytest.mark.slow
 @pytest.mark.parametrize("lag", [slow(0.8), 1.0])
 @pytest.mark.parametrize("fault", ["no_sample", "plain_only"])
-def test_a_heavy_wheel_is_neither_slow_nor_a_missing_comma(fault: str, lag: float) -> None:
+def test_a_heavy_wheel_is_neither_a_weak_motor_nor_a_missing_comma(fault: str, lag: float) -> None:
     checked = check(fault, config=Config(sim=SimConfig(motor_time_constant=lag)))
     assert checked.failed == []
     assert checked["trailing comma"].figure == "not needed"
@@ -106,19 +106,19 @@ def test_a_heavy_wheel_is_neither_slow_nor_a_missing_comma(fault: str, lag: floa
 
 
 @pytest.mark.slow
-def test_a_heavy_last_wheel_that_does_need_its_comma_is_found() -> None:
+def test_a_trailing_comma_that_a_heavy_last_wheel_needs_is_found() -> None:
     config = Config(sim=SimConfig(motor_time_constant=0.5))
     checked = check("comma_latched", config=config)
     assert checked["trailing comma"].figure == "needed"
 
 
-def test_a_wheel_without_an_encoder_is_not_told_to_turn_back() -> None:
+def test_a_wheel_without_an_encoder_is_not_commanded_backward() -> None:
     robot = Robot("plain_only", "stuck_encoder=b")
     Checked(robot)
     assert not any(b"bn" in line for line in robot.sent)
 
 
-def test_the_person_is_told_what_can_happen() -> None:
+def test_the_question_warns_that_a_faulty_wheel_can_reach_full_speed() -> None:
     assert "dead or reversed can reach full speed" in procedure.CONFIRM
 
 
@@ -166,7 +166,7 @@ def test_a_planted_fault_is_found_and_named(
     assert not checked.left_turning
 
 
-def test_ten_replies_a_second_by_its_own_clock_are_the_same_mend() -> None:
+def test_a_free_running_board_at_10_hz_gets_a_reply_period_of_0_1_s() -> None:
     checked = check("free_running")
     assert checked["reply rate"].figure == "10 Hz, by its own clock"
     assert checked.changes["mcu.reply_period"] == 0.1
@@ -175,7 +175,7 @@ def test_ten_replies_a_second_by_its_own_clock_are_the_same_mend() -> None:
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("letter", MOTORS)
 @pytest.mark.parametrize("part", ["motor", "encoder"])
-def test_a_reversed_part_is_named_for_swapping_by_who_sees_the_wheel(
+def test_a_person_who_sees_the_wheel_decides_which_reversed_part_is_named(
     letter: str, part: str
 ) -> None:
     checked = check("plain_only", f"reversed_{part}={letter}", person=True)
@@ -187,7 +187,7 @@ def test_a_reversed_part_is_named_for_swapping_by_who_sees_the_wheel(
 
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("motor", range(4))
-def test_a_wheel_mounted_the_other_way_round_is_a_sign_in_the_map(motor: int) -> None:
+def test_a_wheel_mounted_the_other_way_round_changes_its_sign_in_the_map(motor: int) -> None:
     checked = check("plain_only", f"reversed_wheel={MOTORS[motor]}", person=True)
     assert checked.failed == ["wheel map"]
     wheels = {k: v for k, v in checked.changes.items() if "wheels" in k}
@@ -206,7 +206,7 @@ def test_two_swapped_wheels_give_a_changed_wheel_map(one: int, other: int) -> No
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("what", ["motors", "encoders"])
 @pytest.mark.parametrize(("one", "other"), ["ab", "ac", "bd", "cd"])
-def test_crossed_leads_are_named_by_who_sees_the_wheel(what: str, one: str, other: str) -> None:
+def test_crossed_leads_are_named_if_a_person_sees_the_wheels(what: str, one: str, other: str) -> None:
     checked = check("plain_only", f"swapped_{what}={one}:{other}", person=True)
     assert [name.partition(" (")[0] for name in checked.failed] == [
         f"motor {one}",
@@ -215,7 +215,7 @@ def test_crossed_leads_are_named_by_who_sees_the_wheel(what: str, one: str, othe
     assert f"{what} {one} and {other}" in checked[f"motor {one}"].mend
 
 
-def test_any_wiring_is_found_out() -> None:
+def test_the_wheel_map_of_any_wiring_is_found() -> None:
     wired = WheelMap(front_right="-c", front_left="+d", rear_left="-a", rear_right="+b")
     robot = Robot(config=Config(mcu=McuConfig(wheels=wired)), wheels=WheelMap())
     checked = Checked(robot, person=True)
@@ -226,7 +226,7 @@ def test_any_wiring_is_found_out() -> None:
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("part", ["dead_motor", "stuck_encoder"])
 @pytest.mark.parametrize("letter", MOTORS)
-def test_a_dead_motor_is_told_from_a_dead_encoder_by_who_sees_the_wheel(
+def test_a_person_who_sees_the_wheel_separates_a_dead_motor_from_a_dead_encoder(
     part: str, letter: str
 ) -> None:
     checked = check("plain_only", f"{part}={letter}", person=True)
@@ -235,7 +235,7 @@ def test_a_dead_motor_is_told_from_a_dead_encoder_by_who_sees_the_wheel(
     assert says in checked[f"motor {letter}"].text
 
 
-def test_an_encoder_that_moves_while_no_wheel_turns_is_a_loose_wheel() -> None:
+def test_an_encoder_that_moves_while_no_wheel_turns_fails_its_motor() -> None:
     robot = Robot("plain_only")
 
     class Watching(Person):
@@ -248,7 +248,7 @@ def test_an_encoder_that_moves_while_no_wheel_turns_is_a_loose_wheel() -> None:
     assert "you saw no wheel turn" in checked["motor b"].text
 
 
-def test_a_dead_last_motor_is_no_missing_comma() -> None:
+def test_a_dead_last_motor_is_not_taken_for_a_missing_comma() -> None:
     checked = check("dead_motor=d")
     assert checked["trailing comma"].verdict == "SKIPPED"
     assert "mcu.trailing_comma" not in checked.changes
@@ -257,7 +257,7 @@ def test_a_dead_last_motor_is_no_missing_comma() -> None:
 @pytest.mark.variations(4)
 @pytest.mark.parametrize("fault", ["dead_motor=d", "stuck_encoder=d"])
 @pytest.mark.parametrize("counts", [16, 48, 150, 400])
-def test_a_motor_that_coasts_between_two_counts_is_not_moved_by_the_next_one(
+def test_a_motor_that_still_coasts_is_not_taken_for_motion_of_the_next_motor(
     counts: int, fault: str
 ) -> None:
     checked = check("plain_only", fault, config=Config(sim=SimConfig(encoder_counts=counts)))
@@ -273,13 +273,13 @@ def test_a_missing_comma_is_found_with_coarse_encoders(counts: int) -> None:
 
 
 @pytest.mark.parametrize("counts", [16, 48, 96])
-def test_nobody_is_asked_about_a_wheel_with_a_coarse_encoder_before_it_stands(counts: int) -> None:
+def test_the_check_asks_about_a_wheel_with_a_coarse_encoder_only_when_it_stands(counts: int) -> None:
     """The simulated person of the check fails if a wheel still turns."""
     config = Config(sim=SimConfig(encoder_counts=counts))
     assert check("plain_only", config=config, person=True).failed == []
 
 
-def test_old_firmware_with_its_comma_configured_fails_by_its_broken_lines_only() -> None:
+def test_old_firmware_with_its_comma_configured_fails_only_on_broken_lines() -> None:
     checked = check("comma_latched", trailing_comma=True)
     assert checked.failed == ["watchdog", "damaged lines"]
     assert "fed by broken lines" in checked["watchdog"].figure
@@ -310,7 +310,7 @@ def zero(line: bytes) -> bool:
     return line in (Codec(WheelMap()).stop, Codec(WheelMap(), True).stop, b"\r\n")
 
 
-def test_nothing_but_zeros_goes_out_before_the_wheels_are_confirmed_to_be_lifted() -> None:
+def test_only_zeros_are_sent_until_the_wheels_are_confirmed_to_be_lifted() -> None:
     robot = Robot()
 
     class Refuses(Nobody):
@@ -327,7 +327,7 @@ def test_nothing_but_zeros_goes_out_before_the_wheels_are_confirmed_to_be_lifted
 
 
 @pytest.mark.parametrize("typed", ["q\n", "Q\n"])
-def test_a_q_that_is_typed_while_a_motor_turns_ends_the_check(typed: str) -> None:
+def test_a_q_typed_while_a_motor_turns_ends_the_check(typed: str) -> None:
     """The operator holds the key, so further keys arrive during the last zeros."""
     robot = Robot("no_watchdog")
     questions: list[str] = []
@@ -347,7 +347,7 @@ def test_a_q_that_is_typed_while_a_motor_turns_ends_the_check(typed: str) -> Non
     assert robot.later() == [0.0] * 4
 
 
-def test_another_word_that_is_typed_while_a_motor_turns_ends_nothing() -> None:
+def test_another_word_typed_while_a_motor_turns_does_not_end_the_check() -> None:
     class Types(Person):
         def keys(self, wait_s: float) -> str:
             return "none\n"
@@ -394,7 +394,7 @@ class Stalls(Robot):
 
 @pytest.mark.parametrize("asleep", [False, True], ids=["stopped", "suspended"])
 @pytest.mark.parametrize("turning", [1, 2])
-def test_a_check_that_stood_still_while_a_motor_turns_turns_no_motor_any_more(
+def test_a_check_that_stalled_while_a_motor_turned_turns_no_motor_again(
     turning: int, asleep: bool
 ) -> None:
     robot = Stalls(60.0, asleep=asleep, turning=turning)
@@ -461,7 +461,7 @@ def test_before_a_wheel_has_turned_only_a_long_stall_ends_the_check(
     assert bool(robot.turned_after) != ends
 
 
-def test_a_step_that_a_suspend_spoilt_before_a_wheel_has_turned_is_repeated() -> None:
+def test_a_step_spoilt_by_a_suspend_before_a_wheel_has_turned_is_repeated() -> None:
     class Loses(Stalls):
         """A robot of which the host loses replies after a suspend while it counts lost lines."""
 
@@ -506,7 +506,7 @@ LINES = 560
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("fault", ["no_sample", "comma_latched"])
 @pytest.mark.parametrize("number", range(2, LINES, 43))
-def test_whatever_ends_it_the_last_lines_are_zeros_in_both_forms(fault: str, number: int) -> None:
+def test_whatever_ends_the_check_the_last_lines_are_zeros_in_both_forms(fault: str, number: int) -> None:
     error = KeyboardInterrupt if number % 2 else RuntimeError
     robot = Trouble(number, error(), fault, "no_watchdog")
     with robot.faulty(), pytest.raises(error):
@@ -518,7 +518,7 @@ def test_whatever_ends_it_the_last_lines_are_zeros_in_both_forms(fault: str, num
     assert not robot.is_open
 
 
-def test_a_signal_in_the_middle_of_the_last_zeros_does_not_keep_them_back() -> None:
+def test_a_signal_during_the_last_zeros_does_not_stop_them() -> None:
     class Interrupted(Robot):
         interrupted = False
 
@@ -536,7 +536,7 @@ def test_a_signal_in_the_middle_of_the_last_zeros_does_not_keep_them_back() -> N
     assert not robot.is_open
 
 
-def test_a_listener_that_fails_ends_in_zeros_too() -> None:
+def test_a_listener_that_fails_ends_the_check_with_zeros() -> None:
     robot = Robot("no_watchdog")
 
     def tell(finding: Finding) -> None:
@@ -547,7 +547,7 @@ def test_a_listener_that_fails_ends_in_zeros_too() -> None:
     assert robot.later() == [0.0] * 4
 
 
-def test_a_person_who_leaves_while_asked_leaves_a_robot_that_stands() -> None:
+def test_a_person_who_quits_at_a_question_leaves_a_standing_robot() -> None:
     robot = Robot("no_watchdog", "comma_latched")
 
     class Leaves(Nobody):
@@ -563,7 +563,7 @@ def test_a_person_who_leaves_while_asked_leaves_a_robot_that_stands() -> None:
 
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("number", [5, 200, 400])
-def test_a_lost_port_is_a_finding_and_the_rest_is_skipped(number: int) -> None:
+def test_a_lost_port_is_a_finding_and_the_other_steps_are_skipped(number: int) -> None:
     robot = Trouble(number, WireLostError("unplugged"))
     checked = Checked(robot)
     assert checked.failed == ["serial line"]
@@ -571,7 +571,7 @@ def test_a_lost_port_is_a_finding_and_the_rest_is_skipped(number: int) -> None:
     assert not robot.is_open
 
 
-def test_a_runaway_stops_it_at_once() -> None:
+def test_a_runaway_ends_the_check_before_any_faster_command() -> None:
     robot = Robot("bias=b:3")
     checked = Checked(robot)
     assert checked.failed == ["runaway"]
@@ -639,14 +639,14 @@ def zeros_after(sent: Sequence[bytes]) -> int:
     return next(n for n, line in enumerate(reversed(sent)) if b"3.00" in line)
 
 
-def test_after_a_runaway_zeros_go_out_once_and_then_nothing() -> None:
+def test_after_a_runaway_zeros_are_sent_once_and_then_nothing() -> None:
     robot = Robot("bias=b:3")
     Checked(robot)
     assert zeros_after(robot.sent) == 1
     assert robot.sent[-1].startswith(b"\r\nap00.00")
 
 
-def test_a_motor_that_zeros_drive_away_is_left_to_the_watchdog_whatever_ends_it() -> None:
+def test_a_motor_that_runs_away_on_zeros_is_left_to_the_watchdog() -> None:
     robot = Regulates("reversed_encoder=b", lag=0.05)
     with robot.board() as board:
         board.drive((0.0, SPEED, 0.0, 0.0), 0.05)
@@ -694,7 +694,7 @@ def test_an_echo_is_not_taken_for_a_robot() -> None:
         ("partial_line", "line end", "bytes received but no line end; the last bytes are `"),
     ],
 )
-def test_an_mcu_that_says_nothing_good_is_never_driven_and_its_mend_names_what_was_heard(
+def test_an_mcu_without_a_valid_line_is_never_driven_and_its_bytes_are_reported(
     fault: str, mend: str, text: str
 ) -> None:
     robot = Robot(fault)
@@ -731,7 +731,7 @@ def test_neither_a_heavy_wheel_nor_a_coarse_encoder_is_a_weak_motor(
     assert not [name for name in checked.named("WARN") if name.startswith("motor")]
 
 
-def test_what_it_does_is_said_before_it_takes_time() -> None:
+def test_each_step_is_announced_before_it_takes_time() -> None:
     said: list[str] = []
 
     class Listener(Nobody):
@@ -748,15 +748,15 @@ def test_what_it_does_is_said_before_it_takes_time() -> None:
 
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("fault", ["lost_replies", "lost_commands", "bit_errors", "slow_reply"])
-def test_a_poor_line_ends_in_a_stop_whatever_is_found(fault: str) -> None:
+def test_a_check_over_a_poor_line_leaves_no_motor_turning(fault: str) -> None:
     assert not check(fault).left_turning
 
 
-def test_a_board_that_boots_when_opened_is_waited_for() -> None:
+def test_the_check_waits_for_a_board_that_boots_when_the_port_opens() -> None:
     assert check(config=Config(sim=SimConfig(boot_time=2.0))).failed == []
 
 
-def test_no_motor_is_told_more_than_3_rad_s_nor_for_longer_than_it_takes() -> None:
+def test_no_motor_is_commanded_above_3_rad_s_or_for_4_s() -> None:
     robot = Robot("plain_only", "no_watchdog")
     Checked(robot)
     turning_since: dict[str, int] = {}
@@ -773,7 +773,7 @@ def test_no_motor_is_told_more_than_3_rad_s_nor_for_longer_than_it_takes() -> No
         assert at_ns - since < 4000 * MS
 
 
-def test_zeros_that_the_last_motor_obeys_only_with_a_comma_are_told_though_it_turns() -> None:
+def test_a_last_motor_that_obeys_zeros_only_with_a_comma_needs_the_trailing_comma() -> None:
     def obeys(line: bytes) -> protocol.Command | None:
         """Parse plain lines; a zero for motor d is accepted only with a comma after it."""
         command = None if b"#" in line else protocol.whole(line)
@@ -814,7 +814,7 @@ def names(checked: Checked) -> set[str]:
         (Starved, "no_sample", 0.15, 9),
     ],
 )
-def test_a_computer_that_is_late_blames_no_board_and_proposes_nothing(
+def test_on_a_late_computer_no_board_is_blamed_and_no_other_setting_is_proposed(
     computer: type[Busy], fault: str, late_s: float, every: int
 ) -> None:
     period = 0.1 if fault == "free_running" else 0.0
@@ -832,7 +832,7 @@ def test_a_computer_that_is_late_blames_no_board_and_proposes_nothing(
 
 
 @pytest.mark.slow
-def test_what_a_late_moment_spoilt_is_looked_at_again() -> None:
+def test_a_step_that_a_late_moment_spoilt_is_repeated() -> None:
     for computer in (Busy, Starved):
         quiet = check("no_sample")
         checked = Checked(computer("no_sample", late_s=0.45, every=9, until_s=2.5))
@@ -841,7 +841,7 @@ def test_what_a_late_moment_spoilt_is_looked_at_again() -> None:
 
 
 @pytest.mark.slow
-def test_lines_of_a_board_whose_pace_was_not_measured_are_not_counted() -> None:
+def test_lost_lines_of_a_board_without_a_measured_reply_rate_are_not_judged() -> None:
     """Lines that the board sends on its own clock do not match our lines one to one."""
     unpaced = 0
     for until_s in range(2, 10):
@@ -857,7 +857,7 @@ def test_lines_of_a_board_whose_pace_was_not_measured_are_not_counted() -> None:
 
 
 @pytest.mark.slow
-def test_the_person_is_asked_once_about_a_motor_that_is_looked_at_again() -> None:
+def test_the_person_is_asked_once_about_a_motor_that_is_checked_again() -> None:
     robot = Busy("plain_only", late_s=0.45, every=30)
     asked: list[str] = []
 
@@ -883,12 +883,12 @@ def test_the_person_is_asked_once_about_a_motor_that_is_looked_at_again() -> Non
         ("no_watchdog", "watchdog"),
     ],
 )
-def test_what_no_lateness_makes_is_told_all_the_same(fault: str, name: str) -> None:
+def test_a_fault_that_lateness_cannot_cause_is_reported(fault: str, name: str) -> None:
     checked = Checked(Busy(fault, late_s=0.03, every=3))
     assert checked[name].verdict == "FAIL"
 
 
-def test_a_board_that_falls_silent_is_not_excused() -> None:
+def test_a_board_that_falls_silent_fails_despite_small_delays_of_the_host() -> None:
     class Pulled(Busy):
         def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
             got = super().listen(until_ns)
@@ -899,7 +899,7 @@ def test_a_board_that_falls_silent_is_not_excused() -> None:
     assert checked.failed == ["link"]
 
 
-def test_no_motor_is_turned_again_behind_a_silence() -> None:
+def test_no_motor_is_turned_again_after_a_silence() -> None:
     """This holds no matter how late this computer was during the check."""
 
     class Sags(Busy):
@@ -926,7 +926,7 @@ def test_no_motor_is_turned_again_behind_a_silence() -> None:
 
 
 @pytest.mark.slow
-def test_motors_that_were_not_judged_are_said_to_be_unseen_not_wrong() -> None:
+def test_a_motor_that_was_not_judged_does_not_fail_the_watchdog() -> None:
     checked = Checked(Busy("dead_motor=b", late_s=0.45, every=3))
     assert "motor b (front left)" in names(checked)
     assert checked["watchdog"].verdict in ("SKIPPED", "WARN")
@@ -950,7 +950,7 @@ def test_a_fault_beyond_what_the_lateness_explains_is_reported(
     assert type(checked[name]) is Finding  # programs receive no further fields
 
 
-def test_what_a_later_step_could_judge_is_told_though_an_earlier_one_could_not() -> None:
+def test_a_later_step_reports_a_fault_that_an_earlier_step_could_not_judge() -> None:
     class Refuses(Busy):
         """A robot that is late and ignores lines without a comma in the line format step."""
 

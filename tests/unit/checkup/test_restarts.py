@@ -59,7 +59,7 @@ DIALECTS = pytest.mark.parametrize("faults", [(), ("no_sample",), ("plain_only",
 @pytest.mark.slow
 @DIALECTS
 @pytest.mark.parametrize(("at_s", "when"), MOMENTS)
-def test_a_board_that_starts_anew_fails_by_that_and_all_else_is_found_as_before(
+def test_a_restart_of_the_board_fails_and_changes_no_other_finding(
     faults: tuple[str, ...], at_s: float, when: str
 ) -> None:
     checked, sound = Checked(Restarting([at_s], *faults)), check(*faults)
@@ -76,7 +76,7 @@ def test_a_board_that_starts_anew_fails_by_that_and_all_else_is_found_as_before(
 
 
 @DIALECTS
-def test_new_starts_are_counted_and_told_with_what_was_going_on(faults: tuple[str, ...]) -> None:
+def test_restarts_are_counted_and_reported_with_the_motor_that_turned(faults: tuple[str, ...]) -> None:
     checked = Checked(Restarting([1.0, 9.0, 20.0], *faults))
     assert checked.failed == ["restarts"]
     assert checked["restarts"].figure == "restarted, 3 times"
@@ -86,7 +86,7 @@ def test_new_starts_are_counted_and_told_with_what_was_going_on(faults: tuple[st
 
 
 @pytest.mark.parametrize("every_s", [1.0, 4.0])
-def test_one_that_starts_anew_again_and_again_is_left_alone_soon(every_s: float) -> None:
+def test_a_board_that_keeps_restarting_ends_the_check_soon(every_s: float) -> None:
     robot = Restarting([2.0 + every_s * n for n in range(60)])
     checked = Checked(robot)
     assert checked.failed == ["restarts"]
@@ -110,7 +110,7 @@ class Weak(Robot):
             self.mcu.reset(self.now_ns())
 
 
-def test_a_supply_that_gives_in_each_time_a_motor_turns_is_named_and_not_tried_for_long() -> None:
+def test_a_supply_that_drops_each_time_a_motor_turns_is_named_after_few_tries() -> None:
     robot = Weak(1)
     checked = Checked(robot)
     assert checked.failed == ["restarts"]
@@ -172,7 +172,7 @@ def test_a_board_that_does_not_come_back_is_reported() -> None:
         ("unknown", "is the supply weak"),
     ],
 )
-def test_what_the_board_says_that_it_booted_for_is_taken(cause: str, mend: str) -> None:
+def test_the_boot_cause_that_the_board_states_decides_the_remedy(cause: str, mend: str) -> None:
     restarts = heard(reply(0.0, 0))
     name = NAME + b" trips=0 reset=" + cause.encode()
     seen = restarts.look(name, 9.0, None)
@@ -183,7 +183,7 @@ def test_what_the_board_says_that_it_booted_for_is_taken(cause: str, mend: str) 
     assert f"(reset={cause})" in found.text
 
 
-def test_causes_that_differ_leave_it_open() -> None:
+def test_restarts_with_different_causes_get_the_general_remedy() -> None:
     starts = [Restart("a sign", cause=one) for one in ("pin", "watchdog")]
     assert finding(Config().mcu, starts).mend.startswith("is the supply weak")
 
@@ -204,11 +204,11 @@ def sign(seen: Restart | None) -> str:
     return "" if seen is None else seen.sign
 
 
-def test_what_it_says_when_the_port_was_opened_is_no_restart() -> None:
+def test_the_name_sent_when_the_port_was_opened_is_not_a_restart() -> None:
     assert Restarts().look(NAME, 2.0, None) is None
 
 
-def test_its_name_is_a_restart_unless_it_was_asked_for() -> None:
+def test_the_name_of_the_board_is_a_restart_unless_it_was_requested() -> None:
     restarts = heard(reply(0.0, 0))
     restarts.asked(1.0)
     assert restarts.look(NAME, 1.0 + ASKED_S, None) is None
@@ -218,7 +218,7 @@ def test_its_name_is_a_restart_unless_it_was_asked_for() -> None:
     )
 
 
-def test_a_text_is_a_restart_after_a_silence_and_a_debug_print_before_one() -> None:
+def test_a_text_is_a_restart_after_a_silence_and_a_debug_print_otherwise() -> None:
     restarts = heard(reply(0.0, 0))
     for _ in range(UNANSWERED - 1):
         restarts.sent(ZERO, 0.0)
@@ -231,28 +231,28 @@ def test_a_text_is_a_restart_after_a_silence_and_a_debug_print_before_one() -> N
 
 @each("start_ms", [0, 40_000, CLOCK - 5_000])
 @each("clock", [0.98, 1.0, 1.02])
-def test_a_clock_that_runs_on_is_no_restart_at_any_pace_also_where_it_comes_round(
+def test_a_clock_that_continues_is_not_a_restart_at_any_pace_or_at_its_overflow(
     start_ms: int, clock: float
 ) -> None:
     times = [n * 0.3 for n in range(100)]
     heard(*(reply(t, round(start_ms + 1000 * clock * t)) for t in times))
 
 
-def test_replies_that_were_held_up_and_come_at_once_are_no_restart() -> None:
+def test_replies_that_were_held_up_and_arrive_together_are_not_a_restart() -> None:
     late = [reply(1.5 + n / 1000, 100 + 100 * n) for n in range(14)]
     heard(reply(0.0, 0), *late, reply(1.6, 1600))
     assert AHEAD_S > 1.5
 
 
 @pytest.mark.parametrize("before_ms", [3_000, 20_000, 40_000, CLOCK - 1])
-def test_a_clock_that_began_again_is_a_restart(before_ms: int) -> None:
+def test_a_clock_that_restarted_is_a_restart_of_the_board(before_ms: int) -> None:
     restarts = heard(reply(10.0, before_ms))
     again = reply(12.1, 100)
     gone_ms = (100 - before_ms) % CLOCK
     assert ("started again" in sign(restarts.look(b"", again.at_s, again))) == (gone_ms > 4100)
 
 
-def test_it_is_told_what_turned_and_for_how_long_nothing_was_sent_when_it_was_heard_last() -> None:
+def test_a_restart_has_the_last_turning_command_and_the_time_since_the_last_line() -> None:
     restarts = heard(reply(10.0, 0))
     seen = restarts.look(NAME, 20.0, None)
     assert seen is not None
@@ -265,7 +265,7 @@ def test_it_is_told_what_turned_and_for_how_long_nothing_was_sent_when_it_was_he
     assert seen.silent_s == pytest.approx(0.9)
 
 
-def test_nobody_asks_once_the_check_has_ended() -> None:
+def test_restarts_after_the_end_of_the_check_are_not_reported() -> None:
     restarts = heard(reply(0.0, 0))
     restarts.watched = False
     assert restarts.look(NAME, 9.0, None) is None

@@ -52,7 +52,7 @@ def measured(robot: Robot) -> tuple[str, str]:
 @pytest.mark.parametrize("kind", [("plain_only",), ("no_sample",), (), ("free_running",)])
 @pytest.mark.parametrize("time_ms", [120, 450])
 @pytest.mark.parametrize("robot", [Robot, ByItsOwnClock])
-def test_a_time_within_the_contract_is_measured(
+def test_a_watchdog_time_within_the_contract_is_measured_and_passes(
     kind: tuple[str, ...], time_ms: int, robot: type[Robot]
 ) -> None:
     one = robot(*kind)
@@ -66,7 +66,7 @@ def test_a_time_within_the_contract_is_measured(
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("kind", [("plain_only",), (), ("free_running",)])
 @pytest.mark.parametrize("lag", [0.0, 0.05, 0.3])
-def test_a_motor_s_own_run_out_is_not_taken_for_the_watchdog(
+def test_the_run_out_of_a_motor_is_not_taken_for_the_watchdog(
     kind: tuple[str, ...], lag: float
 ) -> None:
     config = Config(sim=SimConfig(motor_time_constant=lag))
@@ -77,7 +77,7 @@ def test_a_motor_s_own_run_out_is_not_taken_for_the_watchdog(
 
 
 @pytest.mark.parametrize("kind", ["plain_only", "no_sample", "free_running"])
-def test_none_and_one_too_long_fail(kind: str) -> None:
+def test_a_missing_watchdog_and_a_late_watchdog_fail(kind: str) -> None:
     for robot in (Robot, ByItsOwnClock):
         assert measured(robot(kind, "no_watchdog")) == ("FAIL", "none within 2.5 s")
         verdict, figure = measured(robot(kind, "late_watchdog"))
@@ -85,13 +85,13 @@ def test_none_and_one_too_long_fail(kind: str) -> None:
         assert int(figure.split()[0]) == pytest.approx(1000, abs=100)
 
 
-def test_one_too_short_for_any_host_is_a_warning() -> None:
+def test_a_watchdog_too_short_for_any_host_is_a_warning() -> None:
     robot = Robot()
     robot.mcu.watchdog_ns = 40_000_000
     assert measured(robot)[0] == "WARN"
 
 
-def test_a_motor_that_does_not_turn_as_told_cannot_show_it() -> None:
+def test_without_a_motor_that_turns_as_commanded_the_watchdog_is_skipped() -> None:
     with Robot().board() as board:
         assert watchdog.finding(board, []).verdict == "SKIPPED"
 
@@ -99,7 +99,7 @@ def test_a_motor_that_does_not_turn_as_told_cannot_show_it() -> None:
 @pytest.mark.variations(4)
 @pytest.mark.parametrize("kind", [("plain_only",), ("no_sample",), (), ("free_running",)])
 @pytest.mark.parametrize("lag", [0.0, pytest.param(0.6, marks=pytest.mark.slow)])
-def test_one_that_broken_lines_feed_fails_and_no_other(kind: tuple[str, ...], lag: float) -> None:
+def test_only_a_watchdog_that_broken_lines_feed_fails(kind: tuple[str, ...], lag: float) -> None:
     config = Config(sim=SimConfig(motor_time_constant=lag))
     for robot in (Robot,) if lag else (Robot, ByItsOwnClock):
         assert measured(robot(*kind, config=config))[0] == "PASS"
@@ -108,7 +108,7 @@ def test_one_that_broken_lines_feed_fails_and_no_other(kind: tuple[str, ...], la
         assert figure.endswith("fed by broken lines")
 
 
-def test_broken_lines_are_never_taken_for_more_than_was_told() -> None:
+def test_firmware_that_obeys_broken_lines_never_gets_more_than_the_commanded_speed() -> None:
     robot = Robot("comma_latched", trailing_comma=True)
     with robot.board() as board:
         assert watchdog.finding(board, ALL).figure.endswith("fed by broken lines")
@@ -120,7 +120,7 @@ def test_broken_lines_are_never_taken_for_more_than_was_told() -> None:
 @pytest.mark.parametrize("fault", [(), ("no_check",)])
 @pytest.mark.parametrize("per_turn", [16, 24, 48, 96])
 @pytest.mark.parametrize("time_s", [0.3, 0.52])
-def test_what_cannot_be_told_finely_is_not_said_to_be_right(
+def test_a_time_measured_too_coarsely_to_judge_does_not_pass(
     fault: tuple[str, ...], per_turn: int, time_s: float
 ) -> None:
     robot = Robot(*fault, config=Config(sim=SimConfig(encoder_counts=per_turn)))
@@ -150,7 +150,7 @@ def silence(robot: Robot) -> Between:
 
 @pytest.mark.parametrize("kind", [("plain_only",), (), ("free_running",)])
 @pytest.mark.parametrize("time_s", [0.2, 0.37])
-def test_the_true_time_lies_between_what_is_reported(kind: tuple[str, ...], time_s: float) -> None:
+def test_the_true_time_lies_within_the_measured_interval(kind: tuple[str, ...], time_s: float) -> None:
     robot = Robot(*kind)
     robot.mcu.watchdog_ns = int(time_s * 1e9)
     least_s, most_s = silence(robot)
@@ -159,7 +159,7 @@ def test_the_true_time_lies_between_what_is_reported(kind: tuple[str, ...], time
 
 
 @pytest.mark.parametrize("kind", ["plain_only", "no_sample", "free_running"])
-def test_motors_that_never_stop_have_no_time(kind: str) -> None:
+def test_the_watchdog_time_of_motors_that_never_stop_is_unknown(kind: str) -> None:
     assert silence(Robot(kind, "no_watchdog"))[1] == UNKNOWN
 
 

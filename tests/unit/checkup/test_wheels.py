@@ -45,19 +45,19 @@ def seen(motor: int, encoder: int, forth: float = 3.0, back: float = -3.0) -> Ch
         (Channel(1, (3.0, 0.0, 0.0, 0.0), (0.0, -3.0, 0.0, 0.0)), "several"),
     ],
 )
-def test_what_the_encoders_say(channel: Channel, kind: Kind) -> None:
+def test_the_speeds_of_the_encoders_decide_the_kind_and_verdict_of_a_motor(channel: Channel, kind: Kind) -> None:
     assert channel.kind == kind
     finding = encoder_finding(MCU, channel)
     assert finding.verdict == {"right": "PASS", "off": "WARN"}.get(kind, "FAIL")
     assert bool(finding.mend) is (kind != "right")
 
 
-def test_an_other_encoder_that_counts_back_is_said_to_be_reversed_too() -> None:
+def test_a_swapped_encoder_that_counts_back_is_also_called_reversed() -> None:
     assert "reversed" in encoder_finding(MCU, seen(0, 1, -3.0, 3.0)).text
     assert "reversed" not in encoder_finding(MCU, seen(0, 1)).text
 
 
-def test_names_are_those_of_the_configured_wheels() -> None:
+def test_findings_name_the_configured_wheel_of_a_motor() -> None:
     mcu = McuConfig(wheels=WheelMap("-d", "+b", "+c", "+a"))
     assert encoder_finding(mcu, seen(0, 0)).name == "motor a (rear right)"
     assert encoder_finding(mcu, seen(3, 3)).name == "motor d (front right)"
@@ -69,7 +69,7 @@ def test_a_map_needs_a_person_for_every_motor() -> None:
     assert wheel_map(MCU, [*channels[:3], seen(3, 3)]).verdict == "SKIPPED"
 
 
-def test_a_wheel_seen_twice_is_no_map() -> None:
+def test_a_wheel_that_was_seen_for_two_motors_fails_the_wheel_map() -> None:
     channels = [Channel(m, seen(m, m).forth, seen(m, m).back, WHEELS[min(m, 2)]) for m in range(4)]
     finding = wheel_map(MCU, channels)
     assert (finding.verdict, finding.keys) == ("FAIL", {})
@@ -83,14 +83,14 @@ def test_a_motor_a_fifth_weak_is_reported_with_its_share() -> None:
     assert "turn freely" in finding.mend
 
 
-def test_what_counts_of_a_coarse_encoder_leave_open_is_not_blamed_on_the_motor() -> None:
+def test_the_uncertainty_of_a_coarse_encoder_is_not_blamed_on_the_motor() -> None:
     channel = seen(0, 0, 3.0, -2.75)
     assert channel.kind == "off"
     assert structs.replace(channel, unsure=0.05).kind == "right"
 
 
 @pytest.mark.parametrize("motor", range(4))
-def test_one_motor_turns_and_no_other(motor: int) -> None:
+def test_only_the_commanded_motor_turns(motor: int) -> None:
     robot = Robot("plain_only")
     with robot.board() as board:
         means, _ = wheels.turn(board, motor, -SPEED)
@@ -109,7 +109,7 @@ def test_the_speed_is_ramped() -> None:
     assert max(told) == SPEED
 
 
-def test_a_motor_that_shows_nothing_is_not_held_for_long() -> None:
+def test_a_motor_without_measured_speed_is_driven_only_briefly() -> None:
     robot = Robot("plain_only", "stuck_encoder=1".replace("1", "b"))
     with robot.board() as board:
         began = robot.now_ns()
@@ -117,7 +117,7 @@ def test_a_motor_that_shows_nothing_is_not_held_for_long() -> None:
         assert robot.now_ns() - began < 1e9
 
 
-def test_every_motor_that_turns_as_told_is_right() -> None:
+def test_every_motor_that_turns_as_commanded_is_right() -> None:
     with Robot("plain_only").board() as board:
         found = [wheels.channel(board, motor) for motor in range(4)]
         comma = dialect.comma(board, found[-1].kind == "dead")
@@ -125,7 +125,7 @@ def test_every_motor_that_turns_as_told_is_right() -> None:
     assert (comma.verdict, comma.figure) == ("PASS", "not needed")
 
 
-def test_a_probe_is_short_and_slow_and_no_dead_motor_is_told_more() -> None:
+def test_a_probe_is_short_and_commands_a_dead_motor_at_most_3_rad_s() -> None:
     robot = Robot("plain_only", "dead_motor=b")
     with robot.board() as board:
         began, before = robot.now_ns(), len(robot.sent)
@@ -139,7 +139,7 @@ def test_a_probe_is_short_and_slow_and_no_dead_motor_is_told_more() -> None:
 
 @pytest.mark.parametrize("per_turn", [16, 24, 48, 3200])
 @pytest.mark.parametrize("lag", [0.0, 0.3, 1.0])
-def test_a_probe_finds_what_follows_and_what_is_reversed(per_turn: int, lag: float) -> None:
+def test_a_probe_distinguishes_a_motor_that_follows_from_a_reversed_encoder(per_turn: int, lag: float) -> None:
     config = Config(sim=SimConfig(motor_time_constant=lag, encoder_counts=per_turn))
     for fault, follows in ((), True), (("reversed_encoder=c",), False):
         robot = Robot("plain_only", *fault, config=config)
@@ -151,7 +151,7 @@ def test_a_probe_finds_what_follows_and_what_is_reversed(per_turn: int, lag: flo
                 assert channel.kind == "reversed"
 
 
-def test_a_motor_that_still_speeds_up_is_held_on_but_not_for_ever() -> None:
+def test_a_motor_that_still_accelerates_is_driven_on_for_a_limited_time() -> None:
     for lag, speed in ((1.0, 2.7), (2.0, 2.0)):
         robot = Robot("plain_only", config=Config(sim=SimConfig(motor_time_constant=lag)))
         with robot.board() as board:
