@@ -51,16 +51,16 @@ def test_a_line_has_the_time_of_its_first_byte() -> None:
     ]
 
 
-def test_an_end_with_a_comma_is_an_end() -> None:
+def test_a_line_may_end_with_a_comma() -> None:
     assert lines_of([(1, ONE + b",\r\n")]) == [(1, ONE)]
 
 
-def test_what_has_no_end_yet_is_no_line() -> None:
+def test_bytes_without_a_line_end_are_not_a_line() -> None:
     assert lines_of([(1, ONE)]) == []
 
 
 @given(st.lists(st.integers(1, 40), max_size=20))
-def test_lines_are_the_same_however_they_are_cut(cuts: list[int]) -> None:
+def test_lines_are_the_same_however_the_stream_is_divided(cuts: list[int]) -> None:
     stream, chunks = (ONE + b"\r\n" + TWO + b"\r\n") * 3, []
     at = 0
     for number, cut in enumerate([*cuts, len(stream)]):
@@ -69,18 +69,18 @@ def test_lines_are_the_same_however_they_are_cut(cuts: list[int]) -> None:
     assert [line for _, line in lines_of(chunks)] == [ONE, TWO] * 3
 
 
-def test_a_command_is_timed_to_the_first_line_that_says_it() -> None:
+def test_a_command_is_timed_to_the_first_line_with_its_speed() -> None:
     lines = [(90, ONE), (150, TWO), (160, ONE), (170, ONE)]
     assert commands_to_lines([(100, ONE)], lines) == [60]
 
 
-def test_a_command_that_never_came_is_left_out() -> None:
+def test_a_command_without_a_line_in_time_is_left_out() -> None:
     assert commands_to_lines([(100, ONE)], []) == []
     assert commands_to_lines([(100, ONE)], [(99, ONE)]) == []
     assert commands_to_lines([(100, ONE)], [(100 + PATIENCE_NS, ONE)]) == []
 
 
-def test_a_sample_is_timed_from_the_line_it_tells() -> None:
+def test_a_sample_is_timed_from_the_line_with_its_speed() -> None:
     said = [(10, 0.25), (20, 0.251), (30, 0.252)]
     assert lines_to_samples(said, [(15, 0.25), (25, 0.251)]) == [Fed(5, 0), Fed(5, 0)]
 
@@ -90,7 +90,7 @@ def test_newer_lines_are_counted_as_waiting() -> None:
     assert lines_to_samples(said, [(35, 0.25), (36, 0.252)]) == [Fed(25, 2), Fed(6, 0)]
 
 
-def test_a_sample_that_repeats_a_line_or_tells_none_is_left_out() -> None:
+def test_a_sample_that_repeats_a_line_or_matches_no_line_is_left_out() -> None:
     said = [(10, 0.25), (20, 0.251)]
     assert lines_to_samples(said, [(12, 0.25), (14, 0.25), (22, 0.7), (5, 0.251)]) == [Fed(2, 0)]
 
@@ -130,7 +130,7 @@ def said_by_the_mcu(config: Config, count: int) -> list[tuple[int, bytes]]:
 
 
 @pytest.mark.parametrize("wheels", WIRINGS)
-def test_each_answer_says_the_next_speed_forward_on_every_wheel(wheels: WheelMap) -> None:
+def test_each_reply_has_the_next_speed_forward_on_every_wheel(wheels: WheelMap) -> None:
     config = Config(mcu=McuConfig(wheels=wheels))
     codec = Codec(wheels)
     lines = lines_of(said_by_the_mcu(config, 20))
@@ -160,7 +160,7 @@ def test_a_command_is_found_on_the_wire() -> None:
     assert command_waits(Record(0, (0, 100), heard, [Sent(4, b"ap1")], [])) == [3]
 
 
-def test_of_a_real_port_nothing_is_known() -> None:
+def test_a_record_of_a_real_port_has_no_lines_and_no_delays() -> None:
     record = Record(0, (0, 100), None, [Sent(4, b"x")], [])
     assert not record.said
     assert not command_waits(record)

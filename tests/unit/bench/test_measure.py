@@ -13,7 +13,9 @@ from acsard.core.config.settings import BusConfig, Config, ControlConfig, Limits
 
 
 @pytest.mark.parametrize("simulated", [True, False])
-def test_it_runs_with_a_name_and_an_address_of_its_own(tmp_path: Path, simulated: bool) -> None:
+def test_the_bench_daemon_has_its_own_name_and_a_local_address(
+    tmp_path: Path, simulated: bool
+) -> None:
     users = Config(
         bus=BusConfig(listen=("tls/0.0.0.0:7449",), tls="/etc/acsard/tls"),
         mcu=McuConfig(trailing_comma=True),
@@ -26,7 +28,7 @@ def test_it_runs_with_a_name_and_an_address_of_its_own(tmp_path: Path, simulated
     assert config.mcu == users.mcu
 
 
-def test_on_a_real_port_the_robots_own_limits_and_doubts_stay() -> None:
+def test_on_a_real_port_the_configured_limits_and_feedback_checks_stay() -> None:
     users = Config(limits=LimitsConfig(linear_speed=0.2))
     config = bench_config(users, simulated=False)
     assert (config.limits, config.feedback, config.drive) == (

@@ -65,7 +65,7 @@ def test_the_table_says_that_the_simulator_has_plain_lines() -> None:
     assert "plain lines" not in plain(*parts(REAL))
 
 
-def test_what_a_real_port_hides_is_said_to_be_left_out() -> None:
+def test_the_table_of_a_real_port_names_the_figures_that_are_not_measured() -> None:
     text = plain(*parts(REAL))
     assert text.count("not measured") == 3
     assert "zero speeds only" in text
@@ -78,11 +78,11 @@ def test_json_has_every_figure_by_its_name() -> None:
     assert set(plain["outside"]) == set(POINTS)
 
 
-def test_the_daemons_own_figures_are_all_named() -> None:
+def test_every_figure_of_the_daemon_has_a_label() -> None:
     assert tuple(OWN) == NAMES
 
 
-def test_this_machine_is_named() -> None:
+def test_the_description_of_this_machine_has_its_processor_and_cores() -> None:
     machine = this_machine()
     assert machine.cpu
     assert machine.cores >= 1

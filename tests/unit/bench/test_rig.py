@@ -23,7 +23,7 @@ JSON = '{"event": "ended"}\n'
         (1, "Traceback ...\nKeyError: 1\n", Exit.FAILURE, "KeyError: 1"),
     ],
 )
-def test_the_daemons_own_words_are_told_if_it_has_any(
+def test_an_ended_daemon_is_reported_with_its_own_message_if_it_has_one(
     tmp_path: Path, code: int, log: str, wanted: Exit, text: str
 ) -> None:
     file = tmp_path / "log"

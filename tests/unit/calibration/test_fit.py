@@ -53,7 +53,7 @@ def test_standard_deviations_cover_the_truth_however_errors_are_correlated(
 
 
 def test_errors_that_last_for_a_whole_run_widen_the_deviations_by_run() -> None:
-    """Each of six runs of four blocks has errors of its own, which neighbours alone do not show."""
+    """Each of six runs of four blocks has errors of its own, which a deviation by blocks misses."""
     known, runs = np.diag([0.0] * 3 + [1.0] * (COUNT - 3)), np.repeat(np.arange(6), 4)
     normal = np.zeros((24, COUNT, COUNT))
     normal[:, range(3), range(3)] = 1.0

@@ -244,7 +244,9 @@ def test_garbage_bytes_anywhere_are_refused_or_left_out(garbage: bytes, at: int)
         ("", "", ""),
     ],
 )
-def test_a_unit_in_brackets_is_separated_from_the_column_name(cell: str, name: str, unit: str) -> None:
+def test_a_unit_in_brackets_is_separated_from_the_column_name(
+    cell: str, name: str, unit: str
+) -> None:
     assert parted(cell) == (name, unit)
 
 
@@ -350,7 +352,7 @@ def test_each_message_is_a_row_with_its_own_time() -> None:
         assert table.columns[name] == pytest.approx(np.array(values), abs=1e-5, nan_ok=True)
 
 
-def test_each_key_of_the_configuration_has_its_form_in_the_table() -> None:
+def test_every_key_of_a_log_is_a_key_of_the_daemon() -> None:
     assert all(by_key(key) is not None for key in KEYS)
 
 

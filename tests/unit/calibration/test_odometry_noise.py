@@ -317,7 +317,9 @@ def rms(values: Floats | Sequence[float]) -> float:
 @pytest.mark.soak
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize(("name", "way"), ROWS)
-def test_the_noise_of_a_calibration_describes_drives_outside_of_its_log(name: str, way: str) -> None:
+def test_the_noise_of_a_calibration_describes_drives_outside_of_its_log(
+    name: str, way: str
+) -> None:
     """A gyro does not show errors of the distance, so only the heading is judged there."""
     shown = (name, way) in SHOWN
     row = measured(ROWS[name, way], way, ROBOTS if shown else FEWER)
@@ -343,7 +345,9 @@ def test_the_noise_of_a_calibration_describes_drives_outside_of_its_log(name: st
 @pytest.mark.parametrize(
     ("name", "way"), [("differential", "both"), ("skid, grows with the rate", "gyro")]
 )
-def test_the_noise_of_a_calibration_describes_other_drives_of_three_robots(name: str, way: str) -> None:
+def test_the_noise_of_a_calibration_describes_other_drives_of_three_robots(
+    name: str, way: str
+) -> None:
     row = measured(SETS[name], way, 3)
     assert 0.5 < row.heading < 2.0
     assert way == "gyro" or 0.4 < row.distance < 2.0

@@ -94,14 +94,16 @@ WRONG = {
         ("later", True, False, "does not follow the wheels"),
     ],
 )
-def test_a_wrong_sign_unit_or_clock_is_refused_by_name(what: str, gyro: bool, places: bool, words: str) -> None:
+def test_a_wrong_sign_unit_or_clock_is_refused_by_name(
+    what: str, gyro: bool, places: bool, words: str
+) -> None:
     with pytest.raises(RefusedError) as refused:
         calibrated(table(WRONG[what], gyro=gyro, places=places))
     assert words in str(refused.value)
 
 
 def test_rpm_are_refused_also_with_the_configuration_of_another_robot() -> None:
-    """Its radius may be a larger share of its separation than in the default configuration."""
+    """The other robot may have larger wheels for its separation than the default robot."""
     with pytest.raises(RefusedError, match="rpm"):
         turn_units("yaw_rate", 1.9 * 2 * np.pi / 60, 1.9 * 2 * np.pi / 60, BASE)
     turn_units("yaw_rate", 1 / 3.5, 1 / 3.5, BASE)
@@ -128,7 +130,7 @@ def test_a_reference_computed_from_the_same_wheels_is_reported(gyro: bool, place
 
 
 def test_an_imu_that_lies_on_its_side_is_refused() -> None:
-    """The noise of its wrong axis adds up to less than a turn, although the robot turned."""
+    """The noise of the wrong axis adds up to less than a turn, although the robot turned."""
     rng = np.random.default_rng(0)
     lying = replace(DRIVE, gyro=rng.normal(0.0, 0.05, len(DRIVE.gyro)))
     with pytest.raises(RefusedError, match=r"but the wheels would turn.*IMU lies on its side"):
@@ -143,7 +145,7 @@ def test_positions_alone_are_not_called_a_yaw_in_degrees() -> None:
 
 
 def test_motion_capture_on_a_good_floor_is_not_taken_for_wheel_odometry() -> None:
-    """It differs from the wheels of a robot that hardly slips by a millimetre."""
+    """Motion capture and the wheels of a robot that hardly slips differ by a millimetre."""
     robot = Robot(
         chi=1.0, rate=0.0, slip=0.0005, place_noise=0.0005, outliers=0.0, place_hz=20.0,
         rng=np.random.default_rng(1),

@@ -117,7 +117,9 @@ def squares(chi: float) -> Plan:
 @pytest.mark.slow
 @pytest.mark.parametrize("chi", [1.3, 1.6, 2.0])
 @pytest.mark.parametrize("lever", [0j, 0.1 + 0.1j])
-def test_an_ambiguous_turn_in_place_is_taken_for_the_likeliest_angle(chi: float, lever: complex) -> None:
+def test_an_ambiguous_turn_in_place_is_taken_for_the_likeliest_angle(
+    chi: float, lever: complex
+) -> None:
     """Positions alone cannot distinguish turns of 90 deg left, 270 deg right and 450 deg left."""
     robot = Robot(chi=chi, rate=0.0, lever=lever, slip=0.02)
     seen = drive(robot, squares(chi))

@@ -293,7 +293,9 @@ def again(seen: Drive) -> Iterator[RosMessage]:
         ([again(SHORT), imu(SHORT)], "go back by 15 s in the middle"),
     ],
 )
-def test_a_bag_that_lacks_data_is_refused_with_the_reason(topics: list[Iterator[RosMessage]], why: str) -> None:
+def test_a_bag_that_lacks_data_is_refused_with_the_reason(
+    topics: list[Iterator[RosMessage]], why: str
+) -> None:
     with pytest.raises(LogError, match=why):
         of(*[iter(list(topic)) for topic in topics])
 

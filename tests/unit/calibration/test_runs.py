@@ -110,7 +110,9 @@ FOUR = "t,fr,fl,rl,rr,yaw_rate\n"
         ("9,9,0.1,9", "rl hardly turns while fl does"),
     ],
 )
-def test_front_and_rear_wheels_that_contradict_each_other_are_refused(wheels: str, words: str) -> None:
+def test_front_and_rear_wheels_that_contradict_each_other_are_refused(
+    wheels: str, words: str
+) -> None:
     text = FOUR + "".join(f"{i / 100},{wheels},0\n" for i in range(500))
     with pytest.raises(LogError, match=words):
         runs(read(text.encode()))
@@ -160,7 +162,9 @@ def test_positions_that_a_logger_repeats_until_the_next_sample_are_taken_once() 
     run = log.runs[0]
     moving = run.place_t >= 3.3
     assert np.diff(run.place_t[moving]) == pytest.approx(0.2)
-    assert (run.place_t < 3.0).sum() == 1, "many of one sample would outweigh those on the way"
+    assert (run.place_t < 3.0).sum() == 1, (
+        "repeated positions at rest would outweigh those of the drive"
+    )
     assert any("x y repeat their last value between samples" in note for note in log.notes)
 
 

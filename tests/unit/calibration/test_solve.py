@@ -216,7 +216,7 @@ def turned_wrong(drives: Sequence[Drive], track: float) -> float:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_ten_manoeuvres_of_a_skidding_robot_give_its_track(seed: int) -> None:
-    """They determine left to right only to 6 to 8 %, so that stays as configured."""
+    """The drives determine the ratio of the radii only to 6 to 8 %, so it stays as configured."""
     found = calibrated(log_of_runs(manoeuvres(seed, 10, 0.1), places=False))
     assert found.kept == (RATIO,)
     assert found.multipliers.values[1:].tolist() == pytest.approx([1.0, 1.0], abs=1e-6)

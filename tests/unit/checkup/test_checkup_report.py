@@ -31,7 +31,9 @@ def test_a_board_passes_if_it_answered_and_no_step_failed() -> None:
         ([Finding("round trip", "SKIPPED")], True),
     ],
 )
-def test_a_check_with_a_step_not_judged_or_not_tried_has_not_passed(more: list[Finding], passed: bool) -> None:
+def test_a_check_with_a_step_not_judged_or_not_tried_has_not_passed(
+    more: list[Finding], passed: bool
+) -> None:
     assert report("sim", [RATE, *more], {}, "", "").passed is passed
 
 

@@ -77,7 +77,9 @@ def test_coarse_encoders_without_configured_counts_are_a_warning(counts: int) ->
 
 
 @pytest.mark.parametrize(("counts", "configured"), [(16, 16), (3200, 0)])
-def test_configured_counts_and_fine_encoders_need_no_further_counts(counts: int, configured: int) -> None:
+def test_configured_counts_and_fine_encoders_need_no_further_counts(
+    counts: int, configured: int
+) -> None:
     config = Config(sim=SimConfig(encoder_counts=counts))
     with Robot(config=config, encoder_counts=configured).board() as board:
         turn(board, 0, 3.0)

@@ -14,7 +14,9 @@ TURNED = McuConfig(wheels=WheelMap("-c", "+d", "-a", "+b"))
     ("motor", "wheel"),
     list(enumerate([("rear_left", -1), ("rear_right", 1), ("front_right", -1), ("front_left", 1)])),
 )
-def test_the_wheel_and_sign_of_a_motor_are_the_configured_ones(motor: int, wheel: tuple[str, int]) -> None:
+def test_the_wheel_and_sign_of_a_motor_are_the_configured_ones(
+    motor: int, wheel: tuple[str, int]
+) -> None:
     assert wheel_of(TURNED, motor) == wheel
     assert motor_name(TURNED, motor) == f"motor {'abcd'[motor]} ({wheel[0].replace('_', ' ')})"
 

@@ -134,9 +134,7 @@ def test_the_lossy_direction_is_found_by_the_motion_of_the_motors(
     ("fault", "verdict"),
     [("lost_commands", "FAIL"), ("lost_replies", "SKIPPED"), ("spaces", "PASS")],
 )
-def test_commands_lost_to_a_free_running_board_are_found(
-    fault: str, verdict: str
-) -> None:
+def test_commands_lost_to_a_free_running_board_are_found(fault: str, verdict: str) -> None:
     assert check("free_running", fault, reply_period=0.1)["lost where"].verdict == verdict
 
 

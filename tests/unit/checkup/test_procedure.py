@@ -206,7 +206,9 @@ def test_two_swapped_wheels_give_a_changed_wheel_map(one: int, other: int) -> No
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("what", ["motors", "encoders"])
 @pytest.mark.parametrize(("one", "other"), ["ab", "ac", "bd", "cd"])
-def test_crossed_leads_are_named_if_a_person_sees_the_wheels(what: str, one: str, other: str) -> None:
+def test_crossed_leads_are_named_if_a_person_sees_the_wheels(
+    what: str, one: str, other: str
+) -> None:
     checked = check("plain_only", f"swapped_{what}={one}:{other}", person=True)
     assert [name.partition(" (")[0] for name in checked.failed] == [
         f"motor {one}",
@@ -273,7 +275,9 @@ def test_a_missing_comma_is_found_with_coarse_encoders(counts: int) -> None:
 
 
 @pytest.mark.parametrize("counts", [16, 48, 96])
-def test_the_check_asks_about_a_wheel_with_a_coarse_encoder_only_when_it_stands(counts: int) -> None:
+def test_the_check_asks_about_a_wheel_with_a_coarse_encoder_only_when_it_stands(
+    counts: int,
+) -> None:
     """The simulated person of the check fails if a wheel still turns."""
     config = Config(sim=SimConfig(encoder_counts=counts))
     assert check("plain_only", config=config, person=True).failed == []
@@ -506,7 +510,9 @@ LINES = 560
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("fault", ["no_sample", "comma_latched"])
 @pytest.mark.parametrize("number", range(2, LINES, 43))
-def test_whatever_ends_the_check_the_last_lines_are_zeros_in_both_forms(fault: str, number: int) -> None:
+def test_whatever_ends_the_check_the_last_lines_are_zeros_in_both_forms(
+    fault: str, number: int
+) -> None:
     error = KeyboardInterrupt if number % 2 else RuntimeError
     robot = Trouble(number, error(), fault, "no_watchdog")
     with robot.faulty(), pytest.raises(error):
@@ -597,7 +603,7 @@ class Regulates(Robot):
     def __init__(self, *faults: str, lag: float = 0.3) -> None:
         super().__init__(*faults, config=Config(sim=SimConfig(motor_time_constant=lag)))
         self.full_s = 0.0
-        """Return for how long a motor was faster than 6 rad/s."""
+        """Time for which a motor was faster than 6 rad/s, in seconds."""
         self.mcu.understand = self._regulated
 
     def _regulated(self, line: bytes) -> protocol.Command | None:

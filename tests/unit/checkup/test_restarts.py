@@ -76,7 +76,9 @@ def test_a_restart_of_the_board_fails_and_changes_no_other_finding(
 
 
 @DIALECTS
-def test_restarts_are_counted_and_reported_with_the_motor_that_turned(faults: tuple[str, ...]) -> None:
+def test_restarts_are_counted_and_reported_with_the_motor_that_turned(
+    faults: tuple[str, ...],
+) -> None:
     checked = Checked(Restarting([1.0, 9.0, 20.0], *faults))
     assert checked.failed == ["restarts"]
     assert checked["restarts"].figure == "restarted, 3 times"

@@ -150,7 +150,9 @@ def silence(robot: Robot) -> Between:
 
 @pytest.mark.parametrize("kind", [("plain_only",), (), ("free_running",)])
 @pytest.mark.parametrize("time_s", [0.2, 0.37])
-def test_the_true_time_lies_within_the_measured_interval(kind: tuple[str, ...], time_s: float) -> None:
+def test_the_true_time_lies_within_the_measured_interval(
+    kind: tuple[str, ...], time_s: float
+) -> None:
     robot = Robot(*kind)
     robot.mcu.watchdog_ns = int(time_s * 1e9)
     least_s, most_s = silence(robot)

@@ -45,7 +45,9 @@ def seen(motor: int, encoder: int, forth: float = 3.0, back: float = -3.0) -> Ch
         (Channel(1, (3.0, 0.0, 0.0, 0.0), (0.0, -3.0, 0.0, 0.0)), "several"),
     ],
 )
-def test_the_speeds_of_the_encoders_decide_the_kind_and_verdict_of_a_motor(channel: Channel, kind: Kind) -> None:
+def test_the_speeds_of_the_encoders_decide_the_kind_and_verdict_of_a_motor(
+    channel: Channel, kind: Kind
+) -> None:
     assert channel.kind == kind
     finding = encoder_finding(MCU, channel)
     assert finding.verdict == {"right": "PASS", "off": "WARN"}.get(kind, "FAIL")
@@ -139,7 +141,9 @@ def test_a_probe_is_short_and_commands_a_dead_motor_at_most_3_rad_s() -> None:
 
 @pytest.mark.parametrize("per_turn", [16, 24, 48, 3200])
 @pytest.mark.parametrize("lag", [0.0, 0.3, 1.0])
-def test_a_probe_distinguishes_a_motor_that_follows_from_a_reversed_encoder(per_turn: int, lag: float) -> None:
+def test_a_probe_distinguishes_a_motor_that_follows_from_a_reversed_encoder(
+    per_turn: int, lag: float
+) -> None:
     config = Config(sim=SimConfig(motor_time_constant=lag, encoder_counts=per_turn))
     for fault, follows in ((), True), (("reversed_encoder=c",), False):
         robot = Robot("plain_only", *fault, config=config)

@@ -349,7 +349,7 @@ def test_two_daemons_cannot_record_to_the_same_directory(tmp_path: Path) -> None
     ring(tmp_path).close()
 
 
-def test_a_pipe_or_a_link_with_the_name_of_a_recording_is_not_one(tmp_path: Path) -> None:
+def test_a_pipe_or_a_link_with_the_name_of_a_recording_is_not_a_recording(tmp_path: Path) -> None:
     """A pipe would block its reader forever, and a link leads elsewhere."""
     whole = tmp_path / "000001-20260101T000000Z.mcap"
     whole.touch()

@@ -272,7 +272,9 @@ def umask(mask: int) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("mask", [0o022, 0o077])
-def test_the_umask_decides_who_may_read_an_export(mask: int, path: Path, tmp_path: Path) -> None:
+def test_the_umask_decides_which_users_may_read_an_export(
+    mask: int, path: Path, tmp_path: Path
+) -> None:
     begin = Span(end=0.1)
     with umask(mask):
         export(Recording(path), tmp_path / "a.csv", "csv", span=begin)

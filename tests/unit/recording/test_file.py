@@ -97,7 +97,7 @@ def on_a_machine(tape: Tape) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("speed", "most"), [(None, 90e6), (0.5, 400e6)])
-def test_an_idle_day_is_less_than_90_mb_and_one_of_driving_less_than_400(
+def test_an_idle_day_takes_less_than_90_mb_and_a_day_of_driving_less_than_400(
     speed: float | None, most: float, tmp_path: Path
 ) -> None:
     tape, sizes = Tape(), []

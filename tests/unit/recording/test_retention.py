@@ -46,7 +46,7 @@ def test_the_oldest_files_go_first_and_protected_files_last() -> None:
     assert to_delete(ended, bounds._replace(size=1000 + LEAST_BYTES), WIDE) == {"1", "3", "4", "5"}
 
 
-def test_near_files_are_protected_as_long_as_their_incident() -> None:
+def test_near_files_are_protected_while_their_incident_is_protected() -> None:
     turns: list[Kind] = ["plain", "kept"]
     ended = files("near", "kept", "near", *turns * KEPT_FILES)
     old = Bounds(10**10, math.inf)

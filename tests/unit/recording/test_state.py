@@ -180,7 +180,7 @@ def test_a_missing_part_that_a_new_robot_lacks_too_gives_a_message(tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_forged_states_behind_gaps_take_time_in_proportion_to_the_file(
+def test_forged_states_after_gaps_take_time_in_proportion_to_the_file(
     taped: Tape, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each state compresses to a few bytes and takes 0.2 s. A gap comes before each."""

@@ -79,7 +79,7 @@ def test_a_text_that_is_not_a_time_is_refused_with_examples(text: str, words: st
         (None, None, (-math.inf, math.inf)),
     ],
 )
-def test_a_time_of_day_is_the_last_one_and_a_range_goes_forward(
+def test_a_time_of_day_is_its_most_recent_occurrence_and_a_range_goes_forward(
     begin: str | None, end: str | None, found: tuple[float, float]
 ) -> None:
     first, last = (None if text is None else parse_when(text, NOW) for text in (begin, end))

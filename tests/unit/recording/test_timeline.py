@@ -184,7 +184,7 @@ def test_a_sender_that_waits_for_less_than_a_second_has_no_entry() -> None:
     assert waits("teleop", "app", 0.8) == []
 
 
-def test_a_sender_that_alone_sends_speeds_has_no_entry() -> None:
+def test_a_sender_that_alone_sends_speeds_has_no_waiting_entry() -> None:
     assert "waits" not in [entry.name for entry in story(driven())]
 
 
@@ -336,7 +336,7 @@ def test_missing_steps_are_reported() -> None:
     assert gaps == ["60 steps are missing before this step (0.3 s)"]
 
 
-def test_a_pressed_emergency_stop_is_a_serious_incident_and_its_release_is_none() -> None:
+def test_a_pressed_emergency_stop_is_a_serious_incident_but_its_release_is_not() -> None:
     events = [
         TimelineEntry(1.0, "emergency_stop", "pressed", "error"),
         TimelineEntry(2.0, "emergency_stop_released", "released"),
@@ -346,14 +346,14 @@ def test_a_pressed_emergency_stop_is_a_serious_incident_and_its_release_is_none(
     assert not is_serious("1 lost port")
 
 
-def test_a_pressed_bumper_is_a_serious_incident_and_its_release_is_none() -> None:
+def test_a_pressed_bumper_is_a_serious_incident_but_its_release_is_not() -> None:
     events = [TimelineEntry(1.0 + i, "bumper_pressed", "pressed", "error") for i in range(2)]
     events.append(TimelineEntry(3.0, "bumper_released", "released"))
     assert summary(events) == "2 bumper hits"
     assert is_serious(summary(events))
 
 
-def test_a_stop_of_the_battery_is_a_serious_incident_and_another_level_is_none() -> None:
+def test_a_battery_stop_is_a_serious_incident_but_another_level_is_not() -> None:
     events = [
         TimelineEntry(1.0, "battery", "21.50 V", "warning"),
         TimelineEntry(2.0, "battery_stop", "20.90 V", "error"),
@@ -362,12 +362,12 @@ def test_a_stop_of_the_battery_is_a_serious_incident_and_another_level_is_none()
     assert is_serious(summary(events))
 
 
-def test_a_summary_counts_no_wheel_that_is_sound_again() -> None:
+def test_a_summary_does_not_count_the_recovery_of_a_wheel_as_a_fault() -> None:
     left_out = TimelineEntry(1.0, "wheel_fault", "left out: ...", "warning")
     assert summary([left_out, TimelineEntry(5.0, "wheel_fault", "again: ...")]) == "1 wheel fault"
 
 
-def test_a_summary_names_who_stopped_the_robot_and_counts_the_incidents() -> None:
+def test_a_summary_names_the_client_that_stopped_the_robot_and_counts_the_incidents() -> None:
     events = [
         TimelineEntry(1.0, "stop", "stopped", by="joe"),
         TimelineEntry(2.0, "stop", "stopped", by="joe"),

@@ -83,7 +83,7 @@ def evil() -> str:
     )
 
 
-def test_no_text_of_a_stranger_becomes_markup_or_code() -> None:
+def test_text_of_a_client_never_becomes_markup_or_code() -> None:
     read = Read(evil())
     assert not {"img", "iframe", "object", "a", "link"} & {tag for tag, _ in read.tags}
     assert all(not name.startswith("on") for _, attrs in read.tags for name in attrs)

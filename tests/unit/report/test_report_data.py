@@ -242,7 +242,7 @@ def test_lateness_is_relative_to_the_smallest_delay() -> None:
     assert values == pytest.approx([0.2, 0.0, 7.0, 0.0, 9.5, 0.0])
 
 
-def test_a_line_that_was_sent_at_once_makes_no_period_late() -> None:
+def test_a_line_that_was_sent_immediately_makes_no_period_late() -> None:
     assert late([0.0] * 50, ahead=frozenset({7, 8, 20})).most_ms == pytest.approx(0.0)
 
 

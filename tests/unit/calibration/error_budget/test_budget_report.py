@@ -42,9 +42,7 @@ KNOWN: tuple[Cause, float, Basis] = ("parameters", 5.0, "settings")
         ("parameters", "acsard calibrate"),
     ],
 )
-def test_one_sentence_advises_on_the_largest_measured_cause(
-    cause: Cause, says: str
-) -> None:
+def test_one_sentence_advises_on_the_largest_measured_cause(cause: Cause, says: str) -> None:
     told = advice(of((cause, 100.0, "measured"), KNOWN))
     assert told.startswith(f"the largest measured cause of errors is {cause}: ")
     assert says in told
