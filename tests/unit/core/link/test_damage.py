@@ -115,7 +115,7 @@ def plausible(
     return not sanity.impossible(Feedback(AT, speeds, 0.01, steps=steps))
 
 
-def test_the_slew_check_itself_tells_a_leap_from_a_step() -> None:
+def test_the_slew_check_distinguishes_a_leap_from_a_step() -> None:
     sanity = Sanity(FeedbackConfig())
     assert plausible(sanity, STILL, WheelSpeeds(5.0, 5.0, 5.0, 5.0))
     assert not plausible(sanity, STILL, WheelSpeeds(0.0, 40.0, 0.0, 0.0))
@@ -147,7 +147,7 @@ def live(lines: list[bytes], every: int) -> tuple[int, int, int]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("every", [50, 1000])
-def test_what_is_learned_of_fine_encoders_lets_hardly_more_damage_pass(every: int) -> None:
+def test_learned_steps_of_fine_encoders_let_hardly_more_damage_pass(every: int) -> None:
     lines = drive(random.Random(6), 20_000)
     wrong = passed = would = 0
     for start in range(1 if every == 50 else 4):
