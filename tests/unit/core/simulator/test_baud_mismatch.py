@@ -25,7 +25,7 @@ def test_at_a_wrong_baud_rate_no_line_survives(sent: int, heard: int) -> None:
     assert b"ap0" not in got
 
 
-def test_a_byte_at_twice_its_baud_rate_is_resampled_bit_by_bit() -> None:
+def test_a_byte_read_at_twice_its_baud_rate_is_resampled_bit_by_bit() -> None:
     # At 9600 baud 0x00 is nine low bits and a high one. At 19200 these are 18 low samples without a
     # stop bit in time.
     assert garbled(b"\x00", 9600, 19200) == b"\x00"
