@@ -27,14 +27,14 @@ class GatewayDaemon:
         return self.told.receive(heard, self.counters)
 
 
-def test_each_gateway_start_and_each_refused_connection_is_counted_once() -> None:
+def test_each_gateway_start_and_each_check_that_found_it_full_is_counted_once() -> None:
     daemon = GatewayDaemon()
     for opened, crowded in ((7, 0), (7, 3), (7, 3), (7, 4), (9, 0), (9, 2)):
         daemon.hears(GatewayState(opened, 255, crowded))
     assert daemon.counters == {"gateway_opened": 2, "gateway_full": 6}
 
 
-def test_connections_refused_before_the_daemon_started_are_all_counted() -> None:
+def test_checks_that_found_the_gateway_full_before_the_daemon_started_are_counted() -> None:
     daemon = GatewayDaemon()
     daemon.hears(GatewayState(7, 255, 40))
     assert daemon.counters == {"gateway_opened": 1, "gateway_full": 40}

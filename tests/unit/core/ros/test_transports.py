@@ -204,7 +204,7 @@ def test_a_robot_without_a_urdf_has_no_robot_description() -> None:
     assert {e.native for e in found(RosConfig())} - kept == {"robot_description"}
 
 
-def test_a_gyro_from_ros_is_used_if_it_is_configured_and_the_robot_simulates_none() -> None:
+def test_a_gyro_from_ros_is_used_if_configured_on_a_robot_that_is_not_simulated() -> None:
     wanted = OdometryConfig(gyro=True)
     assert left_out(Config(mcu=REAL, odometry=wanted, ros=DESCRIBED)) == set()
     for other in (
