@@ -454,7 +454,9 @@ def test_a_native_twist_of_another_length_is_refused(size: int) -> None:
         ("wheel_cmd/app", native_joints(ORDERS[1], [1.0] * 4)[:-1]),
     ],
 )
-def test_a_native_payload_that_is_not_the_expected_message_is_malformed(key: str, payload: bytes) -> None:
+def test_a_native_payload_that_is_not_the_expected_message_is_malformed(
+    key: str, payload: bytes
+) -> None:
     assert refusal(arrival(payload, key=key)) == "malformed"
 
 
@@ -728,7 +730,9 @@ def test_over_rmw_the_attachment_gives_the_sender_and_the_stamp() -> None:
         (Attachment(1, SENT_NS, GID).pack() + b"x", "bad_attachment"),
     ],
 )
-def test_over_rmw_a_command_without_a_valid_attachment_is_refused(attachment: bytes, reason: str) -> None:
+def test_over_rmw_a_command_without_a_valid_attachment_is_refused(
+    attachment: bytes, reason: str
+) -> None:
     assert refusal(by_ros("rmw", twist(), attachment=attachment)) == reason
 
 
@@ -932,7 +936,7 @@ def test_shared_and_ros_senders_are_not_bound_to_a_certificate() -> None:
 
 
 def test_a_sender_id_is_never_taken_for_a_session_that_stamps_for_others() -> None:
-    """The zero of a sender id arms at once. The id of a router's session is no secret."""
+    """The zero of a sender id arms immediately. The id of a router's session is no secret."""
     stamped_by = command(twist(), sender="z1", stamp_ns=5).sender
     for name in ("z1", "session z1", "session/z1", f"{stamped_by}/z1"):
         attachment = msgspec.msgpack.encode({"sender": name})

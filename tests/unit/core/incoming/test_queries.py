@@ -486,7 +486,9 @@ def ros_query(topic: str, via: str = "rmw", payload: bytes = EMPTY, **changes: A
 
 @each("via", ["bridge", "rmw"])
 @each("verb", TRIGGERS)
-def test_a_ros_trigger_makes_a_request_to_the_robot_and_its_answer_is_cdr(verb: str, via: str) -> None:
+def test_a_ros_trigger_makes_a_request_to_the_robot_and_its_answer_is_cdr(
+    verb: str, via: str
+) -> None:
     made = queries()
     got = made.serve(ros_query(f"srv/{verb}", via), nothing, OUTPUTS)
     by = f"unnamed (rmw {ASKED.gid.hex()})" if via == "rmw" else "unnamed (bridge)"
@@ -545,9 +547,7 @@ def test_the_parameter_services_return_the_configuration(via: str) -> None:
 
 @each("via", ["bridge", "rmw"])
 @each("service", PARAMETER_SERVICES)
-def test_an_unreadable_parameter_request_is_answered_with_a_refusal(
-    service: str, via: str
-) -> None:
+def test_an_unreadable_parameter_request_is_answered_with_a_refusal(service: str, via: str) -> None:
     asked = ros_query(f"parameters/{service}", via, payload=b"\x00")
     with pytest.raises(DecodeError) as caught:
         queries().serve(asked, nothing, OUTPUTS)

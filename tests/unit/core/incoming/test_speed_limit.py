@@ -79,7 +79,9 @@ REFUSED: dict[str, list[Arrival]] = {
 
 
 @each("reason", REFUSED)
-def test_a_refused_message_is_reported_with_its_reason_and_keeps_the_earlier_limit(reason: str) -> None:
+def test_a_refused_message_is_reported_with_its_reason_and_keeps_the_earlier_limit(
+    reason: str,
+) -> None:
     for one in REFUSED[reason]:
         limiter, refusals = SpeedLimiter(Config()), list[Refusal]()
         limiter.receive(said(0.5), 1.0, refusals)
@@ -87,7 +89,7 @@ def test_a_refused_message_is_reported_with_its_reason_and_keeps_the_earlier_lim
         limiter.receive(one, 1.0, refusals)
         assert [refusal.reason for refusal in refusals] == [reason]
         assert refusals[0].text.startswith("speed_limit: ")
-        assert limiter.requests((), 2 * PAUSE_NS) == ((), []), "the limit before stays"
+        assert limiter.requests((), 2 * PAUSE_NS) == ((), []), "the earlier limit stays"
 
 
 DAMAGE = st.lists(st.tuples(st.integers(0, 200), st.binary(max_size=8)), min_size=1, max_size=4)
@@ -230,7 +232,9 @@ def test_a_set_that_contradicts_the_setting_under_the_limit_is_refused() -> None
 
 
 @each("wish", [{SETTING: 11.0}, {SETTING: "fast"}, {SETTING: -1.0}, {"limits.nothing": 1.0}])
-def test_an_invalid_set_is_refused_in_the_same_way_with_and_without_a_limit(wish: dict[str, Plain]) -> None:
+def test_an_invalid_set_is_refused_in_the_same_way_with_and_without_a_limit(
+    wish: dict[str, Plain],
+) -> None:
     plain, limited = Robot(), Robot()
     limited.limit(0.3)
     limited.step()

@@ -242,7 +242,7 @@ def test_damage_never_changes_the_state_of_a_bumper(
 
 
 def test_a_false_press_needs_half_a_second_of_damage() -> None:
-    """Of each two lines one is damaged: each false press is a run of five lines, and no other."""
+    """About half of the lines are lost. Only five lost lines in a row make a false press."""
     dice, estop = random.Random(5), EmergencyStop("auto")
     step_ns, presses, runs, last_ns = NS_PER_S // 100, 0, 0, 0
     for step in range(200_000):

@@ -70,7 +70,9 @@ def test_no_true_line_is_dropped_and_a_short_drive_ends_where_the_reports_say(co
 
 @pytest.mark.variations(8)
 @pytest.mark.parametrize("counts", COUNTS + FINER)
-def test_with_configured_counts_a_minute_ends_exactly_where_the_counter_says(counts: int) -> None:
+def test_with_configured_counts_a_drive_ends_exactly_where_the_raw_counter_says(
+    counts: int,
+) -> None:
     one = drive(counts, 2, 60.0, counts)
     assert one.dropped == 0
     assert one.ours == pytest.approx(one.raw, abs=0.0002)

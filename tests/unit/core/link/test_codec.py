@@ -209,7 +209,9 @@ def test_a_written_speed_is_read_back_within_half_a_hundredth(
 
 
 @given(wheels=small_speeds, wiring=wirings)
-def test_a_line_that_was_read_back_is_written_identically(wheels: WheelSpeeds, wiring: WheelMap) -> None:
+def test_a_line_that_was_read_back_is_written_identically(
+    wheels: WheelSpeeds, wiring: WheelMap
+) -> None:
     codec = Codec(wiring)
     line = codec.encode(wheels)
     assert codec.encode(codec.decode(line.removesuffix(b"\r\n"))) == line
@@ -345,7 +347,9 @@ def test_motor_values_are_put_in_the_order_of_the_wheels_with_their_signs() -> N
 
 
 @given(wiring=wirings, motors=st.tuples(*[st.floats(0.0, 99.0)] * 4))
-def test_motor_values_map_to_wheels_in_the_same_way_as_a_line(wiring: WheelMap, motors: Motors) -> None:
+def test_motor_values_map_to_wheels_in_the_same_way_as_a_line(
+    wiring: WheelMap, motors: Motors
+) -> None:
     rounded = tuple(round(motor, 2) for motor in motors)
     tokens = zip("abcd", rounded, strict=True)
     line = ",".join(f"{letter}p{speed:05.2f}" for letter, speed in tokens).encode()

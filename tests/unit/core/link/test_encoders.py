@@ -101,11 +101,13 @@ def test_the_returned_angles_add_up_to_all_counts(
 
 
 @pytest.mark.parametrize("host_ms", [0.0, 5.4, 10.0, 50.0, 700.0])
-def test_the_time_of_the_hosts_read_does_not_change_the_movement(bench: Bench, host_ms: float) -> None:
+def test_the_time_of_the_hosts_read_does_not_change_the_movement(
+    bench: Bench, host_ms: float
+) -> None:
     assert bench.read(10, (50, 50, 50, 50), host_ms) == turned(50, 50, 50, 50)
 
 
-def test_the_same_reading_again_is_no_movement(bench: Bench) -> None:
+def test_a_repeated_reading_is_no_movement(bench: Bench) -> None:
     bench.read(10, (50, 50, 50, 50))
     assert bench.read(0, host_ms=3.0) == turned(0, 0, 0, 0, dt=0.0)
 
@@ -125,7 +127,9 @@ def test_after_a_gap_in_which_a_count_could_have_wrapped_the_movement_is_unknown
 
 @pytest.mark.parametrize("motor", range(4))
 @pytest.mark.parametrize("sign", [1, -1])
-def test_a_movement_beyond_the_fastest_motor_speed_is_a_leap(bench: Bench, motor: int, sign: int) -> None:
+def test_a_movement_beyond_the_fastest_motor_speed_is_a_leap(
+    bench: Bench, motor: int, sign: int
+) -> None:
     # two ms of rounding and four counts of play
     most = int(FASTEST / math.tau * COUNTS * 0.012) + 4
     moved = [0] * 4
@@ -164,7 +168,9 @@ def test_a_restart_is_detected_after_minutes_without_a_reading(bench: Bench) -> 
 
 
 @pytest.mark.parametrize("drift", [0.995, 1.005])
-def test_a_drifting_clock_is_not_a_restart_and_hides_no_later_restart(bench: Bench, drift: float) -> None:
+def test_a_drifting_clock_is_not_a_restart_and_hides_no_later_restart(
+    bench: Bench, drift: float
+) -> None:
     for _ in range(5000):
         assert isinstance(bench.read(10, host_ms=10 * drift), Turned)
     assert bench.read(125, host_ms=10.0) == "restarted"

@@ -84,7 +84,9 @@ def test_an_adapter_that_holds_lines_back_adds_no_pose_error(
 @pytest.mark.slow
 @EFFORT
 @pytest.mark.parametrize("prompted", [False, True], ids=["reporting", "prompted"])
-def test_losing_a_fifth_of_the_lines_adds_little_pose_error(prompted: bool, seconds: float, seeds: int) -> None:
+def test_losing_a_fifth_of_the_lines_adds_little_pose_error(
+    prompted: bool, seconds: float, seeds: int
+) -> None:
     case = Case(prompted=prompted, lost=0.2, stall=0.15, stall_every=60.0)
     name = f"20 % lost, a stall a minute, {link(prompted)}"
     found = errors(name, "0.45 m", case, seconds, seeds)
@@ -93,7 +95,9 @@ def test_losing_a_fifth_of_the_lines_adds_little_pose_error(prompted: bool, seco
 
 @pytest.mark.slow
 @EFFORT
-def test_answers_that_take_1_to_5_ms_give_half_the_error_of_arrival_times(seconds: float, seeds: int) -> None:
+def test_answers_that_take_1_to_5_ms_give_half_the_error_of_arrival_times(
+    seconds: float, seeds: int
+) -> None:
     """The remaining error is the MCU's delay, which the host cannot separate from its own.
 
     Arrival times have it too.

@@ -433,7 +433,9 @@ def test_undoing_a_line_that_was_not_sent_restores_the_earlier_wait() -> None:
 
 
 @given(st.lists(st.integers(0, 50), max_size=60), st.integers(1, 100))
-def test_any_two_lines_that_the_throttle_lets_through_are_the_wait_apart(steps: list[int], wait_ns: int) -> None:
+def test_any_two_lines_that_the_throttle_lets_through_are_the_wait_apart(
+    steps: list[int], wait_ns: int
+) -> None:
     throttle, now_ns, went = Throttle(), 0, []
     for step in steps:
         now_ns += step

@@ -87,7 +87,9 @@ def test_no_period_is_known_before_half_a_second() -> None:
         (0.0333333, 0.0333333),  # the measured period
     ],
 )
-def test_the_period_is_rounded_to_the_one_that_the_firmware_intends(real: float, period: float) -> None:
+def test_the_period_is_rounded_to_the_one_that_the_firmware_intends(
+    real: float, period: float
+) -> None:
     bench = Bench(real)
     for _ in range(400):
         bench.line()
@@ -425,7 +427,7 @@ def test_a_damaged_reply_is_a_filled_gap() -> None:
     assert bench.reply(210.0 + DELAY_MS) == [20.0, 10.0]
 
 
-def test_a_reply_to_a_line_that_was_given_up_too_early_is_matched_to_its_line() -> None:
+def test_a_line_that_was_given_up_too_early_adds_no_time_to_the_replies() -> None:
     bench = Prompted()
     bench.leave(-10.0)
     bench.reply(-10.0 + DELAY_MS - 1.5)  # the earliest time at which an answer may arrive

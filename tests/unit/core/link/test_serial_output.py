@@ -62,7 +62,7 @@ def test_after_an_incomplete_first_line_the_next_line_is_again_the_opening_stop(
     assert wire.out.endswith(b"\r\n" + STOP)
 
 
-def test_a_line_waits_until_the_one_before_has_left_the_wire() -> None:
+def test_a_line_waits_until_the_previous_line_has_left_the_wire() -> None:
     wire = Wire(9600)
     wire.offer(STOP, 5)  # 35 bytes at 9600 baud take 36.458 ms
     assert wire.offer(GO, 5 + 36.458) == "superseded"
@@ -112,9 +112,7 @@ def test_the_opening_stop_is_the_plain_one_that_every_board_obeys() -> None:
 
 
 @pytest.mark.parametrize(("takes", "prefix"), [(33, b""), (32, b"\r\n"), (0, b"")])
-def test_a_line_begins_with_a_line_end_only_after_a_torn_line(
-    takes: int, prefix: bytes
-) -> None:
+def test_a_line_begins_with_a_line_end_only_after_a_torn_line(takes: int, prefix: bytes) -> None:
     wire = Wire().started()
     assert wire.offer(GO, 10, takes=takes) == ("sent" if takes == 33 else "superseded")
     wire.out = b""

@@ -224,7 +224,7 @@ def sampled(bench: Bench, age_ns: int) -> Instant:
     return Instant(made_ns, made_ns + WALL_NS)
 
 
-def test_a_line_at_the_end_of_a_read_is_as_old_as_its_own_wire_time() -> None:
+def test_a_line_at_the_end_of_a_read_has_the_age_of_its_own_wire_time() -> None:
     bench = Bench().open()
     (feedback,) = bench.wait(10, GOOD)
     assert feedback.heard_ns == bench.now_ns
@@ -381,7 +381,7 @@ def test_a_session_restarts_with_the_port_and_after_a_long_gap(case: str) -> Non
 
 
 @pytest.mark.parametrize("begins", ["board", "port"])
-def test_a_new_session_whose_first_line_comes_late_restarts_with_it_again(begins: str) -> None:
+def test_a_new_session_with_a_late_first_line_restarts_again_at_that_line(begins: str) -> None:
     """A zero that was sent while the board was silent must not arm its sender."""
     bench = Bench().up()
     if begins == "port":
@@ -439,7 +439,7 @@ AUTO = McuConfig(link_check="auto")
 REQUIRE = McuConfig(link_check="require")
 
 
-def test_while_the_check_is_asked_for_only_stops_leave_and_the_link_is_not_up() -> None:
+def test_during_the_negotiation_only_stops_are_sent_and_the_link_is_not_up() -> None:
     bench = Bench(REQUIRE).open()
     for _ in range(300):
         bench.wait(10, GOOD)

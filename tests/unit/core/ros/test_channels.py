@@ -133,7 +133,7 @@ def test_a_schema_text_has_the_constants_of_ros(name: str) -> None:
     assert constants == jazzy[name][0]
 
 
-def test_the_default_quaternion_is_no_rotation() -> None:
+def test_the_default_quaternion_is_the_identity_rotation() -> None:
     first, *_ = schema_text("geometry_msgs/msg/Quaternion").split(RULE)
     read = parse_message_string("geometry_msgs", "Quaternion", first)
     assert {field.name: field.default_value for field in read.fields} == {

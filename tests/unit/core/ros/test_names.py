@@ -210,7 +210,9 @@ def test_each_stored_type_hash_is_that_of_its_definition(type_name: str) -> None
          "RIHS01_0a241f87d04668d94099cbb5ba11691d5ad32c2f29682e4eb5653424bd275206"),
     ],
 )  # fmt: skip
-def test_the_hash_function_of_this_test_matches_the_published_hashes_of_ros(type_name: str, published: str) -> None:
+def test_the_hash_function_of_this_test_matches_the_published_hashes_of_ros(
+    type_name: str, published: str
+) -> None:
     """The types come from ROS and not from this project.
 
     Both sides therefore cannot share an error.

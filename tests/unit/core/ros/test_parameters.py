@@ -140,7 +140,9 @@ WISHES: list[tuple[rcl.ParameterValue, object]] = [
 
 
 @each(("value", "expected"), WISHES)
-def test_a_set_request_gives_a_plain_value_for_each_name(value: rcl.ParameterValue, expected: object) -> None:
+def test_a_set_request_gives_a_plain_value_for_each_name(
+    value: rcl.ParameterValue, expected: object
+) -> None:
     asked = rcl.SetRequest([rcl.Parameter("limits.linear_speed", value)])
     assert rcl.wished(Cdr(rcl.SetRequest).encode(asked)) == {"limits.linear_speed": expected}
 

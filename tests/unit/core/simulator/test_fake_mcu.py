@@ -511,7 +511,9 @@ def test_the_trailing_comma_fault_ends_the_answer_with_a_comma() -> None:
 
 
 @each(("motor", "token"), [(0, b"ap18.75"), (1, b"bn13.12"), (2, b"cp22.50"), (3, b"dn15.38")])
-def test_a_bias_changes_the_report_of_one_motor_but_not_its_motion(motor: int, token: bytes) -> None:
+def test_a_bias_changes_the_report_of_one_motor_but_not_its_motion(
+    motor: int, token: bytes
+) -> None:
     mcu, sound = FakeMcu(TRUE), FakeMcu(TRUE)
     with mcu.bias(motor, 1.5):
         data = drive(mcu, 0, 5)[-1][1]
