@@ -27,20 +27,20 @@ class GatewayDaemon:
         return self.told.receive(heard, self.counters)
 
 
-def test_each_opening_and_each_look_at_a_crowd_counts_once() -> None:
+def test_each_gateway_start_and_each_check_that_found_it_full_is_counted_once() -> None:
     daemon = GatewayDaemon()
     for opened, crowded in ((7, 0), (7, 3), (7, 3), (7, 4), (9, 0), (9, 2)):
         daemon.hears(GatewayState(opened, 255, crowded))
     assert daemon.counters == {"gateway_opened": 2, "gateway_full": 6}
 
 
-def test_a_crowd_that_was_there_before_the_daemon_counts_whole() -> None:
+def test_checks_that_found_the_gateway_full_before_the_daemon_started_are_counted() -> None:
     daemon = GatewayDaemon()
     daemon.hears(GatewayState(7, 255, 40))
     assert daemon.counters == {"gateway_opened": 1, "gateway_full": 40}
 
 
-def test_it_tells_when_the_certificate_ends_if_it_knows() -> None:
+def test_the_end_of_the_certificate_is_returned_if_the_gateway_reports_it() -> None:
     daemon = GatewayDaemon()
     assert (
         daemon.hears(GatewayState(7, 0, 0, 1_800_000_000_000_000_000)) == 1_800_000_000_000_000_000
@@ -61,7 +61,7 @@ def test_it_tells_when_the_certificate_ends_if_it_knows() -> None:
         b'{"opened": 1, "connections": 0, "full": 0, "certificate_ends": 1' + b"0" * 400 + b"}",
     ],
 )
-def test_what_cannot_be_read_counts_nothing(payload: bytes) -> None:
+def test_an_unreadable_gateway_report_counts_nothing(payload: bytes) -> None:
     counters = Counter[str]()
     assert GatewayFollower().receive(arrival(payload), counters) is None
     assert not counters
@@ -93,7 +93,7 @@ def test_a_router_that_is_missing_from_the_start_is_reported_and_counted() -> No
     assert daemon.counters == {"router_missing": 1}
 
 
-def test_a_router_that_came_is_told_by_its_name() -> None:
+def test_a_router_that_connects_is_reported_once_with_its_address() -> None:
     daemon = Daemon()
     daemon.hears((), (A,))
     assert daemon.hears((A,), ()) == [Event("router_found", f"connected to {A}")]
@@ -101,7 +101,7 @@ def test_a_router_that_came_is_told_by_its_name() -> None:
     assert daemon.told.status == RoutersStatus((A,), ())
 
 
-def test_of_two_routers_only_the_one_that_went_is_reported() -> None:
+def test_only_the_missing_router_of_two_is_reported() -> None:
     daemon = Daemon()
     assert [e.name for e in daemon.hears((A, B), ())] == ["router_found"]
     (event,) = daemon.hears((A,), (B,))
@@ -109,7 +109,7 @@ def test_of_two_routers_only_the_one_that_went_is_reported() -> None:
     assert A not in event.text
 
 
-def test_a_peer_in_a_routers_place_is_reported_once_with_what_it_means() -> None:
+def test_a_peer_in_the_place_of_a_router_is_reported_once_with_its_consequence() -> None:
     told, counters = RouterFollower(), Counter[str]()
     events: list[Event] = []
     told.receive(RoutersStatus((A,)), counters, events)  # the type of this peer is not known yet
@@ -121,7 +121,7 @@ def test_a_peer_in_a_routers_place_is_reported_once_with_what_it_means() -> None
     assert "call stop --id '*'" in events[-1].text
 
 
-def test_one_may_go_as_the_other_comes() -> None:
+def test_one_router_may_go_missing_while_another_connects() -> None:
     daemon = Daemon()
     daemon.hears((A,), (B,))
     assert [e.name for e in daemon.hears((B,), (A,))] == ["router_missing", "router_found"]

@@ -119,7 +119,7 @@ def test_a_stamped_twist_is_the_same_command_with_a_stamp(form: Format) -> None:
 
 
 @pytest.mark.parametrize("form", FORMATS)
-def test_an_encoding_may_say_what_the_first_byte_would(form: Format) -> None:
+def test_a_command_with_a_named_encoding_is_decoded(form: Format) -> None:
     name = f"application/{form};acsard.Twist.v1"
     assert command(twist(), form, encoding=name).twist == Twist(0.5, 0.2)
 
@@ -162,13 +162,13 @@ def test_both_parts_of_a_twist_are_required(missing: str) -> None:
         {"twist": {"twist": twist()}},
     ],
 )
-def test_any_other_shape_is_refused_whole(body: object) -> None:
+def test_a_command_of_any_other_shape_is_refused(body: object) -> None:
     assert refused(body) == "wrong_shape"
 
 
 @each("bad", NOT_FINITE)
 @each(("part", "axis"), AXES)
-def test_one_axis_that_is_not_finite_refuses_the_command_whole(
+def test_one_axis_that_is_not_finite_refuses_the_whole_command(
     part: str, axis: str, bad: float
 ) -> None:
     body = twist()
@@ -181,7 +181,7 @@ def test_one_axis_that_is_not_finite_refuses_the_command_whole(
 
 
 @pytest.mark.parametrize("form", FORMATS)
-def test_wheel_speeds_are_the_twist_they_give(form: Format) -> None:
+def test_wheel_speeds_are_converted_to_a_twist(form: Format) -> None:
     got = wheels(joints(4.0, 2.0, 2.0, 4.0), form).twist
     assert got.linear == pytest.approx(0.05 * 3.0)
     assert got.angular == pytest.approx(0.05 * 2.0 / 0.30)
@@ -197,7 +197,7 @@ def test_wheels_that_differ_on_one_side_give_the_mean_of_the_side() -> None:
     assert wheels(joints(5.0, 1.0, 3.0, 3.0)).twist == wheels(joints(4.0, 2.0, 2.0, 4.0)).twist
 
 
-def test_joint_names_are_the_configured_ones() -> None:
+def test_wheel_commands_use_the_configured_joint_names() -> None:
     receiver = Receiver(JointsConfig("fr", "fl", "rl", "rr"), KINEMATICS)
     body = joints(1.0, 1.0, 1.0, 1.0, names=["rl", "fr", "rr", "fl"])
     got = receiver.command(arrival(msgspec.msgpack.encode(body), key="wheel_cmd/app"))
@@ -223,13 +223,13 @@ def test_joint_names_are_the_configured_ones() -> None:
         {"name": JOINTS, "position": [1.0, 2.0, 3.0, 4.0]},
     ],
 )
-def test_all_four_wheels_or_none(body: object) -> None:
+def test_a_wheel_command_without_exactly_the_four_wheels_is_refused(body: object) -> None:
     assert refused(body, key="wheel_cmd/app") == "wrong_wheels"
 
 
 @each("form", FORMATS)
 @each("place", range(5))
-def test_the_joints_of_an_arm_among_the_wheels_are_not_for_us(form: Format, place: int) -> None:
+def test_the_joints_of_an_arm_among_the_wheels_are_ignored(form: Format, place: int) -> None:
     names, speeds = list(JOINTS), [1.0, 2.0, 4.0, 8.0]
     names.insert(place, "arm")
     for arm in (0.0, 1e308, *(NOT_FINITE if form != "json" else ())):
@@ -239,7 +239,7 @@ def test_the_joints_of_an_arm_among_the_wheels_are_not_for_us(form: Format, plac
         assert wheels(body, form).twist == wheels(joints(*speeds)).twist
 
 
-def test_what_an_arm_does_is_no_speed_of_the_wheels() -> None:
+def test_the_speed_of_an_arm_does_not_count_as_a_wheel_speed() -> None:
     got = wheels(joints(0.0, 0.0, 0.0, 0.0, 3.0, names=[*JOINTS, "arm"]))
     assert (got.twist, got.cancelled) == (Twist(), False)
 
@@ -253,7 +253,7 @@ def test_one_wheel_that_is_not_finite_refuses_all_four(place: int, bad: float) -
 
 
 @pytest.mark.parametrize("unused", ["position", "effort"])
-def test_a_number_that_is_not_finite_in_an_unused_field_refuses_too(unused: str) -> None:
+def test_a_number_that_is_not_finite_in_an_unused_field_refuses_the_command(unused: str) -> None:
     body = joints(1.0, 1.0, 1.0, 1.0) | {unused: [0.0, math.nan]}
     assert refused(body, key="wheel_cmd/app") == "not_finite"
 
@@ -283,7 +283,7 @@ def test_a_twist_on_a_wheel_key_and_wheels_on_a_twist_key_are_refused() -> None:
         ((5.0, -5.0, -5.0, 5.0), False),
     ],
 )
-def test_wheel_speeds_that_cancel_out_are_no_zero_of_one_who_let_go(
+def test_wheel_speeds_that_cancel_out_are_marked_and_do_not_count_as_neutral(
     form: Format, speeds: tuple[float, ...], cancelled: bool
 ) -> None:
     got = wheels(joints(*speeds), form)
@@ -293,7 +293,7 @@ def test_wheel_speeds_that_cancel_out_are_no_zero_of_one_who_let_go(
 
 @each("form", FORMATS)
 @each(("part", "axis"), AXES)
-def test_a_twist_of_axes_that_the_base_cannot_follow_is_no_zero_of_one_who_let_go(
+def test_a_twist_on_axes_that_the_base_cannot_follow_does_not_count_as_neutral(
     form: Format, part: str, axis: str
 ) -> None:
     body = twist(0.0, 0.0)
@@ -363,7 +363,7 @@ def test_a_native_stamped_twist_may_have_any_frame(frame: bytes) -> None:
 
 @each("surplus", range(4))
 @each("fill", [b"\x00", b"\xff"])
-def test_the_padding_of_dds_makes_no_other_command(surplus: int, fill: bytes) -> None:
+def test_the_padding_of_dds_does_not_change_the_command(surplus: int, fill: bytes) -> None:
     more = fill * surplus
     assert RECEIVER.command(arrival(native_twist() + more)).twist == Twist(0.5, 0.2)
     for frame in (b"", b"base_link"):
@@ -381,7 +381,7 @@ TOLD = {
 @each("surplus", [*range(9), 16, 24, 200])
 @each("fill", [b"\x00", b"\xff"])
 @each("header", ORDERS)
-def test_surplus_bytes_of_any_length_make_no_other_command_where_the_type_is_given(
+def test_surplus_bytes_do_not_change_a_command_whose_type_is_given(
     header: bytes, fill: bytes, surplus: int
 ) -> None:
     more = fill * surplus
@@ -396,14 +396,14 @@ def test_surplus_bytes_of_any_length_make_no_other_command_where_the_type_is_giv
 
 
 @each("size", range(4, 68))
-def test_where_the_type_is_told_a_twist_is_no_stamped_twist_of_that_length(size: int) -> None:
+def test_a_twist_is_malformed_if_its_given_type_is_twist_stamped(size: int) -> None:
     payload = (native_twist() + bytes(68))[:size]
     assert refusal(arrival(payload, encoding=TOLD["TwistStamped"])) == "malformed"
 
 
 @each("size", range(4, 76))
 @each("encoding", ["", "application/cdr", TOLD["TwistStamped"]])
-def test_a_native_stamped_twist_that_is_cut_is_never_a_stamped_twist(
+def test_a_truncated_native_stamped_twist_is_never_read_as_a_stamped_twist(
     encoding: str, size: int
 ) -> None:
     payload = native_stamped(ORDERS[1], b"base_link")[:size]
@@ -417,7 +417,7 @@ def test_a_native_stamped_twist_that_is_cut_is_never_a_stamped_twist(
 
 
 @pytest.mark.parametrize("header", ORDERS)
-def test_native_wheel_speeds_are_the_twist_they_give(header: bytes) -> None:
+def test_native_wheel_speeds_are_converted_to_a_twist(header: bytes) -> None:
     payload = native_joints(header, [4.0, 2.0, 2.0, 4.0])
     got = RECEIVER.command(arrival(payload, key="wheel_cmd/app"))
     assert got.twist == wheels(joints(4.0, 2.0, 2.0, 4.0)).twist
@@ -438,7 +438,7 @@ def test_a_native_number_that_is_not_finite_is_refused(header: bytes, bad: float
 
 
 @each("size", [n for n in range(4, 68) if not 52 <= n <= 55])
-def test_no_native_twist_has_another_length(size: int) -> None:
+def test_a_native_twist_of_another_length_is_refused(size: int) -> None:
     payload = (native_twist() + bytes(68))[:size]
     assert refusal(arrival(payload)) == ("malformed" if size < 52 else "wrong_shape")
 
@@ -454,7 +454,9 @@ def test_no_native_twist_has_another_length(size: int) -> None:
         ("wheel_cmd/app", native_joints(ORDERS[1], [1.0] * 4)[:-1]),
     ],
 )
-def test_a_native_payload_that_is_not_the_message_is_malformed(key: str, payload: bytes) -> None:
+def test_a_native_payload_that_is_not_the_expected_message_is_malformed(
+    key: str, payload: bytes
+) -> None:
     assert refusal(arrival(payload, key=key)) == "malformed"
 
 
@@ -464,7 +466,7 @@ def empty_names(size: int) -> bytes:
     return cdr(ORDERS[1], "iIIB3xI", 0, 0, 1, 0, count) + bytes(4 * count)
 
 
-def test_more_names_than_any_robot_has_are_refused_for_their_number_alone() -> None:
+def test_too_many_joint_names_are_refused_for_their_number_without_being_decoded() -> None:
     payload = empty_names(MAX_COMMAND_BYTES)
     assert len(payload) == MAX_COMMAND_BYTES
     # the decoder looked at no item
@@ -473,13 +475,13 @@ def test_more_names_than_any_robot_has_are_refused_for_their_number_alone() -> N
             RECEIVER.command(arrival(more, key="wheel_cmd/app"))
 
 
-def test_native_wheel_speeds_are_all_four_or_none() -> None:
+def test_native_wheel_speeds_for_another_number_of_wheels_are_refused() -> None:
     for count in (0, 3, 5):
         payload = native_joints(ORDERS[1], [1.0] * count)
         assert refusal(arrival(payload, key="wheel_cmd/app")) == "wrong_wheels"
 
 
-def test_a_native_command_has_the_same_limit_as_any_other() -> None:
+def test_a_native_command_has_the_same_size_limit_as_any_other() -> None:
     largest = native_stamped(ORDERS[1], b"f" * 4027) + bytes(4)
     assert len(largest) == MAX_COMMAND_BYTES
     assert RECEIVER.command(arrival(largest)).twist == Twist(0.5, 0.2)
@@ -503,7 +505,7 @@ def test_a_delete_is_not_a_command(key: str) -> None:
     assert refused(twist(), key=key, put=False) == "not_a_put"
 
 
-def test_a_command_may_be_as_big_as_the_limit_and_no_bigger() -> None:
+def test_a_command_may_reach_the_size_limit_but_not_exceed_it() -> None:
     text = encode(twist(), "json")
     largest = text + b" " * (MAX_COMMAND_BYTES - len(text))
     assert RECEIVER.command(arrival(largest)).twist == Twist(0.5, 0.2)
@@ -511,21 +513,21 @@ def test_a_command_may_be_as_big_as_the_limit_and_no_bigger() -> None:
     assert refusal(arrival(largest + b" ", key="wheel_cmd/app")) == "too_big"
 
 
-def test_no_reason_outweighs_another_refusal() -> None:
+def test_a_wildcard_is_the_reported_reason_of_a_delete_without_payload() -> None:
     assert refusal(arrival(b"", key="cmd/*", put=False)) == "wildcard"
 
 
 # the clock of a stamp
 
 
-def test_wheel_commands_are_stamped_the_same_way() -> None:
+def test_wheel_commands_are_stamped_in_the_same_way_as_twists() -> None:
     body = joints(1.0, 1.0, 1.0, 1.0)
     header = {"header": {"stamp": {"sec": 9, "nanosec": 1}}}
     assert wheels(body | header, stamp_ns=5).stamp_ns == 9_000_000_001
     assert wheels(body, stamp_ns=5).stamp_ns == 5
 
 
-def test_the_age_counts_from_the_arrival_whatever_the_stamp_says() -> None:
+def test_the_age_counts_from_the_arrival_and_not_from_the_stamp() -> None:
     assert command(stamped(1), stamp_ns=2).arrived_ns == ARRIVED_NS
 
 
@@ -534,13 +536,13 @@ def test_the_age_counts_from_the_arrival_whatever_the_stamp_says() -> None:
 
 @each("verb", ["stop", "deactivate", "reset_odometry"])
 @each("payload", [b"", b"{}", b"\xff garbage"])
-def test_a_service_without_arguments_minds_no_payload(verb: Any, payload: bytes) -> None:
+def test_a_service_without_arguments_ignores_its_payload(verb: Any, payload: bytes) -> None:
     assert Receiver.request(verb, 7, "", payload) == Request(verb, 7)
 
 
 @each("verb", ["clear", "activate"])
 @each("form", ["json", "msgpack"])
-def test_clear_and_activate_take_the_number_of_a_latch(form: Format, verb: Verb) -> None:
+def test_clear_and_activate_accept_the_number_of_a_latch(form: Format, verb: Verb) -> None:
     payload = encode({"latch": 1_800_000_000_123}, form)
     request = Receiver.request(verb, 7, "", payload, 5)
     assert request == Request(verb, 7, asked_ns=5, latch=1_800_000_000_123)
@@ -564,7 +566,7 @@ def test_clear_and_activate_refuse_any_other_payload(payload: bytes, verb: Verb)
 
 
 @pytest.mark.parametrize("form", ["json", "msgpack"])
-def test_set_pose_takes_x_y_and_yaw(form: Format) -> None:
+def test_set_pose_accepts_x_y_and_yaw(form: Format) -> None:
     payload = encode({"x": 1.5, "y": -2, "yaw": 0.5}, form)
     assert Receiver.request("set_pose", 7, "", payload) == Request(
         "set_pose", 7, Pose(1.5, -2.0, 0.5)
@@ -585,7 +587,7 @@ def test_set_pose_takes_x_y_and_yaw(form: Format) -> None:
         ({"x": 0.0, "y": -1.1e6, "yaw": 0.0}, "not_finite"),
     ],
 )
-def test_set_pose_refuses_what_is_not_a_pose(body: object, reason: str) -> None:
+def test_set_pose_refuses_a_payload_that_is_not_a_pose(body: object, reason: str) -> None:
     with pytest.raises(DecodeError) as caught:
         Receiver.request("set_pose", 7, "", msgspec.msgpack.encode(body))
     assert caught.value.reason == reason
@@ -685,7 +687,7 @@ def test_a_stamp_beyond_any_clock_is_refused(digits: int) -> None:
         RECEIVER.command(arrival(body.encode()))
 
 
-def test_whatever_the_receiver_lets_through_the_arbiter_survives() -> None:
+def test_a_huge_stamp_never_makes_the_arbiter_raise() -> None:
     body = '{"header":{"stamp":{"sec":%s}},"twist":{"linear":{},"angular":{}}}' % ("9" * 400)
     try:
         got = RECEIVER.command(arrival(body.encode()))
@@ -694,7 +696,7 @@ def test_whatever_the_receiver_lets_through_the_arbiter_survives() -> None:
     Arbiter(CommandsConfig()).accept(got)
 
 
-def test_a_header_beside_a_bare_twist_is_neither_a_twist_nor_a_stamped_one() -> None:
+def test_a_header_beside_a_bare_twist_is_refused() -> None:
     with pytest.raises(DecodeError):
         RECEIVER.command(arrival(b'{"header":{"stamp":{"sec":5}},"linear":{"x":1},"angular":{}}'))
 
@@ -712,7 +714,7 @@ def by_ros(via: str, body: dict[str, Any], **changes: Any) -> Arrival:
     return arrival(written(body, "cdr"), **given)
 
 
-def test_over_rmw_the_attachment_says_who_sent_it_and_when() -> None:
+def test_over_rmw_the_attachment_gives_the_sender_and_the_stamp() -> None:
     command = RECEIVER.command(by_ros("rmw", twist(), stamp_ns=5, sender="router"))
     gid = f"gid {public_name(GID.hex())}"
     assert command == Command(
@@ -728,18 +730,20 @@ def test_over_rmw_the_attachment_says_who_sent_it_and_when() -> None:
         (Attachment(1, SENT_NS, GID).pack() + b"x", "bad_attachment"),
     ],
 )
-def test_over_rmw_nothing_counts_without_its_attachment(attachment: bytes, reason: str) -> None:
+def test_over_rmw_a_command_without_a_valid_attachment_is_refused(
+    attachment: bytes, reason: str
+) -> None:
     assert refusal(by_ros("rmw", twist(), attachment=attachment)) == reason
 
 
-def test_by_a_bridge_any_attachment_is_ignored() -> None:
+def test_the_attachment_of_a_command_from_a_bridge_is_ignored() -> None:
     command = RECEIVER.command(by_ros("bridge", twist(), attachment=b"rqh" + bytes(17)))
     assert command.twist == Twist(0.5, 0.2)
     assert command.stamp_ns is None
 
 
 @pytest.mark.parametrize("via", ["bridge", "rmw"])
-def test_joint_commands_are_wheel_speeds_of_their_source(via: str) -> None:
+def test_joint_commands_from_ros_are_wheel_speeds_of_their_source(via: str) -> None:
     command = RECEIVER.command(
         by_ros(via, joints(6.0, 2.0, 2.0, 6.0), key="wheel_cmd/ros2_control")
     )
@@ -754,12 +758,12 @@ def test_joint_commands_before_the_controller_is_active_are_refused(via: str) ->
 
 
 @pytest.mark.parametrize("via", ["bridge", "rmw"])
-def test_a_wildcard_put_or_a_delete_on_a_ros_key_is_no_command(via: str) -> None:
+def test_a_wildcard_put_or_a_delete_on_a_ros_key_is_refused(via: str) -> None:
     assert refusal(by_ros(via, twist(), key="cmd_*")) == "wildcard"
     assert refusal(by_ros(via, twist(), put=False)) == "not_a_put"
 
 
-def test_the_clock_of_a_header_is_another_than_the_router_s_that_stamped_two_senders() -> None:
+def test_the_clock_of_a_header_is_kept_apart_from_that_of_a_stamping_router() -> None:
     """A router stamps for every sender behind it. A header shows the sender's own clock."""
     arbiter = Arbiter(CommandsConfig())
     reasons = []
@@ -786,7 +790,7 @@ def test_the_sender_over_rmw_is_the_publisher() -> None:
     assert RECEIVER.command(by_ros("rmw", twist(), attachment=other)).sender != name
 
 
-def test_one_who_sends_what_cannot_be_read_is_the_same_sender_as_before() -> None:
+def test_an_unreadable_command_has_the_same_sender_as_a_readable_one() -> None:
     good = arrival(written(twist(), "json"), sender="z1", stamp_ns=5)
     bad = claimed_identity(replace(good, payload=b"hello"))
     assert (bad.sender, bad.shared) == (RECEIVER.command(good).sender, True)
@@ -795,7 +799,7 @@ def test_one_who_sends_what_cannot_be_read_is_the_same_sender_as_before() -> Non
     assert (bad.sender, bad.shared) == (RECEIVER.command(ros).sender, False)
 
 
-def test_half_a_gid_passes_for_no_other_sender() -> None:
+def test_half_a_gid_is_not_taken_for_another_sender() -> None:
     nameless = public_name("z1")
     half = by_ros("rmw", twist(), attachment=bytes.fromhex(nameless))
     assert claimed_identity(half).sender == ""
@@ -814,7 +818,7 @@ def signed(**told: Any) -> bytes:
 @pytest.mark.parametrize(
     ("ahead_ns", "replaced"), [(0, False), (500_000_000, False), (500_000_001, True)]
 )
-def test_a_stamp_that_zenoh_replaced_is_known_by_how_far_ahead_the_sender_s_own_is(
+def test_a_stamp_more_than_half_a_second_ahead_counts_as_replaced_by_zenoh(
     ahead_ns: int, replaced: bool
 ) -> None:
     attachment = signed(stamp=SENT_NS + ahead_ns)
@@ -883,13 +887,13 @@ IDENTITIES: dict[str, tuple[Arrival, str, str, int | None, bool]] = {
 
 
 @each("case", IDENTITIES)
-def test_a_sample_says_who_sent_it_by_which_clock_and_when(case: str) -> None:
+def test_a_sample_gives_its_sender_clock_and_stamp(case: str) -> None:
     came, *expected = IDENTITIES[case]
     told = RECEIVER.command(came)
     assert [told.sender, told.clock, told.stamp_ns, told.shared] == expected
 
 
-def test_without_a_stamp_of_its_own_our_attachment_s_sender_has_zenoh_s() -> None:
+def test_an_attachment_without_a_stamp_uses_the_stamp_of_zenoh() -> None:
     told = command(twist(), attachment=signed(sequence=3), sender="z1", stamp_ns=5)
     assert (told.stamp_ns, told.sequence) == (5, 3)
 
@@ -897,7 +901,7 @@ def test_without_a_stamp_of_its_own_our_attachment_s_sender_has_zenoh_s() -> Non
 # certificates
 
 
-def test_the_certificate_in_the_key_is_part_of_the_sender_s_name() -> None:
+def test_the_certificate_in_the_key_is_part_of_the_sender_name() -> None:
     receiver = Receiver(JointsConfig(), KINEMATICS)
     came = arrival(written(twist(), "json"), key="cmd/app/anna", attachment=signed(stamp=9))
     told = receiver.command(came)
@@ -920,7 +924,7 @@ def test_a_sender_id_under_a_second_certificate_is_refused(first: str, second: s
     assert receiver.command(came).sender == claimed_identity(came).sender
 
 
-def test_what_many_share_and_what_comes_by_ros_is_bound_to_no_certificate() -> None:
+def test_shared_and_ros_senders_are_not_bound_to_a_certificate() -> None:
     receiver = Receiver(JointsConfig(), KINEMATICS)
     receiver.command(arrival(written(twist(), "json"), key="cmd/app/anna", attachment=signed()))
     bridged = by_ros("bridge", twist(), key="cmd/app", attachment=signed())
@@ -931,8 +935,8 @@ def test_what_many_share_and_what_comes_by_ros_is_bound_to_no_certificate() -> N
         assert receiver.command(came).shared
 
 
-def test_no_sender_id_passes_for_the_session_that_stamps_for_others() -> None:
-    """The zero of a sender id arms at once. The id of a router's session is no secret."""
+def test_a_sender_id_is_never_taken_for_a_session_that_stamps_for_others() -> None:
+    """The zero of a sender id arms immediately. The id of a router's session is no secret."""
     stamped_by = command(twist(), sender="z1", stamp_ns=5).sender
     for name in ("z1", "session z1", "session/z1", f"{stamped_by}/z1"):
         attachment = msgspec.msgpack.encode({"sender": name})
@@ -942,7 +946,7 @@ def test_no_sender_id_passes_for_the_session_that_stamps_for_others() -> None:
 # senders bound to certificates
 
 
-def test_the_first_certificate_keeps_the_sender_for_as_long_as_it_speaks() -> None:
+def test_the_first_certificate_keeps_a_sender_id_while_it_sends() -> None:
     bindings = Bindings()
     for at_ns in range(0, 5 * BOUND_NS, BOUND_NS // 2):
         assert bindings.other("a", "anna", at_ns) is None
@@ -951,13 +955,13 @@ def test_the_first_certificate_keeps_the_sender_for_as_long_as_it_speaks() -> No
     assert bindings.other("b", "ben", at_ns) is None
 
 
-def test_this_machine_is_a_place_like_a_certificate() -> None:
+def test_a_sender_id_without_a_certificate_is_bound_to_this_machine() -> None:
     bindings = Bindings()
     assert bindings.other("a", "", 0) is None
     assert bindings.other("a", "anna", 1) == ""
 
 
-def test_refused_commands_do_not_lengthen_the_binding_and_after_a_silence_it_ends() -> None:
+def test_a_binding_ends_after_a_silence_and_refused_commands_do_not_extend_it() -> None:
     bindings = Bindings()
     bindings.other("a", "anna", 0)
     assert bindings.other("a", "ben", BOUND_NS) == "anna"
@@ -965,7 +969,7 @@ def test_refused_commands_do_not_lengthen_the_binding_and_after_a_silence_it_end
     assert bindings.other("a", "anna", BOUND_NS + 2) == "ben"
 
 
-def test_a_flood_of_sender_ids_takes_no_memory_and_those_that_speak_stay_bound() -> None:
+def test_a_flood_of_sender_ids_is_bounded_in_memory_and_active_senders_stay_bound() -> None:
     bindings = Bindings()
     bindings.other("a", "anna", 0)
     for number in range(4 * MAX_BOUND):
@@ -983,7 +987,7 @@ def signed_as(name: str) -> bytes:
     return msgspec.json.encode({"sender": name})
 
 
-def test_a_native_call_has_the_name_it_gives() -> None:
+def test_a_native_caller_has_the_name_in_its_attachment() -> None:
     for form in (msgspec.json, msgspec.msgpack):
         signature = form.encode({"sender": "alice@laptop patrol/s3cret", "sequence": 7})
         assert caller_name("native", signature) == "alice@laptop patrol/b8978a0526b85c8d (native)"
@@ -993,21 +997,21 @@ def test_a_native_call_has_the_name_it_gives() -> None:
     "attachment",
     [b"", b"joe", b"{}", b'{"sender": 7}', b'{"sender": "\xff"}', b"\x81", signed_as("")],
 )
-def test_who_gives_no_name_is_unnamed(attachment: bytes) -> None:
+def test_a_caller_without_a_valid_name_is_unnamed(attachment: bytes) -> None:
     assert caller_name("native", attachment) == "unnamed (native)"
 
 
-def test_what_was_stamped_tells_the_session_that_stamped_it() -> None:
+def test_a_stamped_call_names_the_session_that_stamped_it() -> None:
     session = public_name("1f2e")
     assert caller_name("native", b"", "1f2e") == f"unnamed (native, session {session})"
 
 
-def test_an_rmw_client_is_its_gid() -> None:
+def test_an_rmw_caller_is_named_by_its_gid() -> None:
     gid = bytes(range(16))
     assert caller_name("rmw", bytes(17) + gid) == f"unnamed (rmw {gid.hex()})"
 
 
-def test_a_bridge_tells_nothing() -> None:
+def test_a_caller_through_a_bridge_is_unnamed() -> None:
     assert caller_name("bridge", b"rqh" + bytes(17)) == "unnamed (bridge)"
 
 
@@ -1022,13 +1026,13 @@ def test_a_bridge_tells_nothing() -> None:
         ("Jürgen", "Jürgen"),
     ],
 )
-def test_a_name_cannot_pass_for_the_words_around_it(name: str, kept: str) -> None:
+def test_a_caller_name_cannot_imitate_the_text_around_it(name: str, kept: str) -> None:
     who = caller_name("native", signed_as(f"{name}/s3cret"))
     assert who == f"{kept}/{public_name(f'{name}/s3cret')[-DIGITS:]} (native)"
 
 
 @given(st.binary(max_size=100) | st.text(max_size=100).map(signed_as))
-def test_any_attachment_makes_a_short_printable_name(attachment: bytes) -> None:
+def test_any_attachment_gives_a_short_printable_name(attachment: bytes) -> None:
     who = caller_name("native", attachment)
     name = who.removesuffix(" (native)")
     assert who == f"{name} (native)"

@@ -55,19 +55,19 @@ def test_an_imu_is_read_in_every_encoding(form: Format, named: bool) -> None:
     assert got == GyroSample(7, 12_000_000_005, 0.75, 4e-4)
 
 
-def test_of_json_only_the_angular_velocity_is_required() -> None:
+def test_in_json_only_the_angular_velocity_is_required() -> None:
     assert reading(turning(-0.5)) == GyroSample(7, None, -0.5, 0.0)
 
 
 @given(st.binary(max_size=400))
-def test_whatever_comes_is_a_sample_or_refused(payload: bytes) -> None:
+def test_any_payload_is_a_sample_or_is_counted_as_refused(payload: bytes) -> None:
     counters = Counter[str]()
     sample = GyroFollower().receive(arrival(payload), counters, [])
     assert counters.total() == (sample is None)
 
 
 @given(st.floats(allow_nan=True, allow_infinity=True))
-def test_no_rate_is_let_in_that_no_base_has(rate: float) -> None:
+def test_a_turn_rate_beyond_the_maximum_is_refused(rate: float) -> None:
     imu = Imu(Header(), Quaternion(), ZEROS, Vector3(z=rate), ZEROS, Vector3(), ZEROS)
     if abs(rate) <= MAX_RATE:
         assert reading(arrival(encode(imu, "cdr"))).rate == rate
@@ -94,7 +94,7 @@ REFUSED: dict[str, Arrival] = {
 
 
 @each("reason", REFUSED)
-def test_what_is_refused_is_counted_and_told_by_its_reason(reason: str) -> None:
+def test_a_refused_sample_is_counted_and_reported_with_its_reason(reason: str) -> None:
     counters, events = Counter[str](), list[Event]()
     assert GyroFollower().receive(REFUSED[reason], counters, events) is None
     assert counters == {f"imu_{reason}": 1}
@@ -102,7 +102,7 @@ def test_what_is_refused_is_counted_and_told_by_its_reason(reason: str) -> None:
     assert (event.name, event.kind, event.level) == ("imu_refused", reason, "warning")
 
 
-def test_a_negative_variance_is_none() -> None:
+def test_a_negative_variance_is_refused() -> None:
     with pytest.raises(DecodeError, match="the turn rate is below zero: -1"):
         reading(said(angular_velocity={"z": 0.1}, angular_velocity_covariance=[0.0] * 8 + [-1.0]))
 
@@ -117,7 +117,7 @@ class Daemon:
         return got is not None
 
 
-def test_of_two_gyros_the_first_is_followed_until_it_is_silent() -> None:
+def test_the_first_of_two_gyros_is_followed_until_it_is_silent() -> None:
     daemon = Daemon()
     assert daemon.hears(0.1, 0, "one")
     assert not daemon.hears(0.2, FOLLOWED_NS // 2, "other")
@@ -128,7 +128,7 @@ def test_of_two_gyros_the_first_is_followed_until_it_is_silent() -> None:
     assert not daemon.hears(0.1, 2 * FOLLOWED_NS + 1, "one")
 
 
-def test_the_first_sample_of_another_gyro_says_that_it_is_one() -> None:
+def test_the_first_sample_of_another_gyro_is_marked_as_new() -> None:
     told, anew = GyroFollower(), []
     heard = [(0, "one"), (1, "one"), (FOLLOWED_NS + 1, "other"), (FOLLOWED_NS + 2, "other")]
     for at_ns, who in heard:
@@ -138,14 +138,14 @@ def test_the_first_sample_of_another_gyro_says_that_it_is_one() -> None:
     assert anew == [False, False, True, False]
 
 
-def test_who_comes_back_after_a_silence_is_no_other() -> None:
+def test_a_gyro_that_returns_after_a_silence_is_not_marked_as_new() -> None:
     told = GyroFollower()
     for at_ns in (0, 10 * FOLLOWED_NS):
         sample = told.receive(turning(0.1, at_ns, "one"), Counter(), [])
         assert sample == GyroSample(at_ns, None, 0.1)
 
 
-def test_beside_a_gyro_of_its_own_a_robot_follows_no_other_however_long_that_is_silent() -> None:
+def test_a_robot_with_its_own_gyro_never_follows_another_one() -> None:
     counters, events = Counter[str](), list[Event]()
     told = GyroFollower(own=True)
     for who in ("other", OWN):
@@ -158,7 +158,7 @@ def test_beside_a_gyro_of_its_own_a_robot_follows_no_other_however_long_that_is_
     assert "simulat" in events[0].text
 
 
-def test_what_is_refused_keeps_nobody_out() -> None:
+def test_a_refused_sample_does_not_occupy_the_place_of_the_gyro() -> None:
     daemon = Daemon()
     daemon.told.receive(REFUSED["out_of_range"], daemon.counters, daemon.events)
     assert daemon.hears(0.1, 8, "other")

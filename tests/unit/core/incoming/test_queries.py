@@ -107,7 +107,7 @@ def test_a_published_key_answers_with_its_last_value(topic: Any, form: Format) -
 
 
 @pytest.mark.parametrize("key", ["odom", "state"])
-def test_a_key_of_the_json_tree_answers_as_the_plain_one(key: str) -> None:
+def test_a_key_of_the_json_tree_has_the_answer_of_the_plain_key(key: str) -> None:
     plain = answer(query(key))
     assert answer(query(f"json/{key}")) == replace(plain, key=f"json/{key}")
 
@@ -132,7 +132,7 @@ def test_a_ros_message_is_also_answered_as_cdr(topic: Any) -> None:
         ("schema/<Type>", "schema/Odometry", "dict"),
     ],
 )
-def test_what_is_no_ros_message_is_refused_as_cdr_in_words(
+def test_a_query_for_cdr_of_a_type_that_is_not_a_ros_message_is_refused_with_a_text(
     topic: str, asked: str, kind: str
 ) -> None:
     assert answer(query(topic, asked, fmt="cdr")) == Reply(
@@ -151,12 +151,12 @@ def test_a_published_key_without_a_value_yet_has_no_answer(topic: Any, fmt: str)
 
 
 @each("asked", ["odom", "**", "*", "acsard/*/odom"])
-def test_a_last_value_may_be_asked_by_wildcard_and_has_its_own_key(asked: str) -> None:
+def test_a_wildcard_query_gets_the_last_value_under_its_exact_key(asked: str) -> None:
     assert answer(query("odom", asked)).key == "odom"
 
 
 @pytest.mark.parametrize("form", ["msgpack", "json"])
-def test_info_says_who_the_daemon_is(form: Format) -> None:
+def test_info_identifies_the_daemon(form: Format) -> None:
     assert answer(query("info", fmt=form)) == Reply(
         7, "info", encode(INFO, form), encoding_name(form, "Info")
     )
@@ -174,7 +174,7 @@ def test_config_is_the_configuration_in_force(form: Format) -> None:
 
 
 @pytest.mark.parametrize("role", ROLES)
-def test_whoami_says_the_role_that_was_asked_as_and_who_asks(role: str) -> None:
+def test_whoami_returns_the_role_in_the_key_and_the_name_of_the_caller(role: str) -> None:
     sender = msgspec.msgpack.encode({"sender": "joe@laptop/s3cret"})
     asked = f"whoami/{role}"
     reply = answer(query("whoami/<role>", asked, attachment=sender))
@@ -186,11 +186,11 @@ def test_whoami_says_the_role_that_was_asked_as_and_who_asks(role: str) -> None:
 
 
 @each("asked", ["whoami/*", "whoami/**", "**", "whoami/admin"])
-def test_nobody_is_told_a_role_that_was_not_asked_for_by_its_name(asked: str) -> None:
+def test_whoami_does_not_answer_a_wildcard_or_an_unknown_role(asked: str) -> None:
     assert answers(query("whoami/<role>", asked)) == []
 
 
-def test_topics_is_the_whole_table_with_full_keys() -> None:
+def test_topics_returns_the_whole_table_with_full_keys() -> None:
     reply = answer(query("topics"))
     table = msgspec.json.decode(reply.payload, type=Topics).topics
     assert [row.key for row in table] == [f"acsard/r7/{topic.key}" for topic in offered(CONFIG)]
@@ -225,7 +225,7 @@ def test_the_table_has_only_the_transforms_that_the_daemon_publishes(
 
 
 @each("name", SCHEMAS)
-def test_each_type_has_its_schema(name: str) -> None:
+def test_each_type_has_a_schema(name: str) -> None:
     reply = answer(query("schema/<Type>", f"schema/{name}"))
     assert reply.key == f"schema/{name}"
     assert msgspec.json.decode(reply.payload) == SCHEMAS[name]
@@ -233,7 +233,7 @@ def test_each_type_has_its_schema(name: str) -> None:
 
 
 @each("asked", ["schema/*", "schema/**", "**", "acsard/*/schema/*"])
-def test_a_wildcard_gives_the_schema_of_every_type(asked: str) -> None:
+def test_a_wildcard_for_all_types_gives_every_schema(asked: str) -> None:
     assert [reply.key for reply in answers(query("schema/<Type>", asked))] == [
         f"schema/{name}" for name in SCHEMAS
     ]
@@ -256,14 +256,14 @@ def test_a_wildcard_gives_the_schema_of_every_type(asked: str) -> None:
         ("**/" + "$*a" * 10_000, []),
     ],
 )
-def test_a_wildcard_gives_the_schemas_whose_key_it_includes(asked: str, found: list[str]) -> None:
+def test_a_wildcard_gives_the_schemas_whose_keys_it_includes(asked: str, found: list[str]) -> None:
     assert [reply.key for reply in answers(query("schema/<Type>", asked))] == [
         f"schema/{name}" for name in found
     ]
 
 
 @each("name", ["", "Nothing", "odometry", "Odometry/x", "<Type>"])
-def test_there_is_no_schema_of_what_is_no_type(name: str) -> None:
+def test_an_unknown_type_has_no_schema(name: str) -> None:
     assert answers(query("schema/<Type>", f"schema/{name}")) == []
 
 
@@ -273,7 +273,7 @@ def test_a_key_that_is_not_in_the_table_has_no_answer() -> None:
 
 @each("key", [t.key for t in TOPICS if t.direction != "in" and t.key != "alive"])
 @each("fmt", ["xml", "JSON", "CDR", " json"])
-def test_an_unknown_format_is_answered_with_an_error_in_words(key: str, fmt: str) -> None:
+def test_an_unknown_format_is_answered_with_an_error_text(key: str, fmt: str) -> None:
     reply = answer(query(key, fmt=fmt))
     assert not reply.ok
     assert reply.ticket == 7
@@ -282,12 +282,12 @@ def test_an_unknown_format_is_answered_with_an_error_in_words(key: str, fmt: str
 
 
 @pytest.mark.parametrize("form", FORMATS)
-def test_the_error_for_an_unknown_format_says_which_there_are(form: Format) -> None:
+def test_the_error_for_an_unknown_format_lists_the_known_formats(form: Format) -> None:
     assert f"fmt={form}" in answer(query("odom", fmt="xml")).payload.decode()
 
 
 @each("key", ["odom", "info", "config", "topics", "interfaces"])
-def test_without_a_format_the_answer_is_json_for_people(key: str) -> None:
+def test_without_a_format_the_answer_is_json(key: str) -> None:
     reply = answer(query(key))
     assert reply.ok
     assert reply.encoding.startswith("application/json")
@@ -345,7 +345,7 @@ def payload_for(verb: str) -> bytes:
 
 
 @each("verb", SERVICES)
-def test_a_service_asked_by_its_exact_key_is_a_request_of_the_robot(verb: Any) -> None:
+def test_a_service_query_with_its_exact_key_makes_a_request_to_the_robot(verb: Any) -> None:
     got = queries().serve(query(f"srv/{verb}", payload=payload_for(verb)), nothing, OUTPUTS)
     pose = Pose(1.0, 2.0, 3.0) if verb == "set_pose" else None
     told: dict[str, Plain] = {"limits.linear_speed": 0.8, "log.level": "debug"}
@@ -363,7 +363,7 @@ def test_a_wildcard_never_runs_a_service(verb: str, asked: str) -> None:
 
 
 @each("asked", ["srv/stop/", "srv", "/srv/stop", "srv/clear", "SRV/STOP", ""])
-def test_a_service_does_not_run_by_a_key_that_is_only_like_its_own(asked: str) -> None:
+def test_a_service_does_not_run_for_a_key_that_only_resembles_its_own(asked: str) -> None:
     assert queries().serve(query("srv/stop", asked), nothing, None) == []
 
 
@@ -372,7 +372,7 @@ def test_a_service_that_does_not_exist_does_nothing() -> None:
 
 
 @pytest.mark.parametrize("success", [True, False])
-def test_the_robots_answer_goes_back_to_who_asked(success: bool) -> None:
+def test_the_answer_of_the_robot_goes_back_to_the_caller(success: bool) -> None:
     made = queries()
     made.serve(query("srv/clear", ticket=12), nothing, None)
     made.serve(query("srv/stop", ticket=13), nothing, None)
@@ -385,14 +385,14 @@ def test_the_robots_answer_goes_back_to_who_asked(success: bool) -> None:
     )
 
 
-def test_an_answer_goes_back_once() -> None:
+def test_an_answer_goes_back_only_once() -> None:
     made = queries()
     made.serve(query("srv/stop"), nothing, None)
     assert made.answered(Answer(7, True, ""), WALL_NS) is not None
     assert made.answered(Answer(7, True, ""), WALL_NS) is None
 
 
-def test_an_answer_nobody_waits_for_goes_nowhere() -> None:
+def test_an_answer_without_a_waiting_caller_makes_no_reply() -> None:
     assert queries().answered(Answer(0, True, "stopped"), WALL_NS) is None
 
 
@@ -413,7 +413,7 @@ def test_an_answer_nobody_waits_for_goes_nowhere() -> None:
         ("json", b"\x00\x01\x00\x00\x00", "", "json"),
     ],
 )
-def test_a_service_answers_in_the_format_asked_for_else_in_the_payloads(
+def test_a_service_answers_in_the_requested_format_or_else_in_that_of_the_payload(
     fmt: str, payload: bytes, encoding: str, form: Format
 ) -> None:
     made = queries()
@@ -425,7 +425,7 @@ def test_a_service_answers_in_the_format_asked_for_else_in_the_payloads(
     assert reply.encoding == encoding_name(form, "ServiceReply")
 
 
-def test_a_service_asked_in_cdr_answers_as_a_ros_trigger_does() -> None:
+def test_a_service_called_in_cdr_answers_like_a_ros_trigger() -> None:
     made = queries()
     made.serve(query("srv/stop", payload=b"\x00\x01\x00\x00\x00"), nothing, None)
     reply = made.answered(Answer(7, True, "ok"), WALL_NS)
@@ -455,7 +455,7 @@ def test_a_service_without_arguments_runs_whatever_the_payload(verb: str) -> Non
         (encode({"x": 1.0, "y": 2.0, "yaw": math.nan}, "msgpack"), "yaw must be finite"),
     ],
 )
-def test_a_pose_that_is_none_is_answered_in_words_and_asks_nothing_of_the_robot(
+def test_an_invalid_pose_is_answered_with_a_text_and_makes_no_request_to_the_robot(
     payload: bytes, words: str
 ) -> None:
     made = queries()
@@ -486,7 +486,9 @@ def ros_query(topic: str, via: str = "rmw", payload: bytes = EMPTY, **changes: A
 
 @each("via", ["bridge", "rmw"])
 @each("verb", TRIGGERS)
-def test_a_trigger_asks_the_robot_and_its_answer_is_cdr(verb: str, via: str) -> None:
+def test_a_ros_trigger_makes_a_request_to_the_robot_and_its_answer_is_cdr(
+    verb: str, via: str
+) -> None:
     made = queries()
     got = made.serve(ros_query(f"srv/{verb}", via), nothing, OUTPUTS)
     by = f"unnamed (rmw {ASKED.gid.hex()})" if via == "rmw" else "unnamed (bridge)"
@@ -497,7 +499,7 @@ def test_a_trigger_asks_the_robot_and_its_answer_is_cdr(verb: str, via: str) -> 
     assert reply.ok
 
 
-def test_over_rmw_a_reply_has_the_request_s_sequence_and_gid_and_its_own_time() -> None:
+def test_over_rmw_a_reply_has_the_sequence_and_gid_of_the_request_and_its_own_stamp() -> None:
     made = queries()
     made.serve(ros_query("srv/clear"), nothing, OUTPUTS)
     reply = made.answered(Answer(7, False, "no"), WALL_NS)
@@ -505,7 +507,7 @@ def test_over_rmw_a_reply_has_the_request_s_sequence_and_gid_and_its_own_time() 
     assert unpack(reply.attachment) == Attachment(7, WALL_NS, ASKED.gid)
 
 
-def test_by_a_bridge_a_reply_needs_no_attachment() -> None:
+def test_a_reply_through_a_bridge_has_no_attachment() -> None:
     made = queries()
     made.serve(ros_query("srv/clear", "bridge", attachment=b"rqh" + bytes(17)), nothing, OUTPUTS)
     reply = made.answered(Answer(7, True, ""), WALL_NS)
@@ -514,14 +516,14 @@ def test_by_a_bridge_a_reply_needs_no_attachment() -> None:
 
 
 @each("payload", [b"", EMPTY[:4], EMPTY, EMPTY + bytes(3)])
-def test_a_trigger_takes_a_request_of_any_length(payload: bytes) -> None:
+def test_a_ros_trigger_accepts_a_request_of_any_length(payload: bytes) -> None:
     got = queries().serve(ros_query("srv/stop", "bridge", payload), nothing, OUTPUTS)
     assert isinstance(got, Request)
 
 
 @each("topic", ["srv/clear", "parameters/list_parameters"])
 @each("attachment", [b"", bytes(20)])
-def test_over_rmw_a_request_without_its_attachment_is_not_answered(
+def test_over_rmw_a_request_without_a_valid_attachment_is_not_answered(
     topic: str, attachment: bytes
 ) -> None:
     made = queries()
@@ -532,7 +534,7 @@ def test_over_rmw_a_request_without_its_attachment_is_not_answered(
 
 
 @pytest.mark.parametrize("via", ["bridge", "rmw"])
-def test_the_parameter_services_tell_the_configuration(via: str) -> None:
+def test_the_parameter_services_return_the_configuration(via: str) -> None:
     payload = Cdr(rcl.Names).encode(rcl.Names(["robot.id"]))
     (reply,) = reply_to(ros_query("parameters/get_parameters", via, payload))
     (value,) = Cdr(rcl.Values).decode(reply.payload).values
@@ -545,9 +547,7 @@ def test_the_parameter_services_tell_the_configuration(via: str) -> None:
 
 @each("via", ["bridge", "rmw"])
 @each("service", PARAMETER_SERVICES)
-def test_a_parameter_request_that_cannot_be_read_is_answered_by_a_refusal(
-    service: str, via: str
-) -> None:
+def test_an_unreadable_parameter_request_is_answered_with_a_refusal(service: str, via: str) -> None:
     asked = ros_query(f"parameters/{service}", via, payload=b"\x00")
     with pytest.raises(DecodeError) as caught:
         queries().serve(asked, nothing, OUTPUTS)
@@ -569,7 +569,7 @@ def test_a_parameter_request_that_cannot_be_read_is_answered_by_a_refusal(
 
 
 @pytest.mark.parametrize("service", rcl.SETTING)
-def test_a_parameter_that_is_set_twice_at_once_is_refused_with_a_result_for_each(
+def test_a_parameter_set_twice_in_a_request_is_refused_with_all_its_results(
     service: str,
 ) -> None:
     wishes = [
@@ -591,7 +591,7 @@ def test_a_parameter_that_is_set_twice_at_once_is_refused_with_a_result_for_each
         assert Cdr(rcl.SetAtomicallyReply).decode(reply.payload) == rcl.SetAtomicallyReply(no)
 
 
-def test_as_many_names_as_fit_are_answered_and_more_by_a_refusal() -> None:
+def test_a_parameter_request_with_too_many_names_is_refused() -> None:
     names = ["robot.id"] * 256
     payload = Cdr(rcl.Names).encode(rcl.Names(names))
     (reply,) = reply_to(ros_query("parameters/get_parameters", payload=payload))
@@ -605,20 +605,20 @@ def test_as_many_names_as_fit_are_answered_and_more_by_a_refusal() -> None:
 
 
 @pytest.mark.parametrize("via", ["bridge", "rmw"])
-def test_a_trigger_that_is_turned_away_hears_so(via: str) -> None:
+def test_a_rejected_ros_trigger_gets_a_reply_with_the_reason(via: str) -> None:
     reply = refused(ros_query("srv/clear", via), BUSY, WALL_NS)
     assert reply is not None
     assert (reply.ok, reply.key, reply.ticket) == (True, "srv/clear", 7)
     assert Cdr(ServiceReply).decode(reply.payload) == ServiceReply(False, BUSY)
 
 
-def test_who_asks_natively_is_turned_away_with_an_error() -> None:
+def test_a_rejected_native_query_gets_an_error_with_the_reason() -> None:
     reply = refused(query("odom"), BUSY, WALL_NS)
     assert reply is not None
     assert (reply.ok, reply.payload) == (False, BUSY.encode())
 
 
-def test_over_rmw_nobody_is_found_without_the_attachment_of_the_request() -> None:
+def test_over_rmw_a_rejected_request_without_an_attachment_gets_no_reply() -> None:
     assert refused(ros_query("srv/clear", attachment=b""), BUSY, WALL_NS) is None
 
 
@@ -630,7 +630,7 @@ def test_over_rmw_nobody_is_found_without_the_attachment_of_the_request() -> Non
         ("robot1", "/robot1/acsard/clear", "/robot1/acsard/activate"),
     ],
 )
-def test_to_ros_the_services_are_called_as_ros_calls_them(
+def test_replies_to_ros_callers_name_the_services_as_ros_does(
     via: str, namespace: str, clear: str, activate: str
 ) -> None:
     made = queries(replace(CONFIG, ros=RosConfig(namespace=namespace)))
@@ -642,7 +642,7 @@ def test_to_ros_the_services_are_called_as_ros_calls_them(
     assert told == f"call {clear} first; {activate} switches it on, not srv/clearance"
 
 
-def test_to_others_the_services_are_called_by_their_keys() -> None:
+def test_replies_to_native_callers_name_the_services_by_their_keys() -> None:
     made = queries()
     made.serve(query("srv/stop"), nothing, OUTPUTS)
     reply = made.answered(Answer(7, True, "call srv/clear first"), WALL_NS)
@@ -652,7 +652,7 @@ def test_to_others_the_services_are_called_by_their_keys() -> None:
 
 @each("via", ["bridge", "rmw"])
 @each("service", rcl.SETTING)
-def test_a_request_to_set_parameters_asks_the_robot_and_hears_its_answer(
+def test_a_request_to_set_parameters_goes_to_the_robot_and_returns_its_answer(
     service: str, via: str
 ) -> None:
     value = rcl.ParameterValue(rcl.DOUBLE, double_value=0.7)
@@ -674,7 +674,7 @@ def test_a_request_to_set_parameters_asks_the_robot_and_hears_its_answer(
     assert reply.attachment == (echo if via == "rmw" else b"")
 
 
-def test_what_is_set_is_what_config_and_parameters_tell() -> None:
+def test_config_and_the_parameter_services_return_a_changed_setting() -> None:
     made = queries()
     made.use(replace(CONFIG, limits=LimitsConfig(linear_speed=0.7)))
     (told,) = made.serve(query("config"), nothing, OUTPUTS)  # type: ignore[misc]

@@ -43,7 +43,7 @@ def test_a_speed_limit_is_read_in_every_encoding(form: Format, named: bool) -> N
     assert decode_limit(arrival(encode(FULL, form), encoding), 0.5).speed == pytest.approx(0.2)
 
 
-def test_of_json_only_the_number_is_required_and_is_in_metres_per_second() -> None:
+def test_in_json_only_the_number_is_required_and_is_in_metres_per_second() -> None:
     assert decode_limit(said(0.3), 1.0).speed == 0.3
 
 
@@ -52,13 +52,13 @@ def test_of_json_only_the_number_is_required_and_is_in_metres_per_second() -> No
     [(0.0, False, math.inf), (0.0, True, math.inf), (-0.0, False, math.inf), (100.0, True, 0.8),
      (50.0, True, 0.4), (9.0, False, 9.0), (1e-300, False, 1e-300)],
 )  # fmt: skip
-def test_zero_is_no_limit_and_a_percentage_is_of_the_configured_speed(
+def test_zero_means_no_limit_and_a_percentage_refers_to_the_configured_speed(
     value: float, percentage: bool, speed: float
 ) -> None:
     assert decode_limit(said(value, percentage=percentage), 0.8).speed == speed
 
 
-def test_the_sender_is_named() -> None:
+def test_the_sender_of_a_limit_is_named() -> None:
     by = decode_limit(arrival(encode(FULL, "cdr"), via="rmw"), 1.0).by
     assert by == f"speed_limit, unnamed (rmw {(b'g' * 16).hex()})"
 
@@ -79,7 +79,9 @@ REFUSED: dict[str, list[Arrival]] = {
 
 
 @each("reason", REFUSED)
-def test_a_message_is_refused_as_a_whole_with_its_reason(reason: str) -> None:
+def test_a_refused_message_is_reported_with_its_reason_and_keeps_the_earlier_limit(
+    reason: str,
+) -> None:
     for one in REFUSED[reason]:
         limiter, refusals = SpeedLimiter(Config()), list[Refusal]()
         limiter.receive(said(0.5), 1.0, refusals)
@@ -87,14 +89,14 @@ def test_a_message_is_refused_as_a_whole_with_its_reason(reason: str) -> None:
         limiter.receive(one, 1.0, refusals)
         assert [refusal.reason for refusal in refusals] == [reason]
         assert refusals[0].text.startswith("speed_limit: ")
-        assert limiter.requests((), 2 * PAUSE_NS) == ((), []), "the limit before stays"
+        assert limiter.requests((), 2 * PAUSE_NS) == ((), []), "the earlier limit stays"
 
 
 DAMAGE = st.lists(st.tuples(st.integers(0, 200), st.binary(max_size=8)), min_size=1, max_size=4)
 
 
 @given(st.sampled_from(FORMATS), DAMAGE, st.booleans())
-def test_a_damaged_message_is_a_limit_or_refused(
+def test_a_damaged_message_is_refused_or_gives_a_limit_of_at_least_zero(
     form: Format, damage: list[tuple[int, bytes]], named: bool
 ) -> None:
     payload = encode(FULL, form)
@@ -148,7 +150,7 @@ class Robot:
         return self.config.limits.linear_speed
 
 
-def test_a_limit_lowers_the_setting_and_its_end_brings_the_setting_back() -> None:
+def test_a_limit_lowers_the_setting_and_its_end_restores_the_setting() -> None:
     robot = Robot()
     robot.limit(0.3)
     robot.step()
@@ -171,7 +173,7 @@ def test_a_limit_above_the_setting_raises_nothing(value: float) -> None:
     assert (robot.speed, robot.limiter.text) == (1.0, "")
 
 
-def test_a_set_below_the_limit_counts_at_once_and_stays_when_the_limit_ends() -> None:
+def test_a_set_below_the_limit_applies_immediately_and_stays_when_the_limit_ends() -> None:
     robot = Robot()
     robot.limit(0.5)
     robot.step()
@@ -199,7 +201,7 @@ def test_a_set_above_the_limit_waits_for_its_end_and_the_answer_says_so() -> Non
     assert robot.speed == 0.8
 
 
-def test_the_answer_names_also_the_settings_that_need_not_wait() -> None:
+def test_the_answer_also_names_the_settings_that_apply_immediately() -> None:
     robot = Robot()
     robot.limit(0.3)
     robot.step()
@@ -218,7 +220,7 @@ def test_a_limit_and_a_higher_set_in_one_step_leave_the_limit_in_force() -> None
     assert robot.speed == 1.4
 
 
-def test_a_set_that_the_setting_behind_the_limit_contradicts_is_refused() -> None:
+def test_a_set_that_contradicts_the_setting_under_the_limit_is_refused() -> None:
     """At 0.3 m/s the deceleration would do. At 1 m/s, after the limit, it would not."""
     robot = Robot()
     robot.limit(0.3)
@@ -230,7 +232,9 @@ def test_a_set_that_the_setting_behind_the_limit_contradicts_is_refused() -> Non
 
 
 @each("wish", [{SETTING: 11.0}, {SETTING: "fast"}, {SETTING: -1.0}, {"limits.nothing": 1.0}])
-def test_a_set_that_is_not_valid_is_refused_as_without_a_limit(wish: dict[str, Plain]) -> None:
+def test_an_invalid_set_is_refused_in_the_same_way_with_and_without_a_limit(
+    wish: dict[str, Plain],
+) -> None:
     plain, limited = Robot(), Robot()
     limited.limit(0.3)
     limited.step()
@@ -238,7 +242,7 @@ def test_a_set_that_is_not_valid_is_refused_as_without_a_limit(wish: dict[str, P
     assert limited.limiter.settings.limits.linear_speed == 1.0
 
 
-def test_two_sets_of_one_step_are_obeyed_one_after_the_other() -> None:
+def test_two_sets_of_one_step_are_processed_one_after_the_other() -> None:
     """Alone each is right, but together they contradict each other once the limit ends."""
     robot = Robot()
     robot.limit(0.3)

@@ -78,7 +78,7 @@ def test_each_field_is_optional_and_the_order_is_free(fields: bytes, status: Boa
         b"!status\testop=ok", b"!status estop=ok*12", b"!status estop=ok*9c94",
     ],
 )  # fmt: skip
-def test_any_other_form_is_refused_whole(line: bytes) -> None:
+def test_a_status_line_of_any_other_form_is_refused_whole(line: bytes) -> None:
     with pytest.raises(FrameError) as caught:
         decode_status(line, False)
     assert caught.value.reason == "status_malformed"
@@ -118,7 +118,7 @@ def test_a_field_keeps_its_last_value_until_a_newer_line_has_it() -> None:
 
 
 @each("line", [OK, PRESSED, FULL, sealed(OK), sealed(FULL)])
-def test_a_status_line_is_no_reply_in_any_dialect(line: bytes) -> None:
+def test_a_status_line_is_not_a_reply_in_any_dialect(line: bytes) -> None:
     for comma in (False, True):
         with pytest.raises(FrameError):
             Codec(WheelMap(), comma).decode(line)
@@ -201,7 +201,7 @@ def wrongly_taken(count: int, check: bool) -> Counter[str]:
     "count",
     [20_000, pytest.param(1_000_000, marks=[pytest.mark.soak, pytest.mark.timeout(600)])],
 )
-def test_damage_makes_no_release_of_a_press(count: int, check: bool) -> None:
+def test_damage_never_changes_the_emergency_stop_state(count: int, check: bool) -> None:
     taken = wrongly_taken(count, check)
     print(f"\n{count} damaged status lines, checked {check}: {dict(taken)}")
     assert taken["released"] == 0
@@ -214,7 +214,7 @@ def test_damage_makes_no_release_of_a_press(count: int, check: bool) -> None:
     [20_000, pytest.param(1_000_000, marks=[pytest.mark.soak, pytest.mark.timeout(600)])],
 )
 @pytest.mark.parametrize("places", [("front", "rear", "left", "right"), ()])
-def test_damage_makes_no_release_and_no_press_of_a_bumper(
+def test_damage_never_changes_the_state_of_a_bumper(
     places: tuple[Place, ...], count: int, check: bool
 ) -> None:
     dice, extra = random.Random(34), (b"", b" volts=24.31", b" driver=ok temp=41.5")
@@ -241,8 +241,8 @@ def test_damage_makes_no_release_and_no_press_of_a_bumper(
                 bumpers.look(whole, number)
 
 
-def test_only_half_a_second_of_damage_is_a_false_press() -> None:
-    """Of each two lines one is damaged: each false press is a run of five lines, and no other."""
+def test_a_false_press_needs_half_a_second_of_damage() -> None:
+    """About half of the lines are lost. Only five lost lines in a row make a false press."""
     dice, estop = random.Random(5), EmergencyStop("auto")
     step_ns, presses, runs, last_ns = NS_PER_S // 100, 0, 0, 0
     for step in range(200_000):

@@ -51,10 +51,12 @@ def drive(seed: int, seconds: float, model: Model, robots: int) -> Array:
 @pytest.mark.parametrize(
     ("model", "least"), [(WHEELS, 2.7), (DEFAULT, 2.85)], ids=["wheels", "default"]
 )
-def test_after_bursts_the_covariance_tells_the_truth(model: Model, least: float) -> None:
-    """The bursts cause most of the error and are overrated a little.
+def test_after_bursts_of_lost_lines_the_covariance_is_consistent(
+    model: Model, least: float
+) -> None:
+    """The wheels err by 3 mm per metre, so the bursts cause most of the error.
 
-    This is for wheels that err by 3 mm per metre.
+    The covariance overestimates the error of the bursts a little.
     """
     values = np.concatenate([drive(seed, 90.0, model, 10) for seed in range(100)])
     inside = float((values < REGION).mean())

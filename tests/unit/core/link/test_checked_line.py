@@ -38,7 +38,7 @@ def reason(line: bytes) -> str:
     return caught.value.reason
 
 
-def test_the_crc_is_the_one_of_its_catalogue() -> None:
+def test_the_crc_matches_the_check_value_of_its_catalogue() -> None:
     assert crc(b"123456789") == 0x31C3
     assert seal(b"123456789\r\n", 0)[:12] == b"123456789#00"
 
@@ -47,7 +47,7 @@ def test_the_crc_is_the_one_of_its_catalogue() -> None:
     ("sequence", "letters", "suffix"),
     [(0, b"", b"#00"), (7, b"", b"#07"), (255, b"S", b"#FFS"), (171, b"S", b"#ABS")],
 )
-def test_a_sealed_command_is_the_line_the_suffix_and_its_check(
+def test_a_sealed_command_is_the_line_followed_by_its_suffix_and_check(
     sequence: int, letters: bytes, suffix: bytes
 ) -> None:
     assert seal(PLAIN, sequence, letters) == closed(SEED_LINE + suffix) + b"\r\n"
@@ -66,7 +66,7 @@ def test_the_example_of_the_protocol_is_right() -> None:
     assert unseal(REPLY) == Checked(SEED_LINE, 7, None)
 
 
-def test_a_sampled_reply_says_milliseconds_and_four_counts() -> None:
+def test_a_sampled_reply_contains_milliseconds_and_four_counts() -> None:
     line = closed(SAMPLE[:-5])
     assert len(line) + 2 == 62 < MAX_LINE
     reading = Reading(0x0FA0, (0x0001, 0xFFFF, 0x8000, 0x7FFF))
@@ -74,7 +74,7 @@ def test_a_sampled_reply_says_milliseconds_and_four_counts() -> None:
 
 
 @given(sequence=st.integers(0, 255), text=st.text("abcdnp0123456789., ", max_size=60))
-def test_what_was_sealed_is_unsealed(sequence: int, text: str) -> None:
+def test_unsealing_returns_the_sealed_line(sequence: int, text: str) -> None:
     sealed = seal(text.encode() + b"\r\n", sequence)
     assert unseal(sealed.removesuffix(b"\r\n")) == Checked(text.encode(), sequence, None)
 

@@ -62,7 +62,7 @@ def drive(counts: int, seed: int, seconds: float, configured: int = 0) -> Driven
 
 @pytest.mark.slow
 @pytest.mark.parametrize("counts", COUNTS)
-def test_no_true_line_is_dropped_and_half_a_minute_ends_where_the_lines_say(counts: int) -> None:
+def test_no_true_line_is_dropped_and_a_short_drive_ends_where_the_reports_say(counts: int) -> None:
     one = drive(counts, 1, 25.0)
     assert one.dropped == 0
     assert one.ours == pytest.approx(one.plain, abs=0.004)
@@ -70,7 +70,9 @@ def test_no_true_line_is_dropped_and_half_a_minute_ends_where_the_lines_say(coun
 
 @pytest.mark.variations(8)
 @pytest.mark.parametrize("counts", COUNTS + FINER)
-def test_with_configured_counts_a_minute_ends_exactly_where_the_counter_says(counts: int) -> None:
+def test_with_configured_counts_a_drive_ends_exactly_where_the_raw_counter_says(
+    counts: int,
+) -> None:
     one = drive(counts, 2, 60.0, counts)
     assert one.dropped == 0
     assert one.ours == pytest.approx(one.raw, abs=0.0002)
@@ -80,7 +82,7 @@ def test_with_configured_counts_a_minute_ends_exactly_where_the_counter_says(cou
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("counts", COUNTS + FINER)
 @pytest.mark.parametrize("configured", [False, True], ids=["", "configured"])
-def test_450_m_end_as_far_off_as_the_raw_counter_does(counts: int, configured: bool) -> None:
+def test_the_error_after_450_m_is_that_of_the_raw_counter(counts: int, configured: bool) -> None:
     """Without the setting, two decimals of a board with a fixed period cost 1 m more at most."""
     drives = [drive(counts, seed, 600.0, counts if configured else 0) for seed in range(20)]
     raw, plain, ours = (
@@ -110,7 +112,7 @@ def heard(rows: Array, feedback: FeedbackConfig | None = None) -> Host:
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("counts", [16, 20, 40, 96])
 @pytest.mark.parametrize("acceleration", [100.0, 1500.0])
-def test_no_line_is_dropped_of_a_firmware_that_divides_by_the_time_it_measured(
+def test_no_line_of_a_firmware_that_divides_by_its_measured_time_is_dropped(
     counts: int, acceleration: float
 ) -> None:
     wheels, dice = angles(np.random.default_rng(2), 25.0), np.random.default_rng(1)
@@ -124,7 +126,7 @@ def test_no_line_is_dropped_of_a_firmware_that_divides_by_the_time_it_measured(
 @pytest.mark.variations(9)
 @pytest.mark.parametrize("counts", [16, 20, 40, 96])
 @pytest.mark.parametrize("share", [0.3, 0.5, 0.7, 0.9])
-def test_no_line_is_dropped_of_a_firmware_that_filters(counts: int, share: float) -> None:
+def test_no_line_of_a_firmware_that_filters_is_dropped(counts: int, share: float) -> None:
     wheels, speed, rows = angles(np.random.default_rng(3), 25.0), np.zeros(4), []
     for row in counted(wheels, counts) * math.tau / counts / PERIOD:
         speed = speed + share * (row - speed)
@@ -149,11 +151,11 @@ def wild(wheels: int, seed: int) -> Host:
     return host
 
 
-def test_a_wheel_that_jumps_at_random_is_found_out_by_the_steps_of_the_others() -> None:
+def test_a_wheel_that_jumps_at_random_is_suspected_because_the_other_wheels_step_finely() -> None:
     found = sorted(wild(1, seed).lines for seed in range(7))
     assert found[3] <= 60
 
 
-def test_two_wheels_that_jump_at_random_are_believed_as_the_reference_says() -> None:
+def test_two_wheels_that_jump_at_random_are_not_suspected() -> None:
     """They could equally be two coarse encoders among fine ones."""
     assert not wild(2, 1).sanity.doubtful

@@ -60,7 +60,7 @@ def codec() -> Codec:
 # writing
 
 
-def test_the_seed_line_is_written_to_the_byte(codec: Codec) -> None:
+def test_the_seed_line_is_written_byte_for_byte(codec: Codec) -> None:
     line = codec.encode(SEED_SPEEDS)
     assert line == b"ap12.50,bn08.75,cp15.00,dn10.25\r\n"
     assert len(line) == 33
@@ -71,7 +71,7 @@ def test_a_trailing_comma_goes_before_the_end_of_the_line() -> None:
     assert line == b"ap12.50,bn08.75,cp15.00,dn10.25,\r\n"
 
 
-def test_the_stop_line_says_plus_zero_on_all_wheels() -> None:
+def test_the_stop_line_has_plus_zero_for_each_wheel() -> None:
     assert Codec(WheelMap()).stop == ZERO + b"\r\n"
     assert Codec(WheelMap(), trailing_comma=True).stop == ZERO + b",\r\n"
     assert Codec(wheel_map("----", "dcba")).stop == ZERO + b"\r\n"
@@ -106,7 +106,7 @@ def test_a_speed_is_clamped_rounded_and_padded(codec: Codec, speed: float, token
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("name", ["front_right", "front_left", "rear_left", "rear_right"])
-def test_a_speed_that_is_not_finite_is_a_bug_of_the_caller(
+def test_a_speed_that_is_not_finite_raises_a_value_error(
     codec: Codec, name: str, bad: float
 ) -> None:
     with pytest.raises(ValueError, match="not finite"):
@@ -156,7 +156,7 @@ def test_a_line_is_refused_whole_and_for_its_reason(codec: Codec, line: bytes, r
     assert caught.value.reason == reason
 
 
-def test_a_refusal_tells_its_reason_and_the_beginning_of_the_line(codec: Codec) -> None:
+def test_a_refusal_contains_its_reason_and_the_beginning_of_the_line(codec: Codec) -> None:
     with pytest.raises(FrameError) as caught:
         codec.decode(b"x" * 70)
     assert str(caught.value) == f"malformed: {b'x' * 60!r}"
@@ -192,14 +192,14 @@ def test_signs_are_applied_when_reading() -> None:
     assert codec.decode(SEED_LINE).as_tuple() == (-12.5, -8.75, -15.0, -10.25)
 
 
-def test_letters_are_placed_when_writing_and_reading() -> None:
+def test_motor_letters_are_mapped_to_wheels_when_writing_and_reading() -> None:
     codec = Codec(wheel_map("++++", "dcba"))
     assert codec.encode(SEED_SPEEDS) == b"an10.25,bp15.00,cn08.75,dp12.50\r\n"
     assert codec.decode(SEED_LINE).as_tuple() == SEED_MOTORS[::-1]
 
 
 @given(wheels=small_speeds, wiring=wirings, trailing_comma=st.booleans())
-def test_what_is_written_is_read_back_within_half_a_hundredth(
+def test_a_written_speed_is_read_back_within_half_a_hundredth(
     wheels: WheelSpeeds, wiring: WheelMap, trailing_comma: bool
 ) -> None:
     codec = Codec(wiring, trailing_comma)
@@ -209,7 +209,9 @@ def test_what_is_written_is_read_back_within_half_a_hundredth(
 
 
 @given(wheels=small_speeds, wiring=wirings)
-def test_what_was_read_back_is_written_as_it_was(wheels: WheelSpeeds, wiring: WheelMap) -> None:
+def test_a_line_that_was_read_back_is_written_identically(
+    wheels: WheelSpeeds, wiring: WheelMap
+) -> None:
     codec = Codec(wiring)
     line = codec.encode(wheels)
     assert codec.encode(codec.decode(line.removesuffix(b"\r\n"))) == line
@@ -248,12 +250,12 @@ def independent(line: bytes) -> Motors | None:
 
 
 @each(("line", "motors"), ACCEPTED)
-def test_the_independent_reader_accepts_what_is_accepted(line: bytes, motors: Motors) -> None:
+def test_the_independent_reader_accepts_every_accepted_line(line: bytes, motors: Motors) -> None:
     assert independent(line) == motors
 
 
 @each("line", [line for line, _ in REFUSED])
-def test_the_independent_reader_refuses_what_is_refused(line: bytes) -> None:
+def test_the_independent_reader_refuses_every_refused_line(line: bytes) -> None:
     assert independent(line) is None
 
 
@@ -339,13 +341,15 @@ def test_a_damaged_line_is_rejected_whole_or_is_itself_a_well_formed_line(count:
     assert all(seen.values()), seen
 
 
-def test_what_the_motors_did_is_put_in_the_wheels_order_with_their_signs() -> None:
+def test_motor_values_are_put_in_the_order_of_the_wheels_with_their_signs() -> None:
     codec = Codec(WheelMap("-d", "+c", "-b", "+a"))
     assert codec.wheels((1.0, 2.0, 3.0, 4.0)) == (-4.0, 3.0, -2.0, 1.0)
 
 
 @given(wiring=wirings, motors=st.tuples(*[st.floats(0.0, 99.0)] * 4))
-def test_motors_become_wheels_as_a_line_of_theirs_does(wiring: WheelMap, motors: Motors) -> None:
+def test_motor_values_map_to_wheels_in_the_same_way_as_a_line(
+    wiring: WheelMap, motors: Motors
+) -> None:
     rounded = tuple(round(motor, 2) for motor in motors)
     tokens = zip("abcd", rounded, strict=True)
     line = ",".join(f"{letter}p{speed:05.2f}" for letter, speed in tokens).encode()

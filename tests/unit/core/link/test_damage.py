@@ -72,7 +72,7 @@ def hurt(kind: int, line: bytes, after: bytes, chance: float, place: int) -> byt
     "count",
     [100_000, pytest.param(10_000_000, marks=[pytest.mark.soak, pytest.mark.timeout(1800)])],
 )
-def test_damage_raises_nothing_and_is_accepted_as_rarely_as_a_plain_line_allows(count: int) -> None:
+def test_damage_raises_no_exception_and_is_rarely_accepted(count: int) -> None:
     rng, codec, began = random.Random(4), Codec(WheelMap()), time.perf_counter()
     lines = drive(rng, 5000)
     truth = [codec.decode(line[:-2]) for line in lines]
@@ -115,7 +115,7 @@ def plausible(
     return not sanity.impossible(Feedback(AT, speeds, 0.01, steps=steps))
 
 
-def test_the_slew_check_itself_tells_a_leap_from_a_step() -> None:
+def test_the_slew_check_distinguishes_a_leap_from_a_step() -> None:
     sanity = Sanity(FeedbackConfig())
     assert plausible(sanity, STILL, WheelSpeeds(5.0, 5.0, 5.0, 5.0))
     assert not plausible(sanity, STILL, WheelSpeeds(0.0, 40.0, 0.0, 0.0))
@@ -147,7 +147,7 @@ def live(lines: list[bytes], every: int) -> tuple[int, int, int]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("every", [50, 1000])
-def test_what_is_learned_of_fine_encoders_lets_hardly_more_damage_pass(every: int) -> None:
+def test_learned_steps_of_fine_encoders_let_hardly_more_damage_pass(every: int) -> None:
     lines = drive(random.Random(6), 20_000)
     wrong = passed = would = 0
     for start in range(1 if every == 50 else 4):

@@ -56,19 +56,19 @@ def test_twenty_equal_reports_through_a_change_of_speed_are_an_echo() -> None:
     assert bench.exchange(5.0)
 
 
-def test_a_change_alone_does_not_make_an_echo_before_there_are_twenty() -> None:
+def test_fewer_than_twenty_equal_reports_are_not_an_echo_despite_speed_changes() -> None:
     bench = Echoes()
     found = [bench.exchange(speed) for speed in (0, *range(REPORTS - 1))]
     assert found == [False] * (REPORTS - 1) + [True]
 
 
 @pytest.mark.parametrize("speed", [0.0, 10.0])
-def test_without_a_change_of_speed_nothing_is_an_echo(speed: float) -> None:
+def test_without_a_change_of_speed_no_report_is_an_echo(speed: float) -> None:
     bench = Echoes()
     assert not any(bench.exchange(speed) for _ in range(1000))
 
 
-def test_small_changes_count_by_their_sum() -> None:
+def test_small_speed_changes_add_up_to_an_echo() -> None:
     bench = Echoes()
     found = [bench.exchange(step % 2 * 0.5) for step in range(40)]
     assert found.index(True) == REPORTS - 1
@@ -77,7 +77,7 @@ def test_small_changes_count_by_their_sum() -> None:
     assert found.index(True) in (40, 41)  # 40 changes of 0.05 rad/s, with float rounding
 
 
-def test_one_report_that_differs_begins_the_run_anew() -> None:
+def test_a_differing_report_restarts_the_count_of_equal_reports() -> None:
     bench = Echoes()
     for speed in range(REPORTS - 1):
         assert not bench.exchange(speed)
@@ -87,14 +87,14 @@ def test_one_report_that_differs_begins_the_run_anew() -> None:
 
 
 @each("lag", range(LINES))
-def test_an_echo_is_found_however_many_lines_later_it_comes(lag: int) -> None:
+def test_an_echo_is_found_at_every_lag_of_the_kept_lines(lag: int) -> None:
     bench = Echoes()
     found = [bench.exchange(step // 7 % 40 * 0.5, lag=lag) for step in range(200)]
     assert any(found)
     assert found.index(True) < 40 + lag
 
 
-def test_an_echo_that_comes_in_batches_is_found() -> None:
+def test_an_echo_that_arrives_in_batches_is_found() -> None:
     bench = Echoes()
     found = []
     for step in range(0, 60, 2):
@@ -110,7 +110,7 @@ DRIVE = [*[0.0] * 30, *[0.2 * n for n in range(50)]]
 
 @each("others", [1, 2])
 @each("late", [0, 3])
-def test_an_echo_is_found_as_soon_if_the_replies_of_a_board_come_between(
+def test_board_replies_between_the_echoes_do_not_delay_the_detection(
     others: int, late: int
 ) -> None:
     bench = Echoes()
@@ -123,7 +123,7 @@ def test_an_echo_is_found_as_soon_if_the_replies_of_a_board_come_between(
     assert number - late - 30 == 10  # lines after the start of the ramp: 10 changes of 0.2 rad/s
 
 
-def test_an_echo_is_found_as_soon_if_a_board_reports_now_and_then() -> None:
+def test_occasional_board_reports_do_not_delay_the_detection() -> None:
     bench = Echoes()
     for number, speed in enumerate(DRIVE):
         if number % 10 == 7:
@@ -145,7 +145,7 @@ def test_a_steady_ramp_shows_no_echo() -> None:
 @each("acceleration", [3.0, 5.0, 20.0, 400.0])
 @each("lag", [1, 2, 3, 7])
 @each("reports", [1, 2, 3])
-def test_a_motor_that_lags_by_a_whole_number_of_lines_is_no_echo(
+def test_a_motor_that_lags_by_a_whole_number_of_lines_is_not_an_echo(
     acceleration: float, lag: int, reports: int
 ) -> None:
     """The board measures exactly, over the time since its last report."""
@@ -162,7 +162,7 @@ def test_a_motor_that_lags_by_a_whole_number_of_lines_is_no_echo(
 
 
 @each("others", [1, 2, 3])
-def test_a_motor_that_reaches_a_new_speed_within_some_reports_is_no_echo(others: int) -> None:
+def test_a_motor_that_reaches_a_new_speed_within_some_reports_is_not_an_echo(others: int) -> None:
     bench = Echoes()
     for number in range(400):
         speed, before = number // 40 % 2 * 6.0, (number // 40 + 1) % 2 * 6.0
@@ -170,12 +170,12 @@ def test_a_motor_that_reaches_a_new_speed_within_some_reports_is_no_echo(others:
         assert not bench.exchange(speed, before + (speed - before) * min(1.0, share))
 
 
-def test_a_report_older_than_the_lines_that_are_kept_is_no_echo() -> None:
+def test_a_report_that_equals_a_line_older_than_the_kept_ones_is_not_an_echo() -> None:
     bench = Echoes()
     assert not any(bench.exchange(step // 7 % 40 * 0.5, lag=LINES) for step in range(2000))
 
 
-def test_reports_at_another_pace_than_the_lines_are_no_echo() -> None:
+def test_reports_at_another_rate_than_the_lines_are_not_an_echo() -> None:
     bench = Echoes()
     for step in range(2000):
         bench.send(step // 2 % 40)
@@ -183,7 +183,7 @@ def test_reports_at_another_pace_than_the_lines_are_no_echo() -> None:
             assert not bench.report(step // 2 % 40)
 
 
-def test_the_mean_of_two_lines_is_no_echo() -> None:
+def test_the_mean_of_two_lines_is_not_an_echo() -> None:
     bench, before = Echoes(), 0.0
     for step in range(2000):
         speed = step // 7 % 40 * 0.5
@@ -191,7 +191,7 @@ def test_the_mean_of_two_lines_is_no_echo() -> None:
         before = speed
 
 
-def test_an_opening_begins_anew() -> None:
+def test_forgetting_restarts_the_count_of_equal_reports() -> None:
     bench = Echoes()
     for speed in range(REPORTS - 1):
         assert not bench.exchange(speed)
@@ -201,7 +201,7 @@ def test_an_opening_begins_anew() -> None:
 
 
 @given(st.lists(st.tuples(st.floats(-40, 40), st.floats(-3, 3)), min_size=1, max_size=200))
-def test_what_a_board_measures_is_no_echo(lines: list[tuple[float, float]]) -> None:
+def test_measured_speeds_are_not_an_echo(lines: list[tuple[float, float]]) -> None:
     bench = Echoes()
     for sent, error in lines:
         wrong = sent + (error if abs(error) > 0.02 else 0.02)

@@ -55,7 +55,7 @@ def turned(*counts: int, dt: float = 0.01) -> Turned:
     return Turned((a, b, c, d), dt)
 
 
-def test_the_first_reading_tells_nothing() -> None:
+def test_the_first_reading_gives_no_movement() -> None:
     assert Bench().read() == "unknown"
 
 
@@ -68,7 +68,7 @@ def test_a_whole_turn_is_2_pi_of_the_configured_counts() -> None:
     assert found.dt == 0.2
 
 
-def test_counts_and_milliseconds_go_on_over_their_wrap(bench: Bench) -> None:
+def test_movement_is_exact_across_a_wrap_of_counts_and_milliseconds(bench: Bench) -> None:
     for _ in range(2000):  # 20 s, in which the clock wraps once and the counts wrap eight times
         assert bench.read(10, (300, -300, 300, -300)) == turned(300, -300, 300, -300)
 
@@ -78,7 +78,7 @@ def test_counts_and_milliseconds_go_on_over_their_wrap(bench: Bench) -> None:
         st.tuples(st.integers(1, 400), st.floats(-1.0, 1.0), st.floats(0.0, 300.0)), max_size=40
     )
 )
-def test_what_is_told_adds_up_to_all_that_was_counted(
+def test_the_returned_angles_add_up_to_all_counts(
     steps: list[tuple[int, float, float]],
 ) -> None:
     bench = Bench()
@@ -101,22 +101,24 @@ def test_what_is_told_adds_up_to_all_that_was_counted(
 
 
 @pytest.mark.parametrize("host_ms", [0.0, 5.4, 10.0, 50.0, 700.0])
-def test_when_the_host_read_the_line_bends_nothing(bench: Bench, host_ms: float) -> None:
+def test_the_time_of_the_hosts_read_does_not_change_the_movement(
+    bench: Bench, host_ms: float
+) -> None:
     assert bench.read(10, (50, 50, 50, 50), host_ms) == turned(50, 50, 50, 50)
 
 
-def test_the_same_reading_again_is_no_movement(bench: Bench) -> None:
+def test_a_repeated_reading_is_no_movement(bench: Bench) -> None:
     bench.read(10, (50, 50, 50, 50))
     assert bench.read(0, host_ms=3.0) == turned(0, 0, 0, 0, dt=0.0)
 
 
-def test_a_gap_in_which_a_count_cannot_have_wrapped_is_bridged(bench: Bench) -> None:
+def test_a_gap_in_which_no_count_can_have_wrapped_is_filled(bench: Bench) -> None:
     ms = int(WRAP_MS) - 4
     assert bench.read(ms, (-900, 0, 0, 900)) == turned(-900, 0, 0, 900, dt=ms / 1000)
 
 
 @pytest.mark.parametrize(("mcu_ms", "host_ms"), [(810, 810), (10, 810), (810, 780), (9000, 9000)])
-def test_a_gap_in_which_a_count_could_have_wrapped_tells_nothing(
+def test_after_a_gap_in_which_a_count_could_have_wrapped_the_movement_is_unknown(
     bench: Bench, mcu_ms: float, host_ms: float
 ) -> None:
     assert bench.read(mcu_ms, (1, 1, 1, 1), host_ms) == "unknown"
@@ -125,7 +127,9 @@ def test_a_gap_in_which_a_count_could_have_wrapped_tells_nothing(
 
 @pytest.mark.parametrize("motor", range(4))
 @pytest.mark.parametrize("sign", [1, -1])
-def test_further_than_a_motor_can_turn_is_a_leap(bench: Bench, motor: int, sign: int) -> None:
+def test_a_movement_beyond_the_fastest_motor_speed_is_a_leap(
+    bench: Bench, motor: int, sign: int
+) -> None:
     # two ms of rounding and four counts of play
     most = int(FASTEST / math.tau * COUNTS * 0.012) + 4
     moved = [0] * 4
@@ -142,7 +146,7 @@ def test_a_clock_that_went_back_is_a_restart(bench: Bench) -> None:
     assert bench.read(10, (5, 5, 5, 5)) == turned(5, 5, 5, 5)
 
 
-def test_a_clock_that_leaps_ahead_of_the_hosts_is_a_restart(bench: Bench) -> None:
+def test_an_mcu_clock_that_leaps_ahead_of_the_hosts_clock_is_a_restart(bench: Bench) -> None:
     assert bench.read(111, host_ms=10.0) == "restarted"
     assert isinstance(bench.read(109, host_ms=10.0), Turned)
 
@@ -156,7 +160,7 @@ def test_a_reading_read_late_does_not_make_the_next_one_a_restart(bench: Bench) 
     assert bench.read(3, host_ms=10.0) == "restarted"
 
 
-def test_minutes_without_a_reading_hide_no_later_restart(bench: Bench) -> None:
+def test_a_restart_is_detected_after_minutes_without_a_reading(bench: Bench) -> None:
     assert bench.read(200_000) == "unknown"
     assert bench.read(10, (5, 5, 5, 5)) == turned(5, 5, 5, 5)
     bench.mcu_ms = 0.0
@@ -164,14 +168,16 @@ def test_minutes_without_a_reading_hide_no_later_restart(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("drift", [0.995, 1.005])
-def test_clocks_that_go_apart_are_no_restart_and_hide_none(bench: Bench, drift: float) -> None:
+def test_a_drifting_clock_is_not_a_restart_and_hides_no_later_restart(
+    bench: Bench, drift: float
+) -> None:
     for _ in range(5000):
         assert isinstance(bench.read(10, host_ms=10 * drift), Turned)
     assert bench.read(125, host_ms=10.0) == "restarted"
 
 
 @given(old_ms=st.integers(0, 65535), since_ms=st.integers(0, 90), host_ms=st.integers(1, 100))
-def test_of_restarts_at_any_time_hardly_one_is_missed(
+def test_a_restart_is_missed_only_if_the_mcu_clock_happens_to_match(
     old_ms: int, since_ms: int, host_ms: int
 ) -> None:
     encoders = Encoders(COUNTS, FASTEST, 100 * MS)
@@ -181,7 +187,7 @@ def test_of_restarts_at_any_time_hardly_one_is_missed(
     assert (found == "restarted") is not missed
 
 
-def test_after_forgetting_the_next_reading_is_a_first_one(bench: Bench) -> None:
+def test_after_forgetting_the_next_reading_counts_as_the_first(bench: Bench) -> None:
     bench.encoders.forget()
     assert bench.read(10, (50, 50, 50, 50)) == "unknown"
     assert bench.read(10, (50, 50, 50, 50)) == turned(50, 50, 50, 50)

@@ -52,7 +52,7 @@ class Bench:
         return self.timeline.place(SPEEDS, reading, following, LENGTH, gap)
 
 
-def test_the_first_line_has_a_time_and_nothing_before_it() -> None:
+def test_the_first_line_has_a_time_but_neither_dt_nor_gap() -> None:
     bench = Bench()
     found = bench.line()
     made_ns = bench.now_ns - WIRE_NS
@@ -60,19 +60,19 @@ def test_the_first_line_has_a_time_and_nothing_before_it() -> None:
     assert (found.speeds, found.dt, found.gap, found.heard_ns) == (SPEEDS, 0.0, 0.0, bench.now_ns)
 
 
-def test_bytes_behind_a_line_make_it_older() -> None:
+def test_bytes_that_follow_a_line_make_it_older() -> None:
     bench = Bench()
     assert bench.line(following=12).at.mono_ns == bench.now_ns - 1_041_666 - WIRE_NS
 
 
-def test_without_counts_dt_is_the_hosts() -> None:
+def test_without_counts_dt_comes_from_the_hosts_clock() -> None:
     bench = Bench()
     bench.line()
     found = bench.line(ms=12)
     assert (found.dt, found.turned) == (0.012, None)
 
 
-def test_with_counts_dt_is_the_mcus_and_the_wheels_turned_as_counted() -> None:
+def test_with_counts_dt_comes_from_the_mcu_and_the_angles_come_from_the_counts() -> None:
     bench = Bench()
     bench.line(0, 0, 0, 0)
     found = bench.line(10, -20, 30, 0, ms=17, mcu_ms=10)
@@ -80,7 +80,7 @@ def test_with_counts_dt_is_the_mcus_and_the_wheels_turned_as_counted() -> None:
     assert found.turned == pytest.approx((DEGREE, -2 * DEGREE, 3 * DEGREE, 0.0))
 
 
-def test_the_wiring_says_whose_counts_they_are_and_which_way() -> None:
+def test_the_wheel_map_assigns_counts_and_signs_to_the_wheels() -> None:
     bench = Bench(WheelMap("-d", "+c", "-b", "+a"))
     bench.line(0, 0, 0, 0)
     found = bench.line(10, 20, 30, 40)
@@ -94,7 +94,7 @@ def test_the_first_counts_fall_back_to_speed_times_time() -> None:
     assert (found.dt, found.turned) == (0.01, None)
 
 
-def test_lines_without_counts_end_what_was_compared() -> None:
+def test_counts_are_not_compared_across_a_line_without_counts() -> None:
     bench = Bench()
     bench.line(0, 0, 0, 0)
     bench.line()
@@ -102,7 +102,7 @@ def test_lines_without_counts_end_what_was_compared() -> None:
     assert bench.line(20, 20, 20, 20).turned == pytest.approx((DEGREE,) * 4)
 
 
-def test_counts_bridge_a_gap_that_is_short_enough() -> None:
+def test_counts_fill_a_gap_that_is_short_enough() -> None:
     bench = Bench()
     bench.line(0, 0, 0, 0)
     found = bench.line(100, 100, 100, 100, ms=300, gap=True)
@@ -110,7 +110,7 @@ def test_counts_bridge_a_gap_that_is_short_enough() -> None:
     assert found.turned == pytest.approx((10 * DEGREE,) * 4)
 
 
-def test_counts_bridge_no_gap_in_which_they_could_have_wrapped() -> None:
+def test_counts_do_not_fill_a_gap_in_which_they_could_have_wrapped() -> None:
     bench = Bench()
     bench.line(0, 0, 0, 0)
     found = bench.line(100, 100, 100, 100, ms=3000, gap=True)
@@ -128,7 +128,7 @@ def test_a_restarted_clock_is_reported_and_is_a_gap() -> None:
     assert not bench.timeline.restarted
 
 
-def test_a_leap_is_counted_and_the_speeds_stand_in() -> None:
+def test_after_a_leap_of_the_counts_the_speeds_are_used_and_the_leap_is_counted() -> None:
     bench = Bench()
     bench.line(0, 0, 0, 0)
     found = bench.line(9000, 0, 0, 0)
@@ -136,14 +136,14 @@ def test_a_leap_is_counted_and_the_speeds_stand_in() -> None:
     assert (bench.timeline.leaps, bench.timeline.restarted) == (1, False)
 
 
-def test_after_forgetting_the_counts_begin_anew() -> None:
+def test_after_forgetting_no_angle_comes_from_the_first_counts() -> None:
     bench = Bench()
     bench.line(0, 0, 0, 0)
     bench.timeline.forget()
     assert bench.line(10, 10, 10, 10).turned is None
 
 
-def test_counts_nobody_configured_are_left_alone() -> None:
+def test_counts_are_ignored_unless_they_are_configured() -> None:
     bench = Bench(counts=0)
     bench.line(0, 0, 0, 0)
     assert bench.line(10, 10, 10, 10).turned is None
@@ -175,20 +175,20 @@ def read(bench: Bench, ms: float, lines: int, silent: bool = False) -> list[Feed
 
 
 @pytest.mark.parametrize("lines", [5, 15, 25, 28])
-def test_lines_that_lay_in_the_kernel_have_a_slot_each(lines: int) -> None:
+def test_each_line_that_waited_in_the_kernel_has_its_own_slot(lines: int) -> None:
     bench = reporting(Bench(counts=0))
     found = read(bench, lines * 10, lines, silent=True)
     assert [(f.dt, f.gap, f.bridged) for f in found] == [(0.01, 0.0, 0.0)] * lines
 
 
-def test_what_the_wheels_are_judged_by_is_the_time_that_passed_here() -> None:
+def test_the_time_between_arrivals_is_kept_for_the_wheel_checks() -> None:
     bench = reporting(Bench(counts=0))
     found = read(bench, 250, 25, silent=True)
     assert found[0].since == 0.0
     assert sum(f.since for f in found[1:]) == pytest.approx(24 * WIRE_NS / 1e9)
 
 
-def test_stamps_of_lines_that_lay_in_the_kernel_are_a_period_apart() -> None:
+def test_stamps_of_lines_that_waited_in_the_kernel_are_a_period_apart() -> None:
     bench = reporting(Bench(counts=0))
     found = read(bench, 250, 25, silent=True)
     stamps = [f.at.mono_ns for f in found]
@@ -207,7 +207,7 @@ def test_missing_lines_are_filled_and_are_not_a_gap() -> None:
     assert found.bridged == pytest.approx(0.3)
 
 
-def test_what_is_missing_for_a_second_is_a_gap() -> None:
+def test_lines_missing_for_a_second_are_a_gap() -> None:
     bench = reporting(Bench(counts=0))
     found = bench.line(ms=1200, gap=True)
     assert (found.dt, found.bridged) == (0.0, 0.0)
@@ -215,7 +215,7 @@ def test_what_is_missing_for_a_second_is_a_gap() -> None:
     assert bench.line().dt == 0.01
 
 
-def test_lines_of_a_backlog_with_missing_lines_are_as_far_apart_as_their_stamps() -> None:
+def test_in_a_backlog_with_missing_lines_each_dt_is_the_distance_of_the_stamps() -> None:
     bench = reporting(Bench(counts=0))
     for ms in range(0, 390, 10):
         bench.timeline.left(bench.now_ns + ms * MS)
@@ -234,7 +234,7 @@ def test_a_backlog_whose_missing_lines_last_for_a_second_begins_with_a_gap() -> 
     assert first.gap == pytest.approx(1.49, abs=0.01)
 
 
-def test_a_line_that_is_none_was_one_when_it_was_made() -> None:
+def test_a_spoilt_line_still_occupies_its_slot() -> None:
     bench = reporting(Bench(counts=0))
     bench.now_ns += 10 * MS
     bench.timeline.read(Instant(bench.now_ns, bench.now_ns), LENGTH, 1, 0)
@@ -244,7 +244,7 @@ def test_a_line_that_is_none_was_one_when_it_was_made() -> None:
 
 
 @pytest.mark.parametrize("ignored", [0, 3])
-def test_a_first_reply_by_the_clock_of_the_commands_fills_what_ignored_replies_reported(
+def test_the_first_prompted_reply_fills_the_time_of_the_ignored_replies(
     ignored: int,
 ) -> None:
     bench = Bench(counts=0)
@@ -261,7 +261,7 @@ def test_a_first_reply_by_the_clock_of_the_commands_fills_what_ignored_replies_r
     assert found.bridged == pytest.approx(0.2 if ignored else 0.0, abs=0.002)
 
 
-def test_without_a_period_lines_of_a_read_share_the_time_since_the_last() -> None:
+def test_without_a_period_the_lines_of_a_read_share_the_time_since_the_last_read() -> None:
     bench = Bench(counts=0)
     bench.line()
     found = read(bench, 60, 3)
@@ -271,7 +271,7 @@ def test_without_a_period_lines_of_a_read_share_the_time_since_the_last() -> Non
     assert stamps[-1] == bench.now_ns - WIRE_NS
 
 
-def test_a_new_session_begins_without_the_old_ones_clock() -> None:
+def test_a_new_session_forgets_the_clock_of_the_old_session() -> None:
     bench = reporting(Bench(counts=0))
     bench.timeline.forget()
     assert bench.line(ms=20).gap == pytest.approx(0.02)
@@ -279,7 +279,7 @@ def test_a_new_session_begins_without_the_old_ones_clock() -> None:
 
 
 @pytest.mark.parametrize("period", [20, 50])
-def test_another_rate_than_ours_has_its_own_period(period: int) -> None:
+def test_a_board_with_its_own_rate_has_its_own_period(period: int) -> None:
     bench = Bench(counts=0)
     for _ in range(80):
         bench.line(ms=period)
@@ -303,7 +303,7 @@ def prompted(bench: Bench, lines: int = 60) -> Bench:
     return bench
 
 
-def test_an_answer_is_as_far_from_the_last_as_their_lines() -> None:
+def test_the_dt_of_an_answer_is_the_time_between_the_prompting_lines() -> None:
     bench = prompted(Bench(counts=0), 80)
     bench.timeline.left(bench.now_ns + 202 * MS)
     found = bench.line(ms=210, gap=True)
@@ -311,7 +311,7 @@ def test_an_answer_is_as_far_from_the_last_as_their_lines() -> None:
     assert (found.gap, found.bridged) == (0.0, 0.0)
 
 
-def test_an_answer_that_says_its_line_is_as_far_from_the_last_as_that() -> None:
+def test_the_dt_of_an_answer_that_names_its_line_is_that_of_the_named_lines() -> None:
     bench = Bench(counts=0)
     for number, ms in enumerate((0, 10, 20, 37)):
         bench.timeline.left(10**9 + ms * MS)
@@ -340,7 +340,7 @@ def test_a_stall_counts_once_if_replies_name_their_line_and_many_are_lost() -> N
             assert total == pytest.approx((left_ns - began_ns) / 1e9, abs=0.005), number
 
 
-def test_a_change_of_clocks_adds_up_to_no_time() -> None:
+def test_a_change_of_the_clock_neither_adds_nor_loses_time() -> None:
     bench = Bench(counts=0)
     began = bench.now_ns + 10 * MS
     total = 0.0
@@ -355,7 +355,7 @@ def test_a_change_of_clocks_adds_up_to_no_time() -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_answers_that_become_the_clock_go_on_where_the_slots_were(seed: int) -> None:
+def test_a_change_from_slots_to_answers_as_the_clock_keeps_the_elapsed_time(seed: int) -> None:
     """A slot lies at the time of the minimum delay, an answer at that of the mean delay."""
     bench, chance, total = Bench(counts=0), random.Random(seed), 0.0
     began = bench.now_ns
@@ -371,7 +371,7 @@ def test_answers_that_become_the_clock_go_on_where_the_slots_were(seed: int) -> 
     assert total == pytest.approx(0.8, abs=0.0003)
 
 
-def test_a_board_that_answers_each_line_again_after_sparse_replies_gets_no_old_lines() -> None:
+def test_answers_after_a_phase_of_sparse_replies_are_not_matched_to_old_lines() -> None:
     """While only every fifth line is answered, the board seems to report by its own clock.
 
     Its replies are then assigned to no line, so the lines that left before must not count later.
@@ -413,7 +413,7 @@ def test_a_board_that_answers_each_line_again_after_sparse_replies_gets_no_old_l
         pytest.param(False, [(1, 200.0, 1)], None, id="nothing is expected after long silence"),
     ],
 )
-def test_a_stall_of_ours_tells_whether_the_board_reports_by_itself(
+def test_a_host_stall_reveals_whether_the_board_reports_by_itself(
     configured: bool, stalls: list[tuple[int, float, int]], speaks: bool | None
 ) -> None:
     """Each stall gives the lines that came, its periods, and the lines that left."""

@@ -44,7 +44,7 @@ def link(prompted: bool) -> str:
 @EFFORT
 @pytest.mark.parametrize("stall", [0.05, 0.09, 0.15, 0.25])
 @pytest.mark.parametrize("prompted", [False, True], ids=["reporting", "prompted"])
-def test_stalls_of_the_host_cost_nothing(
+def test_host_stalls_add_no_pose_error(
     prompted: bool, stall: float, seconds: float, seeds: int
 ) -> None:
     found = errors(
@@ -72,7 +72,7 @@ def slack(seeds: int) -> np.ndarray:
 @pytest.mark.slow
 @EFFORT
 @pytest.mark.parametrize("prompted", [False, True], ids=["reporting", "prompted"])
-def test_an_adapter_that_holds_lines_back_costs_nothing(
+def test_an_adapter_that_holds_lines_back_adds_no_pose_error(
     prompted: bool, seconds: float, seeds: int
 ) -> None:
     case = Case("ftdi", prompted, stall=0.15)
@@ -84,7 +84,9 @@ def test_an_adapter_that_holds_lines_back_costs_nothing(
 @pytest.mark.slow
 @EFFORT
 @pytest.mark.parametrize("prompted", [False, True], ids=["reporting", "prompted"])
-def test_a_fifth_of_the_lines_lost_costs_little(prompted: bool, seconds: float, seeds: int) -> None:
+def test_losing_a_fifth_of_the_lines_adds_little_pose_error(
+    prompted: bool, seconds: float, seeds: int
+) -> None:
     case = Case(prompted=prompted, lost=0.2, stall=0.15, stall_every=60.0)
     name = f"20 % lost, a stall a minute, {link(prompted)}"
     found = errors(name, "0.45 m", case, seconds, seeds)
@@ -93,7 +95,9 @@ def test_a_fifth_of_the_lines_lost_costs_little(prompted: bool, seconds: float, 
 
 @pytest.mark.slow
 @EFFORT
-def test_of_answers_that_take_1_to_5_ms_their_own_delay_counts(seconds: float, seeds: int) -> None:
+def test_answers_that_take_1_to_5_ms_give_half_the_error_of_arrival_times(
+    seconds: float, seeds: int
+) -> None:
     """The remaining error is the MCU's delay, which the host cannot separate from its own.
 
     Arrival times have it too.
@@ -114,7 +118,7 @@ def test_of_answers_that_take_1_to_5_ms_their_own_delay_counts(seconds: float, s
         pytest.param(True, *FULL.values, marks=FULL.marks, id="prompted-450 m"),
     ],
 )
-def test_losses_on_a_batched_link_cost_no_more_than_arrival_times(
+def test_losses_on_a_batched_link_give_no_more_error_than_arrival_times(
     prompted: bool, seconds: float, seeds: int
 ) -> None:
     case = Case("ftdi", prompted, lost=0.2, stall=0.15, stall_every=60.0)
@@ -124,7 +128,7 @@ def test_losses_on_a_batched_link_cost_no_more_than_arrival_times(
 
 
 @pytest.mark.slow
-def test_a_lost_answer_in_a_hundred_leaves_a_batched_link_its_clock() -> None:
+def test_a_batched_link_that_loses_one_answer_in_a_hundred_keeps_its_clock() -> None:
     """Without the clock, a stall is spread over earlier lines.
 
     That costs 0.44 m in this drive.
@@ -135,7 +139,7 @@ def test_a_lost_answer_in_a_hundred_leaves_a_batched_link_its_clock() -> None:
 
 @pytest.mark.slow
 @EFFORT
-def test_bursts_of_lost_lines_are_bridged(seconds: float, seeds: int) -> None:
+def test_the_gaps_of_bursts_of_lost_lines_are_filled(seconds: float, seeds: int) -> None:
     case = Case(burst_every=30.0)
     found = errors("bursts of 0.1 to 0.5 s, 2 a minute", "7.5 m", case, seconds, seeds)
     assert found[FOUND, 0] <= 7.5
@@ -160,7 +164,7 @@ def test_every_slot_of_a_drive_is_counted_once() -> None:
         Case(burst_every=5.0, lost=0.3),
     ],
 )
-def test_time_never_goes_back(case: Case) -> None:
+def test_line_times_never_go_backwards(case: Case) -> None:
     heard = drive(case, 2, 30.0).heard
     assert all(f.dt >= f.bridged >= 0.0 and f.since >= 0.0 for f in heard)
     assert all(a.at.mono_ns <= b.at.mono_ns for a, b in pairwise(heard))
@@ -169,7 +173,7 @@ def test_time_never_goes_back(case: Case) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("adapter", ["acm", "ftdi"])
-def test_a_stamp_is_when_the_sample_was_made(adapter: str) -> None:
+def test_a_stamp_is_the_time_at_which_the_sample_was_made(adapter: str) -> None:
     host = drive(Case("ftdi" if adapter == "ftdi" else "acm", stall=0.15), 3, 40.0)
     late, came = [], []
     for line, feedback in list(zip(host.lines, host.heard, strict=True))[1000:]:

@@ -39,7 +39,7 @@ def test_a_line_ends_with_lf_or_cr_lf() -> None:
     assert feed(LineReader(), b"one\ntwo\r\n") == [b"one", b"two"]
 
 
-def test_a_line_without_its_end_is_not_there_yet() -> None:
+def test_a_line_without_its_line_end_is_not_returned_yet() -> None:
     reader = LineReader()
     assert feed(reader, SEED_LINE + b"\r") == []
     assert feed(reader, b"\n") == [SEED_LINE]
@@ -56,7 +56,7 @@ def test_a_carriage_return_inside_a_line_stays() -> None:
 
 
 @given(data=streams)
-def test_fed_byte_by_byte_the_lines_are_those_fed_whole(data: bytes) -> None:
+def test_feeding_byte_by_byte_gives_the_same_lines_as_feeding_all_at_once(data: bytes) -> None:
     whole, single = LineReader(), LineReader()
     expected = feed(whole, data)
     assert feed(single, *(data[i : i + 1] for i in range(len(data)))) == expected
@@ -64,7 +64,7 @@ def test_fed_byte_by_byte_the_lines_are_those_fed_whole(data: bytes) -> None:
 
 
 @given(data=streams, places=st.sets(st.integers(0, 500)))
-def test_cut_anywhere_the_lines_are_those_fed_whole(data: bytes, places: set[int]) -> None:
+def test_feeding_pieces_cut_anywhere_gives_the_same_lines(data: bytes, places: set[int]) -> None:
     whole, cut = LineReader(), LineReader()
     expected = feed(whole, data)
     assert feed(cut, *cut_at(data, places)) == expected
@@ -72,7 +72,7 @@ def test_cut_anywhere_the_lines_are_those_fed_whole(data: bytes, places: set[int
 
 
 @given(data=streams)
-def test_the_lines_are_what_splitting_at_newlines_gives_less_the_empty_and_the_long(
+def test_the_lines_are_the_text_split_at_newlines_without_empty_and_over_long_ones(
     data: bytes,
 ) -> None:
     *ended, _ = (data + b"\n").split(b"\n")
@@ -117,7 +117,7 @@ def test_each_over_long_line_counts() -> None:
     assert reader.too_long == 3
 
 
-def test_with_each_line_comes_the_number_of_bytes_that_followed_it() -> None:
+def test_each_line_has_the_number_of_bytes_that_followed_it() -> None:
     assert LineReader().feed(b"one\r\ntwo\nthr") == [(b"one", 7), (b"two", 3)]
 
 

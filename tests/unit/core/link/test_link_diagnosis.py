@@ -69,7 +69,7 @@ def test_a_board_that_only_prints_noise_is_reported_with_its_noise() -> None:
     assert bench.session.words() == "linked"
 
 
-def test_a_link_that_fell_silent_says_so_first_and_then_what_is_heard() -> None:
+def test_a_silent_link_is_reported_first_and_the_received_data_later() -> None:
     bench = Bench().up()
     for _ in range(20):
         bench.wait(10)
@@ -91,7 +91,7 @@ def test_a_link_that_fell_silent_says_so_first_and_then_what_is_heard() -> None:
         (136, 0.25, "at least every 0.25 s", "set mcu.reply_period"),
     ],
 )
-def test_lines_too_far_apart_are_reported_and_no_setting_that_would_be_refused(
+def test_lines_too_far_apart_are_reported_with_a_setting_only_if_it_is_valid(
     apart: int, longest: float, told: str, untold: str
 ) -> None:
     bench = Bench(McuConfig(port="/dev/board"), longest_reply=longest).open()
@@ -104,7 +104,7 @@ def test_lines_too_far_apart_are_reported_and_no_setting_that_would_be_refused(
     assert untold not in words
 
 
-def test_one_silence_is_no_clock_of_the_boards_own() -> None:
+def test_a_single_silence_does_not_suggest_a_reply_period() -> None:
     bench = Bench(McuConfig(port="/dev/board")).up()
     for _ in range(20):
         bench.wait(10)
@@ -113,7 +113,7 @@ def test_one_silence_is_no_clock_of_the_boards_own() -> None:
 
 
 @pytest.mark.parametrize("port", ["sim", "/dev/board"])
-def test_lines_that_we_were_late_to_hear_are_no_advice_about_the_board(port: str) -> None:
+def test_lines_that_the_host_read_late_give_no_advice_about_the_board(port: str) -> None:
     bench = Bench(McuConfig(port=port)).up()
     told = set()
     for _ in range(20):  # this computer runs a step late and finds the bytes that arrived meanwhile
@@ -139,7 +139,7 @@ def after(*steps_ms: int, good: bool = False, simulated: bool = False) -> Latene
     return lateness
 
 
-def test_a_board_that_does_not_answer_steps_in_time_is_silent() -> None:
+def test_silence_during_punctual_steps_is_blamed_on_the_board() -> None:
     assert after(*[10] * 11).words("stale") == WORDS["stale"]
     assert after(*[49] * 3).late_s == 0.0
 
@@ -151,26 +151,26 @@ def test_a_host_stall_is_reported_with_its_length() -> None:
         assert "which other program" in told
 
 
-def test_a_good_line_ends_it() -> None:
+def test_a_good_line_ends_the_host_stall() -> None:
     assert after(800, 10, good=True).late_s == 0.0
     assert after(800, 10, good=True).ended_s == pytest.approx(0.8)
     assert after(800, 10).ended_s == after(10, 10, good=True).ended_s == 0.0
     assert after(800, good=True).words("stale") == WORDS["stale"]
 
 
-def test_a_simulator_that_is_late_is_no_silent_microcontroller() -> None:
+def test_a_late_simulator_is_not_reported_as_a_silent_microcontroller() -> None:
     assert "simulator" in after(10, 10, simulated=True).words("stale")
     assert after(800, simulated=True).words("stale").startswith("this computer")
 
 
-def test_a_link_that_is_up_or_closed_is_told_as_it_is() -> None:
+def test_a_link_that_is_not_stale_is_reported_unchanged_despite_a_host_stall() -> None:
     late = after(800)
     assert [late.words(state) for state in ("up", "booting", "down")] == [
         WORDS["up"], WORDS["booting"], WORDS["down"]
     ]  # fmt: skip
 
 
-def test_words_of_a_silence_say_whose_it_is() -> None:
+def test_the_text_of_a_silence_shows_whether_the_host_caused_it() -> None:
     ours = [after(800), after(800, simulated=True), after(10, simulated=True)]
     assert all(is_ours(lateness.words("stale")) for lateness in ours)
     assert not any(is_ours(words) for words in (WORDS["stale"], "", after(800).words("down")))
@@ -185,7 +185,7 @@ def heard(data: bytes) -> Heard:
 
 
 @pytest.mark.parametrize(("data", "looks", "counted"), HEARD.values(), ids=HEARD)
-def test_it_says_what_was_heard_how_that_looks_and_what_to_do(
+def test_the_diagnosis_says_what_was_received_how_it_looks_and_what_to_do(
     data: bytes, looks: Look, counted: str
 ) -> None:
     found = heard(data)
@@ -196,7 +196,7 @@ def test_it_says_what_was_heard_how_that_looks_and_what_to_do(
     assert "`acsard mcu check`" in found.words
 
 
-def test_it_is_told_after_three_seconds_and_again_only_when_it_looks_otherwise() -> None:
+def test_the_diagnosis_comes_after_three_seconds_and_again_only_when_it_changes() -> None:
     hearing, told = SilenceDiagnosis(), []
     for tick in range(100):
         now_ns = tick * PATIENCE_NS // 10
@@ -221,7 +221,7 @@ def sparse(bench: Bench) -> Heard:
     return found
 
 
-def test_a_stall_while_the_link_was_up_does_not_explain_the_sparse_lines_of_later() -> None:
+def test_a_stall_while_the_link_was_up_does_not_explain_later_sparse_lines() -> None:
     bench = Bench(McuConfig(port="/dev/board")).up()
     bench.wait(2000, GOOD * 3)
     for _ in range(500):
@@ -233,7 +233,7 @@ def test_a_stall_while_the_link_was_up_does_not_explain_the_sparse_lines_of_late
     assert "did not run" not in sparse(bench).words
 
 
-def test_a_closed_port_is_no_stall_of_this_computer() -> None:
+def test_a_closed_port_is_not_a_host_stall() -> None:
     bench = Bench(McuConfig(port="/dev/board")).up().close()
     for _ in range(500):
         bench.wait(10)
@@ -266,21 +266,21 @@ def events_of(every: int, windows: int = 3, period: float = 0.0, linked: bool = 
     return [event.text for event in events if event is not None]
 
 
-def test_a_fifth_lost_is_reported_once_with_its_figures() -> None:
+def test_a_loss_of_a_fifth_of_the_lines_is_reported_once_with_its_figures() -> None:
     (text,) = events_of(5)
     assert f"answered only {WINDOW * 4 // 5} of {WINDOW} lines" in text
     assert "`acsard mcu check`" in text
 
 
-def test_what_a_sound_link_loses_is_not_told() -> None:
+def test_the_few_losses_of_a_sound_link_are_not_reported() -> None:
     assert events_of(0) == events_of(int(1 / LOST) + 1) == []
 
 
-def test_a_board_known_to_report_by_its_own_clock_and_no_link_are_not_judged() -> None:
+def test_losses_are_not_judged_for_a_free_running_board_or_without_a_link() -> None:
     assert events_of(5, period=0.1) == events_of(5, linked=False) == []
 
 
-def test_it_is_reported_again_after_the_link_was_lost() -> None:
+def test_losses_are_reported_again_after_the_link_was_down() -> None:
     answered, events = UnansweredLines(0.0), []
     for sent in range(3 * WINDOW):
         events.append(answered.look(sent, sent // 2, sent != WINDOW + 10))

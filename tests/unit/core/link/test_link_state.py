@@ -32,18 +32,18 @@ class Bench:
         return self.link.state
 
 
-def test_every_state_has_its_words_and_a_way_down() -> None:
+def test_every_state_has_a_text_and_goes_down_when_the_port_closes() -> None:
     assert set(WORDS) == set(get_args(State))
     assert {state for state, sign in TABLE if sign == "closed"} == set(WORDS) - {"down"}
 
 
-def test_it_does_not_rise_against_a_reason() -> None:
+def test_the_link_does_not_come_up_while_it_may_not_rise() -> None:
     bench = Bench()
     assert bench.good(GOOD_LINES + 1, may_rise=False) == "booting"
     assert bench.good() == "up"
 
 
-def test_lines_further_apart_than_quiet_are_reported_and_make_no_link() -> None:
+def test_lines_further_apart_than_the_silence_limit_are_reported_and_make_no_link() -> None:
     bench = Bench()
     bench.good(2, ms=101)
     assert bench.link.sparse_s == 0.0  # a single silence proves nothing
@@ -66,7 +66,7 @@ def test_bad_lines_alone_do_not_take_the_link_down_but_are_reported() -> None:
     ("sign", "state"),
     [("closed", "down"), ("opened", "booting"), ("restarted", "booting"), ("damaged", "stale")],
 )
-def test_what_ends_a_link_ends_trust_too(sign: Sign, state: State) -> None:
+def test_after_the_link_ends_good_lines_are_counted_from_zero(sign: Sign, state: State) -> None:
     bench = Bench()
     bench.good(GOOD_LINES)
     bench.link.sign(sign)
@@ -74,7 +74,7 @@ def test_what_ends_a_link_ends_trust_too(sign: Sign, state: State) -> None:
     assert bench.good(GOOD_LINES - 1) == state
 
 
-def test_the_first_line_of_a_session_comes_after_nothing() -> None:
+def test_the_first_line_of_a_session_has_no_time_since_a_previous_line() -> None:
     bench = Bench()
     assert bench.link.good(bench.now_ns) is None
     assert bench.link.good(bench.now_ns + 7) == 7

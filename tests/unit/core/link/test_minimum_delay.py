@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from acsard.core.link.minimum_delay import MinimumDelay
 
 
-def test_the_first_is_the_promptest() -> None:
+def test_the_first_event_has_no_lateness() -> None:
     assert MinimumDelay(0.0).late == 0.0
 
 
-def test_what_is_late_is_so_by_what_the_two_clocks_differ_in() -> None:
+def test_lateness_is_the_difference_between_the_two_clocks_intervals() -> None:
     promptest = MinimumDelay(0.0)
     assert promptest.add(ours=30, theirs=10) == 20
     assert promptest.late == 20
@@ -24,7 +24,7 @@ def test_what_is_late_is_so_by_what_the_two_clocks_differ_in() -> None:
     assert promptest.late == 15
 
 
-def test_one_that_is_prompter_is_the_promptest_from_then_on() -> None:
+def test_an_earlier_event_becomes_the_new_minimum() -> None:
     promptest = MinimumDelay(0.0)
     assert promptest.add(10, 13) == -3
     assert promptest.late == 0.0
@@ -32,7 +32,7 @@ def test_one_that_is_prompter_is_the_promptest_from_then_on() -> None:
     assert promptest.add(13, 10) == 3
 
 
-def test_the_drift_is_forgiven_by_the_time_that_passed_and_no_further_than_prompt() -> None:
+def test_the_drift_allowance_grows_with_time_and_makes_no_lateness_negative() -> None:
     promptest = MinimumDelay(0.01)
     assert promptest.add(200, 100) == 100  # the drift allowance comes afterwards
     assert promptest.late == 98
@@ -42,7 +42,7 @@ def test_the_drift_is_forgiven_by_the_time_that_passed_and_no_further_than_promp
     assert promptest.late == 0.0
 
 
-def test_one_that_is_measured_and_not_believed_leaves_the_promptest_as_it_is() -> None:
+def test_a_measurement_that_is_not_believed_does_not_change_the_minimum() -> None:
     promptest = MinimumDelay(0.0)
     assert promptest.measure(10, 25) == -15
     assert promptest.measure(10, 5) == -10
@@ -50,13 +50,13 @@ def test_one_that_is_measured_and_not_believed_leaves_the_promptest_as_it_is() -
     assert promptest.measure(10, 10) == 0.0
 
 
-def test_the_drift_is_forgiven_of_all_that_is_measured() -> None:
+def test_the_drift_allowance_is_subtracted_from_each_measurement() -> None:
     promptest = MinimumDelay(0.01)
     assert promptest.measure(1000, 900) == 90
     assert promptest.measure(1000, 1000) == 80
 
 
-def test_no_more_than_the_most_is_remembered() -> None:
+def test_the_remembered_lateness_has_an_upper_limit() -> None:
     promptest = MinimumDelay(0.0, most=1000)
     assert promptest.add(5000, 0) == 5000
     assert promptest.late == 1000
@@ -64,7 +64,7 @@ def test_no_more_than_the_most_is_remembered() -> None:
 
 @pytest.mark.parametrize("offset", [0, 10**18, -(10**18)])
 @given(delays=st.lists(st.integers(0, 10**9), min_size=1, max_size=30))
-def test_without_drift_it_is_the_delay_beyond_the_least_whatever_the_clocks_say(
+def test_without_drift_the_lateness_is_the_delay_above_the_minimum_at_any_clock_offset(
     offset: int, delays: list[int]
 ) -> None:
     promptest, left, came = MinimumDelay(0.0), offset, delays[0]

@@ -95,20 +95,20 @@ def kind(line: bytes) -> str:
 # asking
 
 
-def test_switched_off_nothing_is_asked_and_lines_leave_as_they_are() -> None:
+def test_with_the_check_off_lines_leave_unchanged() -> None:
     check = Negotiation(McuConfig(), STOP)
     check.begin(fresh=True)
     assert (check.state, check.in_force) == ("off", "plain")
     assert check.seal(GO, 0) == GO
 
 
-def test_every_question_is_a_stop() -> None:
+def test_every_question_to_the_board_is_a_stop() -> None:
     for mcu in (AUTO, SAMPLES, REQUIRE):
         for line in Bench(mcu).ask(3000):
             assert line == STOP or line.startswith(STOP[:-2] + b"#")
 
 
-def test_a_question_that_did_not_leave_is_asked_again_at_once() -> None:
+def test_a_question_that_was_not_sent_is_repeated_immediately() -> None:
     check, ms = Bench().check, 1000
     check.settle(True)
     kinds = []
@@ -125,7 +125,7 @@ def test_a_question_that_did_not_leave_is_asked_again_at_once() -> None:
     assert kinds == ["plain"] * 3 + ["checked"] * 2
 
 
-def test_an_mcu_that_says_nothing_is_asked_in_turn_plainly_and_with_a_check_at_10_hz() -> None:
+def test_a_silent_mcu_gets_plain_and_checked_questions_in_turn_at_10_hz() -> None:
     bench = Bench()
     asked = bench.ask(2000)
     assert [kind(line) for line in asked[:4]] == ["plain", "checked", "plain", "checked"]
@@ -133,13 +133,13 @@ def test_an_mcu_that_says_nothing_is_asked_in_turn_plainly_and_with_a_check_at_1
     assert bench.check.asking
 
 
-def test_after_a_gap_the_first_question_is_one() -> None:
+def test_after_a_gap_a_board_that_had_the_check_gets_a_checked_question_first() -> None:
     bench = Bench().checked()
     bench.check.begin()
     assert kind(bench.ask()[0]) == "checked"
 
 
-def test_a_right_reply_to_a_question_confirms() -> None:
+def test_a_right_reply_to_a_question_confirms_the_check() -> None:
     bench = Bench().checked()
     assert bench.check.in_force == "checked"
     assert kind(bench.check.seal(GO, bench.now_ns)) == "checked"
@@ -153,7 +153,7 @@ def test_a_right_reply_to_a_sequence_that_was_not_sent_confirms_nothing() -> Non
     assert bench.check.asking
 
 
-def test_a_question_that_did_not_leave_cannot_be_answered() -> None:
+def test_a_reply_to_a_question_that_was_not_sent_is_stale() -> None:
     bench = Bench()
     (_, question) = bench.ask(100)
     bench.check.settle(False)
@@ -161,7 +161,7 @@ def test_a_question_that_did_not_leave_cannot_be_answered() -> None:
     assert bench.stale(sequence_of(question))
 
 
-def test_a_question_of_each_kind_without_an_answer_settles_for_plain() -> None:
+def test_unanswered_checked_questions_end_in_the_plain_state() -> None:
     bench = Bench()
     bench.ask()
     bench.check.heard_plain()
@@ -171,7 +171,7 @@ def test_a_question_of_each_kind_without_an_answer_settles_for_plain() -> None:
     assert bench.check.seal(GO, bench.now_ns) == GO
 
 
-def test_samples_are_asked_for_three_times_and_then_three_times_without() -> None:
+def test_the_board_is_asked_three_times_with_samples_and_then_three_times_without() -> None:
     bench = Bench(SAMPLES)
     bench.ask()
     bench.check.heard_plain()
@@ -180,7 +180,7 @@ def test_samples_are_asked_for_three_times_and_then_three_times_without() -> Non
     assert bench.check.state == "plain"
 
 
-def test_questions_that_did_not_leave_are_not_counted() -> None:
+def test_questions_that_were_not_sent_are_not_counted() -> None:
     bench = Bench()
     bench.check.heard_plain()
     for _ in range(300):
@@ -189,7 +189,7 @@ def test_questions_that_did_not_leave_are_not_counted() -> None:
     assert bench.check.asking
 
 
-def test_a_question_is_counted_once_however_often_it_is_looked_at() -> None:
+def test_a_question_is_counted_once_however_often_the_negotiation_is_judged() -> None:
     bench = Bench()
     bench.check.heard_plain()
     bench.ask()
@@ -199,14 +199,14 @@ def test_a_question_is_counted_once_however_often_it_is_looked_at() -> None:
     assert bench.check.asking
 
 
-def test_silence_is_no_refusal_however_long() -> None:
+def test_a_silent_board_is_asked_for_ever() -> None:
     bench = Bench(SAMPLES)
     bench.ask(60_000)
     assert bench.check.asking
     assert not bench.check.trouble
 
 
-def test_a_slow_wire_is_given_time_to_answer() -> None:
+def test_a_board_on_a_slow_wire_has_more_time_to_answer() -> None:
     bench = Bench(McuConfig(link_check="auto", baud_rate=9600))
     bench.check.heard_plain()
     bench.ask(4 * 190)
@@ -215,7 +215,7 @@ def test_a_slow_wire_is_given_time_to_answer() -> None:
     assert bench.check.in_force == "plain"
 
 
-def test_required_and_refused_it_is_asked_for_ever_and_says_why() -> None:
+def test_a_required_check_that_is_refused_is_asked_for_ever_with_its_reason() -> None:
     bench = Bench(REQUIRE)
     bench.check.heard_plain()
     assert len(bench.ask(5000)) > 50
@@ -227,7 +227,7 @@ def test_required_and_refused_it_is_asked_for_ever_and_says_why() -> None:
     assert (bench.check.state, bench.check.trouble) == ("checked", "")
 
 
-def test_who_has_answered_with_a_check_is_not_believed_without() -> None:
+def test_a_board_that_answered_with_a_check_is_not_accepted_without_it() -> None:
     bench = Bench().checked()
     bench.check.begin()
     bench.check.heard_plain()
@@ -236,7 +236,7 @@ def test_who_has_answered_with_a_check_is_not_believed_without() -> None:
     assert "damaged" in MENDS[bench.check.trouble]
 
 
-def test_a_new_opening_forgets_who_was_there() -> None:
+def test_a_new_opening_forgets_that_a_board_had_the_check() -> None:
     bench = Bench().checked()
     bench.check.begin(fresh=True)
     bench.check.heard_plain()
@@ -244,7 +244,7 @@ def test_a_new_opening_forgets_who_was_there() -> None:
     assert bench.check.state == "plain"
 
 
-def test_a_plain_question_that_was_not_sent_does_not_answer_the_one_before() -> None:
+def test_an_unsent_plain_question_leaves_the_question_before_it_valid() -> None:
     bench = Bench()
     plain, question, again = bench.ask(200)
     assert [kind(line) for line in (plain, question, again)] == ["plain", "checked", "plain"]
@@ -252,7 +252,7 @@ def test_a_plain_question_that_was_not_sent_does_not_answer_the_one_before() -> 
     bench.reply(sequence_of(question))
 
 
-def test_no_sign_leads_out_of_off() -> None:
+def test_no_transition_leads_into_or_out_of_the_off_state() -> None:
     assert "off" not in {state for state, _ in TABLE} | set(TABLE.values())
 
 
@@ -265,7 +265,7 @@ def test_sequences_count_up_and_start_over_after_255() -> None:
     assert others == [(first + n) % 256 for n in range(1, 300)]
 
 
-def test_only_the_last_line_can_be_one_that_did_not_leave() -> None:
+def test_only_the_last_line_can_be_marked_as_not_sent() -> None:
     bench = Bench().checked()
     first, second = bench.drive(2)
     bench.check.settle(False)
@@ -274,7 +274,7 @@ def test_only_the_last_line_can_be_one_that_did_not_leave() -> None:
     bench.reply(first)
 
 
-def test_a_line_from_another_time_is_stale_also_when_newer_ones_are_out() -> None:
+def test_a_late_answer_is_stale_even_while_newer_lines_wait() -> None:
     bench = Bench().checked()
     (old,) = bench.drive()
     bench.now_ns += LATE_NS + 1
@@ -283,21 +283,21 @@ def test_a_line_from_another_time_is_stale_also_when_newer_ones_are_out() -> Non
     bench.reply(new)
 
 
-def test_each_sequence_is_answered_once() -> None:
+def test_each_sequence_is_accepted_once() -> None:
     bench = Bench().checked()
     (sequence,) = bench.drive()
     bench.reply(sequence)
     assert bench.stale(sequence)
 
 
-def test_late_answers_of_lines_that_were_piped_are_normal() -> None:
+def test_answers_to_pipelined_lines_are_accepted_in_order() -> None:
     bench = Bench().checked()
     for sequence in bench.drive(10):
         bench.now_ns += 5 * MS
         bench.reply(sequence)
 
 
-def test_an_answer_makes_those_before_it_stale() -> None:
+def test_an_answer_makes_earlier_sequences_stale() -> None:
     bench = Bench().checked()
     first, second, third = bench.drive(3)
     bench.reply(second)
@@ -305,7 +305,7 @@ def test_an_answer_makes_those_before_it_stale() -> None:
     bench.reply(third)
 
 
-def test_an_answer_may_be_late_but_not_from_another_time() -> None:
+def test_an_answer_is_accepted_up_to_the_time_limit_and_stale_after_it() -> None:
     bench = Bench().checked()
     assert LATE_NS == 300 * MS  # the timeout of the MCU's own watchdog
     first, second = bench.drive(2)
@@ -315,14 +315,14 @@ def test_an_answer_may_be_late_but_not_from_another_time() -> None:
     assert bench.stale(second)
 
 
-def test_only_the_last_lines_are_waited_for() -> None:
+def test_only_the_lines_within_the_window_can_be_answered() -> None:
     bench = Bench().checked()
     sequences = bench.drive(WINDOW + 1)
     assert bench.stale(sequences[0])
     bench.reply(sequences[1])
 
 
-def test_asking_anew_forgets_what_was_sent_before() -> None:
+def test_a_new_negotiation_forgets_the_lines_that_were_sent_before() -> None:
     bench = Bench().checked()
     (sequence,) = bench.drive()
     bench.check.begin()
@@ -330,7 +330,7 @@ def test_asking_anew_forgets_what_was_sent_before() -> None:
 
 
 @given(st.lists(st.integers(-1, 7), max_size=400))
-def test_no_sequence_counts_twice_whatever_is_lost(skips: list[int]) -> None:
+def test_no_sequence_is_accepted_twice_or_out_of_order(skips: list[int]) -> None:
     bench = Bench().checked()
     sent: list[int] = []
     answered: set[int] = set()
@@ -347,19 +347,19 @@ def test_no_sequence_counts_twice_whatever_is_lost(skips: list[int]) -> None:
 # samples
 
 
-def test_an_answer_with_a_sample_has_them_asked_for_on() -> None:
+def test_an_answer_with_a_sample_keeps_samples_requested() -> None:
     bench = Bench(SAMPLES).checked(READING)
     assert bench.check.in_force == "checked with samples"
     assert kind(bench.check.seal(GO, bench.now_ns)) == "sampled"
 
 
-def test_an_answer_without_a_sample_ends_asking_for_them() -> None:
+def test_an_answer_without_a_sample_ends_the_sample_requests() -> None:
     bench = Bench(SAMPLES).checked()
     assert bench.check.in_force == "checked"
     assert kind(bench.check.seal(GO, bench.now_ns)) == "checked"
 
 
-def test_samples_that_stop_coming_are_asked_for_no_more() -> None:
+def test_samples_that_stop_coming_are_no_longer_requested() -> None:
     bench = Bench(SAMPLES).checked(READING)
     for _ in range(FEW_SAMPLES - 1):
         bench.reply(bench.drive()[0])
@@ -371,7 +371,7 @@ def test_samples_that_stop_coming_are_asked_for_no_more() -> None:
 
 
 @pytest.mark.parametrize("mcu", [AUTO, SAMPLES, REQUIRE])
-def test_while_it_is_asked_nothing_is_in_force(mcu: McuConfig) -> None:
+def test_a_new_negotiation_is_not_checked_yet(mcu: McuConfig) -> None:
     assert Bench(mcu).check.in_force == "not checked yet"
 
 
@@ -382,7 +382,7 @@ def test_the_pace_of_questions_is_bounded() -> None:
     assert len(bench.ask(1000)) <= 25
 
 
-def test_an_echo_is_never_taken_for_an_answer_and_nothing_drives_on_it() -> None:
+def test_an_echo_of_a_question_is_reported_and_ends_no_negotiation() -> None:
     for mcu in (AUTO, REQUIRE, SAMPLES):
         bench = Bench(mcu)
         bench.check.heard_plain()
@@ -395,26 +395,26 @@ def test_an_echo_is_never_taken_for_an_answer_and_nothing_drives_on_it() -> None
         assert not bench.check.trouble
 
 
-def test_an_answer_is_no_echo() -> None:
+def test_an_answer_is_not_an_echo() -> None:
     bench = Bench()
     (_, question) = bench.ask(110)
     answer = question.replace(b"H", b"")[:-2]
     assert not bench.check.echoed(answer)
 
 
-def test_the_first_goes_at_once_whatever_the_time() -> None:
+def test_the_throttle_lets_the_first_line_through_at_any_time() -> None:
     assert Throttle().lets(0, 100)
     assert Throttle().lets(-(10**18), 100)
 
 
-def test_the_next_goes_when_the_wait_is_over_and_not_before() -> None:
+def test_the_throttle_lets_the_next_line_through_only_after_the_wait() -> None:
     throttle = Throttle()
     assert [throttle.lets(at, 100) for at in (7, 8, 106, 107, 206, 207)] == [
         True, False, False, True, False, True,
     ]  # fmt: skip
 
 
-def test_who_is_not_let_through_does_not_prolong_the_wait() -> None:
+def test_a_line_that_the_throttle_held_back_does_not_prolong_the_wait() -> None:
     throttle = Throttle()
     throttle.lets(0, 100)
     assert not throttle.lets(99, 100)
@@ -422,7 +422,7 @@ def test_who_is_not_let_through_does_not_prolong_the_wait() -> None:
     assert throttle.lets(100, 100)
 
 
-def test_one_that_did_not_leave_uses_nothing_up() -> None:
+def test_undoing_a_line_that_was_not_sent_restores_the_earlier_wait() -> None:
     throttle = Throttle()
     assert throttle.lets(0, 100)
     throttle.undo()
@@ -433,7 +433,9 @@ def test_one_that_did_not_leave_uses_nothing_up() -> None:
 
 
 @given(st.lists(st.integers(0, 50), max_size=60), st.integers(1, 100))
-def test_any_two_that_go_are_the_wait_apart(steps: list[int], wait_ns: int) -> None:
+def test_any_two_lines_that_the_throttle_lets_through_are_the_wait_apart(
+    steps: list[int], wait_ns: int
+) -> None:
     throttle, now_ns, went = Throttle(), 0, []
     for step in steps:
         now_ns += step

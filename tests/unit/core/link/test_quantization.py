@@ -30,7 +30,7 @@ def look(recovery: CountRecovery, rows: Array, counts: bool = False) -> list[Fee
     return [recovery.look(line) for line in lines]
 
 
-def test_without_configured_counts_no_line_has_whole_counts_and_coarse_ones_are_counted() -> None:
+def test_without_configured_counts_no_line_has_whole_counts_and_coarse_lines_are_counted() -> None:
     coarse, fine = CountRecovery(), CountRecovery()
     assert all(line.counted is None for line in look(coarse, speeds(20)) + look(fine, speeds(3200)))
     assert coarse.counts == fine.counts == (0,) * 4
@@ -54,20 +54,20 @@ def test_after_forgetting_no_step_is_known() -> None:
     assert line.steps == (math.inf,) * 4
 
 
-def test_where_the_line_has_counts_of_its_own_nothing_is_made_of_its_speeds() -> None:
+def test_no_counts_are_derived_from_speeds_if_the_line_has_its_own_counts() -> None:
     seen = look(CountRecovery(20), speeds(20), counts=True)
     assert all(line.counted is None for line in seen)
     assert max(seen[-1].steps) == pytest.approx(math.tau / 20 / PERIOD, abs=0.01)
 
 
-def test_after_a_gap_a_line_says_nothing_of_how_far_it_went() -> None:
+def test_no_counts_are_derived_from_a_line_after_a_gap() -> None:
     recovery = CountRecovery(400)
     look(recovery, speeds(400))
     line = recovery.look(Feedback(AT, WheelSpeeds(*[15.71] * 4), 0.0, gap=0.5))
     assert line.counted is None
 
 
-def test_a_wheel_that_jumps_at_random_is_no_coarse_encoder_beside_three_fine_ones() -> None:
+def test_a_randomly_jumping_wheel_beside_three_fine_ones_is_not_a_coarse_encoder() -> None:
     dice, recovery = random.Random(1), CountRecovery()
     for _ in range(1000):
         fine = [round(5.0 + dice.uniform(-0.1, 0.1), 2) for _ in range(3)]
@@ -88,7 +88,7 @@ def fine_speeds(count: int = 2 * BLOCK) -> list[float]:
     return [round(10 + dice.uniform(-0.2, 0.2) + 0.02 * i, 2) for i in range(count)]
 
 
-def test_nothing_is_known_until_enough_steps_were_seen() -> None:
+def test_the_quantization_step_is_unknown_until_enough_steps_were_seen() -> None:
     speeds = [0.1 * (i % 2) for i in range(FIRST)]
     steps = steps_after(speeds)
     assert steps.size == math.inf
@@ -96,24 +96,24 @@ def test_nothing_is_known_until_enough_steps_were_seen() -> None:
     assert steps.size < 0.3
 
 
-def test_rest_and_flicker_teach_nothing() -> None:
+def test_the_quantization_step_is_not_learned_from_rest_or_flicker() -> None:
     steps = steps_after([0.0] * 1000 + [0.01 * (i % 2) for i in range(1000)])
     assert steps.size == math.inf
 
 
 @pytest.mark.parametrize("counts", [16, 20, 96])
-def test_counts_step_by_a_count(counts: int) -> None:
+def test_the_quantization_step_of_whole_counts_is_one_count(counts: int) -> None:
     quantum, dice = math.tau / counts / 0.01, random.Random(2)
     steps = steps_after([quantum * dice.randint(0, 1) for _ in range(6 * BLOCK)])
     assert steps.size == pytest.approx(quantum)
 
 
-def test_a_fine_encoder_hardly_steps() -> None:
+def test_a_fine_encoder_has_a_small_quantization_step() -> None:
     assert steps_after(fine_speeds()).size < 0.5
 
 
 @pytest.mark.parametrize("share", [0.3, 0.5, 0.8])
-def test_a_filter_behind_coarse_counts_leaves_of_a_step_its_share(share: float) -> None:
+def test_a_filter_reduces_the_quantization_step_by_its_share(share: float) -> None:
     speed, speeds, quantum = 0.0, [], 31.4
     for i in range(400):
         speed += share * ((0.0 if i % 9 else quantum) - speed)
@@ -127,7 +127,7 @@ def test_one_damaged_line_does_not_change_the_quantization_step() -> None:
     assert steps.size < 0.5
 
 
-def test_what_does_not_recur_is_forgotten() -> None:
+def test_a_quantization_step_that_does_not_recur_is_forgotten() -> None:
     steps = steps_after([0.0, 30.0] * BLOCK)
     assert steps.size == 30.0
     steps_after(fine_speeds(3 * BLOCK), steps)

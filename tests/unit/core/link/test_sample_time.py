@@ -70,7 +70,7 @@ class Bench:
         return self.counted - (self.made - self.began)
 
 
-def test_no_clock_is_known_before_half_a_second() -> None:
+def test_no_period_is_known_before_half_a_second() -> None:
     bench = Bench()
     for _ in range(45):
         bench.line()
@@ -87,14 +87,16 @@ def test_no_clock_is_known_before_half_a_second() -> None:
         (0.0333333, 0.0333333),  # the measured period
     ],
 )
-def test_the_period_is_the_one_that_the_firmware_means(real: float, period: float) -> None:
+def test_the_period_is_rounded_to_the_one_that_the_firmware_intends(
+    real: float, period: float
+) -> None:
     bench = Bench(real)
     for _ in range(400):
         bench.line()
     assert bench.slots.period == pytest.approx(period, rel=1e-6)
 
 
-def test_lines_with_a_time_are_no_lost_ones() -> None:
+def test_punctual_lines_are_not_counted_as_lost() -> None:
     bench = Bench().found()
     for _ in range(1000):
         bench.line(0.2)
@@ -108,7 +110,7 @@ def test_lines_with_a_time_are_no_lost_ones() -> None:
     seed=st.integers(0, 1000),
     drift=st.floats(-2e-4, 2e-4),
 )
-def test_a_lossless_link_counts_each_line_once_whatever_stalls(
+def test_a_lossless_link_counts_each_line_once_despite_host_stalls(
     stalls: list[tuple[int, float]], seed: int, drift: float
 ) -> None:
     chance = random.Random(seed)
@@ -169,7 +171,7 @@ def packets(size: int, lines: int, phase: float) -> list[tuple[int, int]]:
 @pytest.mark.variations(2)
 @pytest.mark.parametrize("size", [30, 33, 34, 36])
 @given(phase=st.floats(0.0, 16.0))
-def test_lines_that_fill_an_adapter_s_packets_have_the_period_they_are_made_at(
+def test_lines_that_fill_the_packets_of_an_adapter_keep_their_real_period(
     size: int, phase: float
 ) -> None:
     slots, counted = FreeRunningTimes((PERIOD,)), 0
@@ -192,7 +194,7 @@ each other only after it.
 """
 
 
-def test_a_first_line_out_of_turn_makes_no_other_period_of_batches() -> None:
+def test_an_early_first_line_does_not_change_the_period_of_a_batched_link() -> None:
     slots, slot, before = FreeRunningTimes((PERIOD,)), 0, 0.0
     for late in [*OUT_OF_TURN, *OUT_OF_TURN[5:]]:
         lines = round(1.6 - late + before)  # the lines of 16 ms
@@ -207,7 +209,7 @@ def test_a_first_line_out_of_turn_makes_no_other_period_of_batches() -> None:
 @pytest.mark.parametrize("period_ms", [10, 100])
 @pytest.mark.parametrize("early", [0.7, 0.84, 0.95])
 @pytest.mark.parametrize("turns", [{4}, {11}, {3, 15}, {2, 14}, {5, 9}])
-def test_a_reply_to_a_command_between_two_periods_makes_no_clock_that_is_a_slot_early(
+def test_early_replies_to_commands_between_two_periods_do_not_shift_the_slots(
     period_ms: int, early: float, turns: set[int]
 ) -> None:
     slots, period_ns = FreeRunningTimes((period_ms / 1000,)), period_ms * MS
@@ -229,7 +231,7 @@ def test_a_reply_to_a_command_between_two_periods_makes_no_clock_that_is_a_slot_
         [0.60, 0.70, 0.90, 1.00, 1.10, 1.19, 1.30, 1.40, 1.50, 1.54, 1.70, 1.80, 1.84],
     ],
 )
-def test_replies_to_commands_at_odd_times_make_no_clock_that_is_a_slot_late(
+def test_replies_to_commands_at_odd_times_do_not_delay_the_slots(
     odd: list[float],
 ) -> None:
     slots = FreeRunningTimes((0.1,))
@@ -254,7 +256,7 @@ def test_missing_lines_are_counted_with_the_next_one(lost: int) -> None:
 
 
 @given(seed=st.integers(0, 1000))
-def test_a_fifth_of_the_lines_lost_is_counted_to_the_last(seed: int) -> None:
+def test_every_lost_line_is_counted_when_a_fifth_is_lost(seed: int) -> None:
     chance = random.Random(seed)
     bench = Bench().found()
     for _ in range(2000):
@@ -264,7 +266,7 @@ def test_a_fifth_of_the_lines_lost_is_counted_to_the_last(seed: int) -> None:
     assert bench.error == 0
 
 
-def test_a_slot_counted_for_a_late_lone_line_is_taken_back_with_the_next() -> None:
+def test_a_slot_counted_for_a_late_single_line_is_subtracted_at_the_next_line() -> None:
     bench = Bench().found()
     for _ in range(100):
         bench.line(0.2)
@@ -274,7 +276,7 @@ def test_a_slot_counted_for_a_late_lone_line_is_taken_back_with_the_next() -> No
     assert bench.error == 0
 
 
-def test_what_a_backlog_is_short_of_is_counted_with_it() -> None:
+def test_lines_missing_in_a_backlog_are_counted_with_the_backlog() -> None:
     bench = Bench().found()
     for _ in range(100):
         bench.line(0.2)
@@ -294,7 +296,7 @@ def forgets(bench: Bench, lines: Iterable[Callable[[], None]]) -> bool:
 
 
 @each("period", [0.005, 0.0093, 0.0108, 0.02, 0.05])
-def test_another_period_is_found_out_and_found(period: float) -> None:
+def test_a_changed_period_is_noticed_and_learned(period: float) -> None:
     bench = Bench().found()
     began = bench.time_ns()
     bench.made, bench.period_ns = 0, period * 1e9
@@ -307,7 +309,7 @@ def test_another_period_is_found_out_and_found(period: float) -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_lines_without_a_period_have_no_clock(seed: int) -> None:
+def test_irregular_lines_have_no_period(seed: int) -> None:
     chance = random.Random(seed)
     slots, at, known = FreeRunningTimes((PERIOD,)), 10**12, 0
     for _ in range(3000):
@@ -317,7 +319,7 @@ def test_lines_without_a_period_have_no_clock(seed: int) -> None:
     assert known < 300
 
 
-def test_a_line_is_as_old_as_its_slot_not_as_its_read() -> None:
+def test_the_age_of_a_line_comes_from_its_slot_and_not_from_its_read() -> None:
     bench = Bench().found()
     chance = random.Random(1)
     errors, raw = [], []
@@ -337,7 +339,7 @@ def deviation(values: list[float]) -> float:
     return math.sqrt(math.fsum((value - middle) ** 2 for value in values) / len(values))
 
 
-def test_a_clock_that_is_forgotten_is_looked_for_anew() -> None:
+def test_a_forgotten_period_is_learned_again() -> None:
     bench = Bench().found()
     bench.slots.forget()
     assert bench.slots.period is None
@@ -383,25 +385,25 @@ class Prompted:
         return self
 
 
-def test_a_reply_that_no_line_waits_for_has_no_line() -> None:
+def test_a_reply_without_a_waiting_line_is_not_placed() -> None:
     prompts = PromptedTimes(0)
     prompts.read(10 * MS, 1)
     assert prompts.place() is None
 
 
-def test_replies_are_as_far_apart_as_their_lines() -> None:
+def test_the_dt_of_a_reply_is_the_time_between_the_lines() -> None:
     bench = Prompted().talk()
     bench.leave(203.0)
     assert bench.reply(203.0 + DELAY_MS) == [13.0, 0.0]
 
 
-def test_where_no_line_left_nothing_is_missing() -> None:
+def test_a_pause_without_sent_lines_fills_no_gap() -> None:
     bench = Prompted().talk()
     bench.leave(440.0)
     assert bench.reply(440.0 + DELAY_MS) == [250.0, 0.0]
 
 
-def test_a_stall_of_the_read_changes_nothing() -> None:
+def test_a_stalled_read_leaves_each_reply_at_its_line() -> None:
     bench = Prompted().talk()
     bench.leave(200.0)
     bench.leave(410.0)
@@ -409,14 +411,14 @@ def test_a_stall_of_the_read_changes_nothing() -> None:
     assert bench.reply(410.0 + DELAY_MS) == [210.0, 0.0]
 
 
-def test_a_lost_reply_leaves_its_line_without_one() -> None:
+def test_a_lost_reply_is_a_filled_gap() -> None:
     bench = Prompted().talk()
     bench.leave(200.0)
     bench.leave(210.0)
     assert bench.reply(210.0 + DELAY_MS) == [20.0, 10.0]
 
 
-def test_a_damaged_reply_leaves_its_line_without_one() -> None:
+def test_a_damaged_reply_is_a_filled_gap() -> None:
     bench = Prompted().talk()
     bench.leave(200.0)
     bench.prompts.read(int((200.0 + DELAY_MS) * MS), 1)
@@ -425,7 +427,7 @@ def test_a_damaged_reply_leaves_its_line_without_one() -> None:
     assert bench.reply(210.0 + DELAY_MS) == [20.0, 10.0]
 
 
-def test_a_line_given_up_too_early_gets_its_reply_back() -> None:
+def test_a_line_that_was_given_up_too_early_adds_no_time_to_the_replies() -> None:
     bench = Prompted()
     bench.leave(-10.0)
     bench.reply(-10.0 + DELAY_MS - 1.5)  # the earliest time at which an answer may arrive
@@ -440,7 +442,7 @@ def test_a_line_given_up_too_early_gets_its_reply_back() -> None:
     assert bench.reply(220.0 + DELAY_MS) == pytest.approx([10.0, 0.0], abs=1.0)
 
 
-def test_a_late_answer_is_none_that_comes_sooner_than_any() -> None:
+def test_a_reply_before_the_minimum_delay_of_a_line_answers_an_earlier_line() -> None:
     bench = Prompted().talk()
     bench.leave(200.0)
     bench.leave(210.0)
@@ -448,7 +450,7 @@ def test_a_late_answer_is_none_that_comes_sooner_than_any() -> None:
     assert bench.reply(210.0 + DELAY_MS) == [10.0, 0.0]
 
 
-def test_of_two_lines_that_leave_at_once_behind_a_stall_none_is_lost() -> None:
+def test_two_lines_that_leave_close_together_after_a_stall_make_no_gap() -> None:
     """No gap is filled, because the answer to the first line, read late, covers the whole stall."""
     bench = Prompted().talk()
     bench.leave(400.0)
@@ -457,7 +459,7 @@ def test_of_two_lines_that_leave_at_once_behind_a_stall_none_is_lost() -> None:
     assert bench.reply(403.0 + DELAY_MS + 3.0)[1] == 0.0
 
 
-def test_a_silence_that_begins_with_two_close_lines_leaves_all_of_its_lines_without() -> None:
+def test_all_lines_of_a_silence_that_begins_with_two_close_lines_stay_unanswered() -> None:
     """No earlier line's answer can be so late that the second line's own answer would be due."""
     bench = Prompted().talk()
     for ms in (200.0, 203.9, 220.0, 320.0, 420.0, 520.0, 620.0):
@@ -467,7 +469,7 @@ def test_a_silence_that_begins_with_two_close_lines_leaves_all_of_its_lines_with
     assert bench.reply(630.0 + DELAY_MS) == [10.0, 0.0]
 
 
-def test_where_answers_get_lost_one_of_two_close_lines_may_be_without() -> None:
+def test_on_a_lossy_link_the_first_of_two_close_lines_may_be_unanswered() -> None:
     bench = Prompted().talk()
     bench.leave(200.0)
     bench.leave(210.0)
@@ -477,7 +479,7 @@ def test_where_answers_get_lost_one_of_two_close_lines_may_be_without() -> None:
     assert bench.reply(403.0 + DELAY_MS + 0.2) == [193.0, 190.0]
 
 
-def test_where_a_reply_says_its_line_nothing_is_guessed() -> None:
+def test_a_reply_that_names_its_line_is_matched_without_a_guess() -> None:
     bench = Prompted().talk()
     bench.leave(200.0)
     bench.leave(210.0)
@@ -486,7 +488,7 @@ def test_where_a_reply_says_its_line_nothing_is_guessed() -> None:
     assert bench.reply(500.0, asked_ms=220.0) == [10.0, 0.0]
 
 
-def test_a_board_that_thinks_for_1_to_5_ms_samples_as_late_where_replies_name_their_lines() -> None:
+def test_with_named_lines_the_dt_includes_the_changes_of_the_boards_delay() -> None:
     bench, before = Prompted(), 0.0
     late = (2.1, 1.3, 3.7, 1.0, 4.9, 2.6, 1.8, 3.2)
     for number in range(400):
@@ -498,7 +500,7 @@ def test_a_board_that_thinks_for_1_to_5_ms_samples_as_late_where_replies_name_th
         before = thought
 
 
-def test_the_first_reply_answers_the_newest_line_that_it_can() -> None:
+def test_the_first_reply_is_matched_to_the_newest_possible_line() -> None:
     bench = Prompted()
     for number in range(10):
         bench.leave(number * 10)
@@ -542,7 +544,7 @@ def assigned(prompts: PromptedTimes, replies: dict[int, float], hz: int) -> list
     return older
 
 
-def test_a_first_reply_behind_a_stall_hides_no_lost_replies() -> None:
+def test_a_first_reply_that_is_read_late_hides_no_lost_replies() -> None:
     """The first reply is read 44 ms late. Later only every 16th of 300 lines a second is answered.
 
     Then no reply is assigned to a line that is more than one line too old.
@@ -557,7 +559,7 @@ def test_a_first_reply_behind_a_stall_hides_no_lost_replies() -> None:
 
 @pytest.mark.parametrize(("hz", "each"), [(100, 2), (100, 5), (300, 2), (300, 16)])
 @pytest.mark.parametrize("seed", range(5))
-def test_a_delay_that_varies_hides_lost_replies_only_shortly(hz: int, each: int, seed: int) -> None:
+def test_a_varying_delay_hides_lost_replies_only_briefly(hz: int, each: int, seed: int) -> None:
     """A board takes 8 to 16 ms for a reply, and after 2 s answers only some of the lines.
 
     Then no reply is assigned to a line that is more than 20 ms too old.
@@ -573,7 +575,7 @@ def test_a_delay_that_varies_hides_lost_replies_only_shortly(hz: int, each: int,
     assert max(older[50:]) <= 21.0
 
 
-def test_a_new_session_begins_without_a_past() -> None:
+def test_after_forgetting_the_first_reply_has_no_dt() -> None:
     bench = Prompted().talk()
     bench.prompts.forget()
     bench.leave(500.0)
@@ -617,13 +619,13 @@ def batched(
 
 
 @each("seed", range(5))
-def test_of_a_batched_link_each_answer_has_its_line(seed: int) -> None:
+def test_on_a_batched_link_each_answer_is_matched_to_its_line(seed: int) -> None:
     bench = Prompted()
     assert batched(bench, seed, 300) == pytest.approx(1990.0, abs=0.1)
     assert not bench.prompts.lossy
 
 
-def test_answers_that_wait_on_in_an_adapter_behind_a_stall_have_their_own_lines() -> None:
+def test_answers_that_an_adapter_holds_after_a_stall_are_matched_to_their_lines() -> None:
     """The adapter hands over whole packets first, and the rest with its next batch."""
     bench = Prompted()
     batched(bench, 0, 200)
@@ -645,7 +647,7 @@ def test_an_answer_lost_on_a_batched_link_is_noticed_soon(seed: int) -> None:
 
 
 @each("seed", range(5))
-def test_two_lost_answers_that_happen_to_be_near_each_other_leave_the_lines_their_clock(
+def test_a_few_answers_lost_close_together_do_not_make_a_batched_link_lossy(
     seed: int,
 ) -> None:
     bench = Prompted()
@@ -654,7 +656,7 @@ def test_two_lost_answers_that_happen_to_be_near_each_other_leave_the_lines_thei
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_where_a_fifth_of_a_batched_link_is_lost_an_answer_is_of_its_batch(seed: int) -> None:
+def test_on_a_lossy_batched_link_an_answer_is_at_most_one_line_off(seed: int) -> None:
     bench, chance, offs = Prompted(), random.Random(seed), list[int]()
     lost = tuple(number for number in range(1000) if chance.random() < 0.2)
     batched(bench, seed, 1000, lost, offs)
@@ -664,7 +666,7 @@ def test_where_a_fifth_of_a_batched_link_is_lost_an_answer_is_of_its_batch(seed:
     assert {off - usual for off in offs} <= {-1, 0, 1}
 
 
-def test_of_answers_that_take_1_to_5_ms_the_mcu_is_held_to_think() -> None:
+def test_a_delay_that_varies_by_4_ms_counts_as_processing_time_of_the_mcu() -> None:
     bench, chance = Prompted(), random.Random(1)
     for number in range(300):
         bench.leave(number * 10)
@@ -672,7 +674,7 @@ def test_of_answers_that_take_1_to_5_ms_the_mcu_is_held_to_think() -> None:
     assert bench.prompts.thinks
 
 
-def test_what_usb_makes_of_a_delay_is_no_thinking() -> None:
+def test_the_jitter_of_usb_does_not_count_as_processing_time_of_the_mcu() -> None:
     bench, chance = Prompted(), random.Random(1)
     for number in range(300):
         bench.leave(number * 10)

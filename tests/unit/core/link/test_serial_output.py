@@ -47,7 +47,7 @@ class Wire:
         return self
 
 
-def test_the_first_line_of_an_opening_is_a_stop_behind_an_end_of_line() -> None:
+def test_the_first_line_after_an_opening_is_a_line_end_and_a_stop() -> None:
     wire = Wire()
     assert wire.offer(GO, 0) == "superseded"
     assert wire.out == b"\r\n" + STOP
@@ -55,21 +55,21 @@ def test_the_first_line_of_an_opening_is_a_stop_behind_an_end_of_line() -> None:
     assert wire.out == b"\r\n" + STOP + GO
 
 
-def test_a_first_line_that_did_not_go_whole_leaves_the_next_one_the_first() -> None:
+def test_after_an_incomplete_first_line_the_next_line_is_again_the_opening_stop() -> None:
     wire = Wire()
     assert wire.offer(GO, 0, takes=20) == "superseded"
     assert wire.offer(GO, 10) == "superseded"
     assert wire.out.endswith(b"\r\n" + STOP)
 
 
-def test_a_line_waits_until_the_one_before_has_left_the_wire() -> None:
+def test_a_line_waits_until_the_previous_line_has_left_the_wire() -> None:
     wire = Wire(9600)
     wire.offer(STOP, 5)  # 35 bytes at 9600 baud take 36.458 ms
     assert wire.offer(GO, 5 + 36.458) == "superseded"
     assert wire.offer(GO, 5 + 36.459) == "sent"
 
 
-def test_no_line_goes_while_the_kernel_holds_a_byte() -> None:
+def test_no_line_is_sent_while_the_kernel_holds_a_byte() -> None:
     wire = Wire().started()
     assert wire.offer(GO, 1000, kernel=1) == "superseded"
     assert wire.offer(STOP, 1000, kernel=1) == "superseded"
@@ -77,7 +77,7 @@ def test_no_line_goes_while_the_kernel_holds_a_byte() -> None:
 
 
 @pytest.mark.parametrize("period_ms", [4, 10, 100])
-def test_what_was_made_more_than_a_period_ago_does_not_go(period_ms: int) -> None:
+def test_a_line_older_than_a_period_is_not_sent(period_ms: int) -> None:
     wire = Wire(period_ms=period_ms).started()
     assert wire.offer(GO, 100 + period_ms + 0.001, made_ms=100) == "superseded"
     assert wire.offer(GO, 300 + period_ms, made_ms=300) == "sent"
@@ -85,7 +85,7 @@ def test_what_was_made_more_than_a_period_ago_does_not_go(period_ms: int) -> Non
 
 @each("letters", [None, b"", ASK_NOTHING, ASK_SAMPLE])
 @each("stop", [STOP, COMMA_STOP])
-def test_a_stop_is_never_too_old_in_whatever_form(stop: bytes, letters: bytes | None) -> None:
+def test_a_stop_of_any_form_is_never_too_old(stop: bytes, letters: bytes | None) -> None:
     line = stop if letters is None else seal(stop, 7, letters)
     wire = Wire(stop=stop).started()
     assert wire.offer(line, 1000, made_ms=100) == "sent"
@@ -95,26 +95,24 @@ def test_a_stop_is_never_too_old_in_whatever_form(stop: bytes, letters: bytes | 
 @pytest.mark.parametrize(
     "line", [GO, seal(GO, 7), b"ap00.00,bp00.00,cp00.00,dp00.01\r\n", seal(GO, 7, ASK_SAMPLE)]
 )
-def test_what_turns_a_wheel_is_no_stop(line: bytes) -> None:
+def test_a_line_that_turns_a_wheel_is_not_a_stop(line: bytes) -> None:
     assert Wire().started().offer(line, 1000, made_ms=100) == "superseded"
 
 
-def test_the_stop_that_opens_goes_however_old_the_line_is_that_was_wished() -> None:
+def test_the_opening_stop_is_sent_even_if_the_requested_line_is_too_old() -> None:
     wire = Wire()
     assert wire.offer(GO, 1000, made_ms=100) == "superseded"
     assert wire.out == b"\r\n" + STOP
 
 
-def test_the_first_stop_of_an_opening_is_the_plain_one_which_every_board_obeys() -> None:
+def test_the_opening_stop_is_the_plain_one_that_every_board_obeys() -> None:
     wire = Wire()
     assert wire.offer(seal(STOP, 7), 0) == "superseded"
     assert wire.out == b"\r\n" + STOP
 
 
 @pytest.mark.parametrize(("takes", "prefix"), [(33, b""), (32, b"\r\n"), (0, b"")])
-def test_only_after_a_torn_line_the_next_one_begins_with_an_end_of_line(
-    takes: int, prefix: bytes
-) -> None:
+def test_a_line_begins_with_a_line_end_only_after_a_torn_line(takes: int, prefix: bytes) -> None:
     wire = Wire().started()
     assert wire.offer(GO, 10, takes=takes) == ("sent" if takes == 33 else "superseded")
     wire.out = b""

@@ -141,7 +141,7 @@ LINKS: dict[str, list[Step]] = {
 
 
 @each("case", LINKS)
-def test_the_link_follows_the_port_and_the_lines(case: str) -> None:
+def test_the_link_state_follows_the_port_and_the_lines(case: str) -> None:
     bench = Bench()
     for port, ms, data, link in LINKS[case]:
         bench.happen(port, ms, data)
@@ -149,7 +149,7 @@ def test_the_link_follows_the_port_and_the_lines(case: str) -> None:
 
 
 @each("lines", range(5))
-def test_a_reopened_port_is_booting_whatever_came_before(lines: int) -> None:
+def test_the_link_of_a_reopened_port_is_booting(lines: int) -> None:
     bench = Bench().open()
     bench.wait(10, GOOD * lines)
     bench.open().wait(10)
@@ -160,13 +160,13 @@ def test_a_reopened_port_is_booting_whatever_came_before(lines: int) -> None:
     assert bench.link() == "up"
 
 
-def test_half_a_line_of_the_old_session_does_not_spoil_the_first_of_the_new() -> None:
+def test_half_a_line_of_the_old_session_does_not_spoil_the_first_line_of_the_new_one() -> None:
     bench = Bench().up()
     bench.wait(1, GOOD[:10])
     assert len(bench.open().wait(10, GOOD)) == 1
 
 
-def test_half_a_line_before_the_port_closed_does_not_spoil_the_first_after() -> None:
+def test_half_a_line_before_the_port_closed_does_not_spoil_the_first_line_afterwards() -> None:
     bench = Bench().up()
     bench.wait(1, GOOD[:10])
     bench.close().wait(10)
@@ -188,7 +188,7 @@ def test_half_a_line_before_the_port_closed_does_not_spoil_the_first_after() -> 
         (10.0, 0.2, 600),  # 3 x 200 ms exceed 4 x 100 ms
     ],
 )
-def test_quiet_is_100_ms_or_4_periods_or_3_reply_periods(
+def test_the_silence_limit_is_100_ms_or_4_periods_or_3_reply_periods(
     rate_hz: float, reply_period: float, quiet_ms: float
 ) -> None:
     session = McuSession(McuConfig(reply_period=reply_period), rate_hz)
@@ -203,13 +203,13 @@ def test_the_session_is_silent_until_the_first_good_line() -> None:
     assert not bench.session.silent(bench.now_ns)
 
 
-def test_the_session_is_silent_after_quiet() -> None:
+def test_the_session_is_silent_after_the_silence_limit() -> None:
     bench = Bench().up()
     assert not bench.session.silent(bench.now_ns + bench.session.quiet_ns)
     assert bench.session.silent(bench.now_ns + bench.session.quiet_ns + 1)
 
 
-def test_a_new_session_is_silent_however_much_the_old_one_said() -> None:
+def test_a_new_session_is_silent_even_if_the_old_one_received_lines() -> None:
     bench = Bench().up()
     bench.open().wait(10)
     assert bench.session.silent(bench.now_ns)
@@ -224,7 +224,7 @@ def sampled(bench: Bench, age_ns: int) -> Instant:
     return Instant(made_ns, made_ns + WALL_NS)
 
 
-def test_a_line_that_ends_its_read_was_complete_then_and_made_its_own_bytes_earlier() -> None:
+def test_a_line_at_the_end_of_a_read_has_the_age_of_its_own_wire_time() -> None:
     bench = Bench().open()
     (feedback,) = bench.wait(10, GOOD)
     assert feedback.heard_ns == bench.now_ns
@@ -244,20 +244,20 @@ def test_the_bytes_that_followed_a_line_make_it_older_on_both_clocks() -> None:
     assert second.at.wall_ns - second.at.mono_ns == WALL_NS
 
 
-def test_dt_is_the_time_since_the_line_before() -> None:
+def test_dt_is_the_time_since_the_previous_line() -> None:
     bench = Bench().open()
     assert [f.dt for f in bench.wait(10, GOOD)] == [0.0]
     assert [f.dt for f in bench.wait(10, GOOD)] == [0.01]
     assert [f.dt for f in bench.wait(12.5, GOOD)] == [0.0125]
 
 
-def test_lines_read_together_share_the_time_since_the_read_before() -> None:
+def test_lines_read_together_share_the_time_since_the_previous_read() -> None:
     bench = Bench().up()
     first, second, third = bench.wait(15, GOOD * 3)
     assert first.dt == second.dt == third.dt == pytest.approx(0.005)
 
 
-def test_a_line_is_never_older_than_the_one_before_it() -> None:
+def test_a_line_is_never_older_than_the_previous_line() -> None:
     bench = Bench(McuConfig(baud_rate=9600)).open()
     (first,) = bench.wait(10, GOOD)
     (second,) = bench.wait(1, GOOD + GOOD[:20])  # 20.8 ms of wire time within 1 ms
@@ -290,7 +290,7 @@ def test_without_gaps_the_dts_add_up_to_the_time_between_first_and_last_line(
     assert all(f.at.mono_ns <= bench.now_ns for f in heard)
 
 
-def test_a_line_cut_over_two_reads_is_as_old_as_the_second() -> None:
+def test_a_line_split_over_two_reads_has_the_time_of_the_second_read() -> None:
     bench = Bench().up()
     bench.wait(5, GOOD[:20])
     (feedback,) = bench.wait(5, GOOD[20:] + GOOD[:3])
@@ -310,14 +310,14 @@ def test_a_step_of_the_wall_clock_changes_no_dt() -> None:
 # gaps
 
 
-def test_after_a_gap_dt_is_zero_and_the_gap_is_its_length() -> None:
+def test_after_a_gap_dt_is_zero_and_the_length_of_the_gap_is_reported() -> None:
     bench = Bench().up()
     bench.wait(200)
     (feedback,) = bench.wait(50, GOOD)
     assert (feedback.dt, feedback.gap) == (0.0, 0.25)
 
 
-def test_a_silence_as_long_as_quiet_is_no_gap() -> None:
+def test_a_silence_up_to_the_silence_limit_is_not_a_gap() -> None:
     bench = Bench().up()
     (feedback,) = bench.wait(100, GOOD)
     assert (feedback.dt, feedback.gap) == (0.1, 0.0)
@@ -334,14 +334,14 @@ def test_bad_lines_do_not_fill_a_gap() -> None:
     assert (feedback.dt, feedback.gap) == (0.0, 0.16)
 
 
-def test_the_second_line_after_a_gap_has_its_dt_again() -> None:
+def test_the_second_line_after_a_gap_has_a_dt_again() -> None:
     bench = Bench().up()
     bench.wait(500, GOOD)
     (feedback,) = bench.wait(10, GOOD)
     assert (feedback.dt, feedback.gap) == (0.01, 0.0)
 
 
-def test_the_time_a_port_was_closed_is_a_gap_however_short() -> None:
+def test_the_time_with_a_closed_port_is_always_a_gap() -> None:
     bench = Bench().up()
     bench.close().wait(20)
     (feedback,) = bench.open().wait(20, GOOD)
@@ -381,8 +381,8 @@ def test_a_session_restarts_with_the_port_and_after_a_long_gap(case: str) -> Non
 
 
 @pytest.mark.parametrize("begins", ["board", "port"])
-def test_a_new_session_whose_first_line_comes_late_restarts_with_it_again(begins: str) -> None:
-    """A zero that was sent while nobody was heard must not arm its sender."""
+def test_a_new_session_with_a_late_first_line_restarts_again_at_that_line(begins: str) -> None:
+    """A zero that was sent while the board was silent must not arm its sender."""
     bench = Bench().up()
     if begins == "port":
         bench.open().wait(10)
@@ -412,7 +412,7 @@ def test_good_lines_are_counted_and_bad_ones_by_reason() -> None:
     }
 
 
-def test_the_counts_go_on_in_the_next_session() -> None:
+def test_the_line_counters_continue_in_the_next_session() -> None:
     bench = Bench().up()
     bench.wait(10, BAD + b"x" * 200)
     bench.close().wait(10)
@@ -439,7 +439,7 @@ AUTO = McuConfig(link_check="auto")
 REQUIRE = McuConfig(link_check="require")
 
 
-def test_while_the_check_is_asked_for_only_stops_leave_and_the_link_is_not_up() -> None:
+def test_during_the_negotiation_only_stops_are_sent_and_the_link_is_not_up() -> None:
     bench = Bench(REQUIRE).open()
     for _ in range(300):
         bench.wait(10, GOOD)
@@ -489,14 +489,14 @@ def test_on_a_checked_link_a_reply_without_a_right_suffix_is_dropped_and_counted
     assert bench.link() == "up"
 
 
-def test_a_reply_counts_once() -> None:
+def test_a_repeated_reply_is_accepted_once() -> None:
     bench = Bench(AUTO).checked()
     reply = bench.answer(bench.line())
     assert len(bench.wait(10, reply + reply + reply)) == 1
     assert bench.session.rejects["stale_sequence"] == 2
 
 
-def test_replies_to_piped_lines_count_each() -> None:
+def test_each_reply_to_pipelined_lines_is_accepted() -> None:
     bench = Bench(AUTO).checked()
     replies = []
     for _ in range(4):
@@ -505,7 +505,7 @@ def test_replies_to_piped_lines_count_each() -> None:
     assert len(bench.wait(1, b"".join(replies))) == 4
 
 
-def test_five_bad_replies_in_a_row_are_no_link_and_the_check_is_asked_for_again() -> None:
+def test_five_bad_replies_in_a_row_end_the_link_and_restart_the_negotiation() -> None:
     bench = Bench(AUTO).checked()
     bench.wait(1, BAD * (BAD_LINES - 1))
     assert bench.link() == "up"
@@ -528,7 +528,7 @@ def test_bad_replies_among_right_ones_are_only_counted() -> None:
     assert bench.link() == "up"
 
 
-def test_quiet_without_a_right_reply_has_the_check_asked_for_again() -> None:
+def test_a_silence_without_a_right_reply_restarts_the_negotiation() -> None:
     bench = Bench(AUTO).checked()
     for _ in range(3):
         bench.wait(30, GOOD)
@@ -537,7 +537,7 @@ def test_quiet_without_a_right_reply_has_the_check_asked_for_again() -> None:
     assert (bench.link(), bench.session.negotiation.asking) == ("stale", True)
 
 
-def test_who_answered_with_a_check_is_never_driven_plainly() -> None:
+def test_an_mcu_that_answered_with_a_check_is_never_driven_without_it() -> None:
     bench = Bench(AUTO).checked()
     for _ in range(500):
         bench.wait(10, GOOD)
@@ -559,14 +559,14 @@ def test_an_mcu_that_names_itself_has_restarted(mcu: McuConfig) -> None:
     assert bench.session.rejects == {}
 
 
-def test_what_the_mcu_says_while_it_is_awaited_is_no_news() -> None:
+def test_the_identity_line_of_an_mcu_that_is_still_booting_is_not_a_restart_event() -> None:
     bench = Bench(AUTO).open()
     bench.wait(10, BOOTED)
     assert bench.names() == ["link_booting"]
     assert bench.session.restarted
 
 
-def test_the_outcome_is_an_event() -> None:
+def test_the_outcome_of_the_negotiation_is_an_event() -> None:
     bench = Bench(AUTO).open()
     told = []
     for _ in range(40):
@@ -579,7 +579,7 @@ def test_the_outcome_is_an_event() -> None:
     )
 
 
-def test_a_refusal_is_an_event_and_the_reason() -> None:
+def test_a_refused_check_is_an_event_and_the_reason_of_the_link() -> None:
     bench = Bench(REQUIRE).open()
     told = []
     for _ in range(100):
@@ -591,12 +591,12 @@ def test_a_refusal_is_an_event_and_the_reason() -> None:
     assert bench.session.words() == outcome.text
 
 
-def test_the_note_behind_a_reason_says_the_check_in_force() -> None:
+def test_the_note_after_a_reason_names_the_check_in_force() -> None:
     assert Bench().up().session.note == ""
     assert Bench(AUTO).checked().session.note == " (serial lines checked)"
 
 
-def test_the_first_stop_of_a_silence_leaves_at_once() -> None:
+def test_the_first_stop_of_a_silence_is_sent_without_delay() -> None:
     """The last line to the MCU, one period ago, commanded motion."""
     bench = Bench().up()
     while not bench.session.silent(bench.now_ns):
@@ -605,7 +605,7 @@ def test_the_first_stop_of_a_silence_leaves_at_once() -> None:
     assert bench.line() == bench.session.codec.stop
 
 
-def test_an_mcu_that_has_started_again_is_stopped_at_once() -> None:
+def test_an_mcu_that_restarted_gets_a_stop_without_delay() -> None:
     bench = Bench().up()
     assert bench.line() == b"ap01.00,bp01.00,cp01.00,dp01.00\r\n"
     bench.wait(10, BOOTED)
@@ -623,7 +623,7 @@ def test_a_silent_mcu_gets_stops_at_ten_hertz() -> None:
     assert [line for line in lines if line] == [bench.session.codec.stop] * 10
 
 
-def test_zero_is_the_stop_line() -> None:
+def test_zero_speeds_are_sent_as_the_stop_line() -> None:
     assert Bench().up().line(STILL) == ZERO + b"\r\n"
 
 
@@ -637,21 +637,21 @@ def disbelieved() -> Bench:
     return bench
 
 
-def test_behind_a_port_opened_again_the_configured_counts_are_believed_again() -> None:
+def test_the_configured_counts_are_trusted_again_after_the_port_reopens() -> None:
     bench = disbelieved()
     bench.close().wait(10)
     bench.open().wait(10)
     assert bench.session.count_recovery.counts == (20,) * 4
 
 
-def test_an_mcu_that_has_started_again_may_be_another() -> None:
+def test_the_configured_counts_are_trusted_again_after_the_mcu_restarts() -> None:
     bench = disbelieved()
     bench.wait(10, BOOTED)
     assert bench.session.count_recovery.counts == (20,) * 4
 
 
 @pytest.mark.parametrize("reads", [1, 4])
-def test_the_bad_lines_of_an_update_are_one_event_for_each_reason(reads: int) -> None:
+def test_the_bad_lines_of_an_update_make_one_event_for_each_reason(reads: int) -> None:
     bench = Bench().open()
     bench.wait(10)
     bench.wait(10, *([b"x\r\n" * 200 + b"ap99.99\r\n" + b"y" * 300 + b"\r\n"] * reads))
@@ -692,7 +692,7 @@ def test_an_output_that_is_blocked_for_the_watchdog_time_makes_the_link_stale() 
 
 
 @pytest.mark.parametrize(("ms", "restarted"), [(900, False), (1010, True)])
-def test_a_line_that_leaves_ends_the_block_and_a_second_of_it_is_a_new_session(
+def test_a_sent_line_ends_the_block_and_a_block_of_a_second_restarts_the_session(
     ms: float, restarted: bool
 ) -> None:
     bench = blocked(Bench().up(), ms)
@@ -705,7 +705,7 @@ def test_a_line_that_leaves_ends_the_block_and_a_second_of_it_is_a_new_session(
     assert bench.link() == "up"
 
 
-def test_a_step_that_comes_late_is_no_blocked_output() -> None:
+def test_a_late_step_is_not_a_blocked_output() -> None:
     bench = Bench().up()
     bench.line()
     update(bench, left=False, ms=400)
@@ -714,7 +714,7 @@ def test_a_step_that_comes_late_is_no_blocked_output() -> None:
     assert not bench.session.blocked
 
 
-def test_a_block_ends_with_its_opening() -> None:
+def test_closing_the_port_ends_the_block_of_the_output() -> None:
     bench = blocked(Bench().up(), 500)
     bench.close().wait(10)
     assert not bench.session.blocked
@@ -722,7 +722,7 @@ def test_a_block_ends_with_its_opening() -> None:
     assert bench.link() == "up"
 
 
-def test_for_a_closed_port_stops_are_made_at_ten_hertz_and_the_opening_gets_one_at_once() -> None:
+def test_stops_are_made_at_ten_hertz_for_a_closed_port_and_directly_when_it_opens() -> None:
     bench = Bench()
     made = []
     for _ in range(100):
@@ -734,7 +734,7 @@ def test_for_a_closed_port_stops_are_made_at_ten_hertz_and_the_opening_gets_one_
     assert bench.line() == ZERO + b"\r\n"
 
 
-def test_a_blind_stop_that_did_not_leave_is_made_again_with_the_next_line() -> None:
+def test_a_blind_stop_that_was_not_sent_is_made_again_with_the_next_line() -> None:
     bench = Bench().open()
     bench.wait(10)
     assert bench.line() == ZERO + b"\r\n"

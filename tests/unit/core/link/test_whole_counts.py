@@ -50,15 +50,15 @@ def missed(counts: int, jitter: float, nominal: bool = False) -> Array:
 
 @each("counts", [16, 20, 96])
 @pytest.mark.parametrize("nominal", [False, True])
-def test_a_jitter_of_two_ms_costs_no_count(counts: int, nominal: bool) -> None:
+def test_a_jitter_of_two_ms_loses_no_count(counts: int, nominal: bool) -> None:
     assert missed(counts, 0.002, nominal).max() < 0.01
 
 
-def test_of_a_fine_encoder_little_is_lost() -> None:
+def test_a_fine_encoder_loses_few_counts() -> None:
     assert missed(400, 0.0005).max() < 3.0
 
 
-def test_without_whole_counts_speed_times_time_would_be_some_counts_off() -> None:
+def test_speed_times_time_alone_is_more_than_one_count_off() -> None:
     found = sum(
         np.array(speeds) * own / (math.tau / 16) - number
         for speeds, own, number in lines(16, 0.002)
@@ -66,7 +66,7 @@ def test_without_whole_counts_speed_times_time_would_be_some_counts_off() -> Non
     assert np.abs(found).max() > 1.0
 
 
-def test_a_line_that_repeats_the_one_before_turns_no_wheel() -> None:
+def test_a_line_that_repeats_the_previous_one_turns_no_wheel() -> None:
     found, speed = WholeCounts(16), round(math.tau / 16 / 0.008, 2)
     one = (speed, 0.0, speed, 0.0)
     assert found.turned(one, 0.008) == (found.angle, 0.0, found.angle, 0.0)
@@ -74,7 +74,7 @@ def test_a_line_that_repeats_the_one_before_turns_no_wheel() -> None:
     assert found.turned(one, 0.005) == (found.angle, 0.0, found.angle, 0.0)
 
 
-def test_the_other_wheels_choose_between_two_numbers_of_counts() -> None:
+def test_the_other_wheels_decide_between_two_possible_numbers_of_counts() -> None:
     found = WholeCounts(96)
     true = [round(n * found.angle / 0.0139, 2) for n in (3, 3, 2, -3)]
     turned = found.turned((true[0], true[1], true[2], true[3]), 0.0105)
@@ -82,7 +82,7 @@ def test_the_other_wheels_choose_between_two_numbers_of_counts() -> None:
     assert [round(angle / found.angle, 6) for angle in turned] == [3, 3, 2, -3]
 
 
-def test_a_wrong_number_of_counts_is_made_good_by_the_next_line() -> None:
+def test_a_wrong_number_of_counts_is_corrected_by_the_next_line() -> None:
     found, total = WholeCounts(96), 0.0
     for number, time, own in ((3, 0.010, 0.010), (3, 0.0139, 0.0112), (2, 0.0077, 0.0104)):
         speed = round(number * found.angle / time, 2)
@@ -92,7 +92,7 @@ def test_a_wrong_number_of_counts_is_made_good_by_the_next_line() -> None:
     assert total / found.angle == pytest.approx(8)
 
 
-def test_firmware_that_filters_is_not_believed_to_report_whole_counts() -> None:
+def test_whole_counts_are_refuted_for_firmware_that_filters() -> None:
     found, speeds, dice = WholeCounts(96), np.zeros(4), random.Random(1)
     for row, own, _ in lines(96, 0.0):
         speeds = speeds + dice.uniform(0.2, 0.4) * (np.array(row) - speeds)
@@ -101,7 +101,7 @@ def test_firmware_that_filters_is_not_believed_to_report_whole_counts() -> None:
     assert not found.believed
 
 
-def test_a_repeated_line_of_such_firmware_turns_the_wheels_by_speed_times_time() -> None:
+def test_a_repeated_line_of_firmware_that_filters_gives_no_whole_counts() -> None:
     found, speeds, dice, refuted = WholeCounts(96), np.zeros(4), random.Random(1), 0
     for row, own, _ in lines(96, 0.0):
         speeds = speeds + dice.uniform(0.2, 0.4) * (np.array(row) - speeds)
@@ -113,7 +113,7 @@ def test_a_repeated_line_of_such_firmware_turns_the_wheels_by_speed_times_time()
     assert refuted > 1000
 
 
-def test_slow_wheels_whose_firmware_times_the_edges_are_not_a_count_in_each_line() -> None:
+def test_slow_wheels_with_edge_timing_firmware_do_not_turn_a_count_in_each_line() -> None:
     found, total = WholeCounts(16), 0.0
     for _ in range(200):
         turned = found.turned((0.5, 0.5, 0.5, 0.5), 0.01)
@@ -133,7 +133,7 @@ def test_equal_lines_at_uneven_times_lose_no_time(counts: int) -> None:
     assert turned == pytest.approx(13.45 * seconds, rel=0.005)
 
 
-def test_one_damaged_line_ends_nothing() -> None:
+def test_one_damaged_line_does_not_refute_whole_counts() -> None:
     found = WholeCounts(16)
     for number, (speeds, own, whole) in enumerate(lines(16, 0.001)):
         damaged = number == 300
@@ -143,7 +143,7 @@ def test_one_damaged_line_ends_nothing() -> None:
     assert found.believed
 
 
-def test_wheels_at_rest_are_at_rest() -> None:
+def test_zero_speeds_give_zero_angles() -> None:
     assert WholeCounts(16).turned((0.0, 0.0, 0.0, 0.0), 0.01) == (0.0, 0.0, 0.0, 0.0)
 
 

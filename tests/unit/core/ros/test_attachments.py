@@ -22,14 +22,14 @@ attachments = st.builds(
 )
 
 
-def test_the_captured_bytes_are_what_we_write_and_read() -> None:
+def test_the_captured_bytes_are_written_and_read_exactly() -> None:
     attachment = Attachment(1, 1_700_000_000_123_456_789, GID)
     assert attachment.pack() == CAPTURED
     assert unpack(CAPTURED) == attachment
 
 
 @given(attachments)
-def test_zenoh_s_own_serializer_writes_the_same(attachment: Attachment) -> None:
+def test_the_serializer_of_zenoh_writes_the_same_bytes(attachment: Attachment) -> None:
     fields = (
         zenoh.ext.Int64(attachment.sequence),
         zenoh.ext.Int64(attachment.stamp_ns),
@@ -46,17 +46,17 @@ def reason(data: bytes) -> str:
     return caught.value.reason
 
 
-def test_none_at_all_has_a_reason_of_its_own() -> None:
+def test_a_missing_attachment_has_its_own_reason() -> None:
     assert reason(b"") == "no_attachment"
 
 
 @each("length", [1, 16, 20, 32, 34, 64])
-def test_another_length_is_refused(length: int) -> None:
+def test_an_attachment_of_another_length_is_refused(length: int) -> None:
     assert reason((CAPTURED * 2)[:length]) == "bad_attachment"
 
 
 @each("length", [0, 15, 17, 255])
-def test_another_length_of_the_gid_is_refused(length: int) -> None:
+def test_an_attachment_with_another_gid_length_is_refused(length: int) -> None:
     assert reason(CAPTURED[:16] + bytes([length]) + CAPTURED[17:]) == "bad_attachment"
 
 

@@ -77,14 +77,14 @@ def same(ours: Any, theirs: Any) -> bool:
 
 @pytest.mark.slow
 @each("channel", CHANNELS)
-def test_what_is_encoded_is_what_the_definition_says(channel: Channel) -> None:
+def test_each_channel_is_encoded_as_its_definition_says(channel: Channel) -> None:
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(channel.schema, channel.schema_name))
     message = filled(channel.message)
     assert same(message, store.deserialize_cdr(channel.encode(message), channel.schema_name))
 
 
-def test_a_robot_state_is_encoded_as_it_is() -> None:
+def test_a_robot_state_is_read_back_from_its_encoding_unchanged() -> None:
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(STATE.schema, STATE.schema_name))
     read: Any = store.deserialize_cdr(STATE.encode(ROBOT_STATE), STATE.schema_name)
@@ -92,7 +92,7 @@ def test_a_robot_state_is_encoded_as_it_is() -> None:
     assert [one.name for one in read.sources] == ["app", "nav"]
 
 
-def test_topics_are_called_as_in_the_ros_tree() -> None:
+def test_topics_have_the_names_of_the_ros_tree() -> None:
     assert {row.native: row.name for row in PUBLISHED}.items() <= {
         key: channel.name for key, channel in BY_KEY.items()
     }.items()
@@ -100,7 +100,7 @@ def test_topics_are_called_as_in_the_ros_tree() -> None:
     assert CMD_VEL_IN.topic("", "app") == "/cmd_vel_in/app"
 
 
-def test_what_a_robot_has_nothing_to_say_on_has_no_channel() -> None:
+def test_a_key_that_the_robot_does_not_publish_has_no_channel() -> None:
     assert set(CHANNELS) - set(published_channels(frozenset({"tf"}))) == {BY_KEY["tf"]}
 
 
@@ -114,12 +114,12 @@ THEIRS = [name for name in DEFINITIONS if not name.startswith(OURS)]
 
 
 @each("name", DEFINITIONS)
-def test_the_text_alone_is_enough_for_another_program(name: str) -> None:
+def test_a_schema_text_contains_every_type_that_it_needs(name: str) -> None:
     assert {name, *nested(name)} == set(get_types_from_msg(schema_text(name), name))
 
 
 @each("name", THEIRS)
-def test_another_program_makes_the_same_hash_of_the_text(name: str) -> None:
+def test_another_program_computes_the_same_hash_from_the_schema_text(name: str) -> None:
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(schema_text(name), name))
     known = TYPE_HASHES.get(name, rihs01(name))
@@ -127,13 +127,13 @@ def test_another_program_makes_the_same_hash_of_the_text(name: str) -> None:
 
 
 @each("name", THEIRS)
-def test_a_text_has_the_constants_of_ros(name: str) -> None:
+def test_a_schema_text_has_the_constants_of_ros(name: str) -> None:
     jazzy = get_typestore(Stores.ROS2_JAZZY).fielddefs
     constants, _ = get_types_from_msg(schema_text(name), name)[name]
     assert constants == jazzy[name][0]
 
 
-def test_a_quaternion_that_is_not_filled_in_is_no_rotation() -> None:
+def test_the_default_quaternion_is_the_identity_rotation() -> None:
     first, *_ = schema_text("geometry_msgs/msg/Quaternion").split(RULE)
     read = parse_message_string("geometry_msgs", "Quaternion", first)
     assert {field.name: field.default_value for field in read.fields} == {
@@ -141,7 +141,7 @@ def test_a_quaternion_that_is_not_filled_in_is_no_rotation() -> None:
     }  # fmt: skip
 
 
-def test_a_text_has_each_type_once_after_the_type_itself() -> None:
+def test_a_schema_text_has_the_type_first_and_then_each_needed_type_once() -> None:
     text = schema_text("nav_msgs/msg/Odometry")
     first, *others = text.split(f"{RULE}\nMSG: ")
     assert first == (

@@ -68,7 +68,7 @@ def test_the_bridge_key_is_the_full_name_without_its_slash(name: str, key: str) 
         (TRIGGER, "std_srvs::srv::dds_::Trigger_"),
     ],
 )
-def test_dds_has_its_own_way_to_write_a_type(type_name: str, dds: str) -> None:
+def test_a_type_name_is_converted_to_the_form_of_dds(type_name: str, dds: str) -> None:
     assert dds_type(type_name) == dds
 
 
@@ -197,7 +197,7 @@ def rihs01(name: str) -> str:
 
 
 @each("type_name", TYPE_HASHES)
-def test_a_hash_is_that_of_the_definition(type_name: str) -> None:
+def test_each_stored_type_hash_is_that_of_its_definition(type_name: str) -> None:
     assert rihs01(type_name) == TYPE_HASHES[type_name]
 
 
@@ -210,7 +210,9 @@ def test_a_hash_is_that_of_the_definition(type_name: str) -> None:
          "RIHS01_0a241f87d04668d94099cbb5ba11691d5ad32c2f29682e4eb5653424bd275206"),
     ],
 )  # fmt: skip
-def test_the_hash_written_here_is_the_one_ros_computes(type_name: str, published: str) -> None:
+def test_the_hash_function_of_this_test_matches_the_published_hashes_of_ros(
+    type_name: str, published: str
+) -> None:
     """The types come from ROS and not from this project.
 
     Both sides therefore cannot share an error.
@@ -218,7 +220,7 @@ def test_the_hash_written_here_is_the_one_ros_computes(type_name: str, published
     assert rihs01(type_name) == published
 
 
-def test_no_definition_is_kept_that_no_hash_needs() -> None:
+def test_only_the_definitions_that_the_hashes_need_are_kept() -> None:
     needed = set(TYPE_HASHES).union(*map(referred, TYPE_HASHES))
     assert set(KNOWN) == needed
 
@@ -237,7 +239,7 @@ def test_the_gid_is_that_of_the_captured_token() -> None:
     assert gid(token).hex() == "ac170f31eadcd9ff0cd86d7a17907d1c"
 
 
-def test_the_gid_of_another_token_is_another() -> None:
+def test_different_tokens_have_different_gids() -> None:
     assert gid("a") != gid("b")
     assert len(gid("")) == 16
 
@@ -254,7 +256,7 @@ def test_the_gid_of_another_token_is_another() -> None:
         (Qos(5, best_effort=True), "2::,5:,:,:,,"),
     ],
 )
-def test_qos_leaves_out_what_is_the_default(qos: Qos, text: str) -> None:
+def test_the_text_of_a_qos_omits_default_values(qos: Qos, text: str) -> None:
     assert rmw_qos(qos) == text
 
 
@@ -281,7 +283,7 @@ def test_the_token_of_a_publisher_has_13_parts() -> None:
     assert len(token.split("/")) == 13
 
 
-def test_the_token_of_a_service_has_the_type_without_request_or_response() -> None:
+def test_the_token_of_a_service_has_the_type_without_a_request_or_response_suffix() -> None:
     token = Node(0, "abc", "", "acsard").endpoint_token(
         9, "SS", "/acsard/stop", "std_srvs/srv/Trigger", Qos()
     )

@@ -65,7 +65,7 @@ ALL = [
 ]
 
 
-def test_every_key_is_listed_with_the_tables_it_is_in() -> None:
+def test_every_parameter_and_its_prefixes_are_listed() -> None:
     found: rcl.ListReply = ask("list_parameters", rcl.ListRequest([], 0), rcl.ListReply)
     assert found.names == ALL
     assert found.prefixes == [
@@ -94,7 +94,7 @@ def test_every_key_is_listed_with_the_tables_it_is_in() -> None:
         (["nowhere"], 0, []),
     ],
 )
-def test_prefixes_and_depth_choose_among_them(
+def test_prefixes_and_depth_select_the_listed_parameters(
     prefixes: list[str], depth: int, expected: list[str]
 ) -> None:
     assert names(prefixes, depth) == expected
@@ -115,13 +115,13 @@ def test_each_value_has_its_ros_type() -> None:
     assert value("commands.sources.app.priority").integer_value == 50
 
 
-def test_a_name_that_is_not_there_has_no_value_and_no_type() -> None:
+def test_an_unknown_parameter_has_no_value_and_no_type() -> None:
     assert value("robot.weight") == rcl.ParameterValue()
     asked = rcl.Names(["robot.weight", "robot.id"])
     assert ask("get_parameter_types", asked, rcl.Types).types == [rcl.NOT_SET, rcl.STRING]
 
 
-def test_a_description_is_that_of_the_key() -> None:
+def test_the_description_of_a_parameter_is_that_of_its_key() -> None:
     asked = rcl.Names(["drive.wheel_radius", "no.such"])
     found, nothing = ask("describe_parameters", asked, rcl.Descriptors).descriptors
     assert found == described("drive.wheel_radius", rcl.DOUBLE)
@@ -140,7 +140,9 @@ WISHES: list[tuple[rcl.ParameterValue, object]] = [
 
 
 @each(("value", "expected"), WISHES)
-def test_a_wish_is_a_value_by_its_name(value: rcl.ParameterValue, expected: object) -> None:
+def test_a_set_request_gives_a_plain_value_for_each_name(
+    value: rcl.ParameterValue, expected: object
+) -> None:
     asked = rcl.SetRequest([rcl.Parameter("limits.linear_speed", value)])
     assert rcl.wished(Cdr(rcl.SetRequest).encode(asked)) == {"limits.linear_speed": expected}
 
@@ -152,7 +154,7 @@ def test_a_parameter_cannot_be_unset_nor_made_of_bytes(kind: int) -> None:
         rcl.wished(Cdr(rcl.SetRequest).encode(asked))
 
 
-def test_the_reply_has_a_result_for_each_or_one_for_all() -> None:
+def test_a_set_reply_has_one_result_per_parameter_and_an_atomic_one_has_one() -> None:
     wish = rcl.Parameter("log.level", rcl.ParameterValue(rcl.STRING, string_value="debug"))
     payload = Cdr(rcl.SetRequest).encode(rcl.SetRequest([wish, wish]))
     result = rcl.SetParametersResult(False, "why")
@@ -180,7 +182,7 @@ def test_a_request_cut_anywhere_is_refused(service: str) -> None:
             serve(payload[:end])
 
 
-def test_the_whole_configuration_can_be_had() -> None:
+def test_every_listed_parameter_of_the_configuration_has_a_value() -> None:
     serve = Parameters(effective(Config())).answer
     listed = Cdr(rcl.ListReply).decode(
         serve("list_parameters", Cdr(rcl.ListRequest).encode(rcl.ListRequest([], 0)))
@@ -196,7 +198,7 @@ KEYS = [key for key, _ in flat(effective(Config()))]
 DOUBLE, INTEGER = 3, 2
 
 
-def test_what_can_be_set_says_what_it_is_its_range_and_when() -> None:
+def test_a_settable_parameter_is_described_with_its_range_and_condition() -> None:
     assert described("limits.linear_stop_deceleration", DOUBLE) == ParameterDescriptor(
         "limits.linear_stop_deceleration",
         DOUBLE,
@@ -207,7 +209,7 @@ def test_what_can_be_set_says_what_it_is_its_range_and_when() -> None:
     )
 
 
-def test_what_takes_a_start_is_read_only_and_says_so() -> None:
+def test_a_parameter_that_needs_a_restart_is_read_only_and_described_so() -> None:
     assert described("mcu.encoder_counts", INTEGER) == ParameterDescriptor(
         "mcu.encoder_counts",
         INTEGER,
@@ -217,7 +219,7 @@ def test_what_takes_a_start_is_read_only_and_says_so() -> None:
     )
 
 
-def test_a_source_is_described_by_its_name() -> None:
+def test_a_parameter_of_a_source_is_described_under_the_name_of_the_source() -> None:
     found = described("commands.sources.nav.timeout", DOUBLE)
     assert found.floating_point_range == [FloatingPointRange(0.02, 10.0, 0.0)]
     assert (found.read_only, found.additional_constraints) == (
@@ -226,7 +228,7 @@ def test_a_source_is_described_by_its_name() -> None:
     )
 
 
-def test_a_choice_names_what_there_is() -> None:
+def test_the_description_of_a_choice_lists_its_values() -> None:
     found = described("log.level", 4)
     assert found.description == (
         'lowest level of the events that are logged: one of "debug", "error", "info", "warning"'
@@ -234,11 +236,11 @@ def test_a_choice_names_what_there_is() -> None:
 
 
 @each("key", KEYS)
-def test_every_key_has_words_and_is_read_only_unless_it_can_be_set(key: str) -> None:
+def test_every_key_has_a_description_and_is_read_only_unless_it_can_be_set(key: str) -> None:
     found = described(key, DOUBLE)
     assert found.description
     assert found.read_only == (live(key) is None)
 
 
-def test_what_is_not_there_has_none() -> None:
+def test_an_unknown_key_has_no_description() -> None:
     assert described("no.such", 0) == ParameterDescriptor("no.such", 0)

@@ -48,26 +48,26 @@ def test_an_event_is_a_log_line_of_ros() -> None:
 
 
 @pytest.mark.parametrize("text", ["3 x stale; the last: late", "2 x stale, 1 x crowded", "3 times"])
-def test_what_begins_with_its_numbers_is_not_counted_twice(text: str) -> None:
+def test_no_count_is_added_to_an_event_text_that_contains_counts(text: str) -> None:
     assert log(Event("command_refused", text, count=3), Time()).msg == text
 
 
-def test_what_the_topic_says_of_an_event_is_the_same_line() -> None:
+def test_an_event_of_the_topic_gives_the_same_log_line() -> None:
     seen = LogEvent(Time(1), "fault", "error", "dead motor", "", 1)
     assert log(seen, seen.stamp) == log(Event("fault", "dead motor", "error"), Time(1))
 
 
-def test_who_did_it_and_how_often_stand_there_only_if_there_is_something_to_say() -> None:
+def test_a_log_line_without_actor_or_repetition_has_the_text_alone() -> None:
     assert log(Event("started", "up"), Time()) == Log(Time(), 20, "started", "up")
 
 
-def test_a_source_never_heard_has_no_age() -> None:
+def test_a_source_without_commands_has_no_age() -> None:
     assert state(STATE).sources == [
         Source("app", 50, 0.1, ""), Source("nav", 10, None, "a command")
     ]  # fmt: skip
 
 
-def test_what_is_null_in_state_is_not_a_number_in_ros() -> None:
+def test_null_fields_of_the_state_are_nan_in_ros() -> None:
     none = replace(STATE, linear=None, angular=None, wheels=[], feedback_age=None, bumpers=None)
     unknown = state(none)
     told: Any = STORE.deserialize_cdr(Cdr(State).encode(unknown), CHANNEL.schema_name)
@@ -77,7 +77,7 @@ def test_what_is_null_in_state_is_not_a_number_in_ros() -> None:
     assert Cdr(State).decode(Cdr(State).encode(unknown)) == unknown
 
 
-def test_state_is_the_same_field_by_field() -> None:
+def test_the_ros_state_equals_the_native_state_field_by_field() -> None:
     told = state(STATE)
     assert told.header.stamp == STATE.stamp
     assert told.counters == [Counter("lines", 7), Counter("commands", 2)]

@@ -44,7 +44,7 @@ def test_both_trees_have_the_same_names() -> None:
     assert set(keys(RosConfig(), "bridge")) == set(keys(RosConfig(), "rmw"))
 
 
-def test_the_bridge_s_keys_are_the_bare_names() -> None:
+def test_the_keys_of_the_bridge_are_the_bare_names() -> None:
     assert keys(RosConfig(), "bridge") == {
         "odom": "odom",
         "tf": "tf",
@@ -74,7 +74,7 @@ def test_the_bridge_s_keys_are_the_bare_names() -> None:
     }
 
 
-def test_a_namespace_and_a_node_name_are_in_front_of_all_of_them() -> None:
+def test_every_key_has_the_namespace_and_every_service_the_node_name() -> None:
     ros = RosConfig(namespace="lab/robot1", node="base")
     bridge = keys(ros, "bridge")
     assert all(key.startswith("lab/robot1/") for key in bridge.values())
@@ -83,7 +83,7 @@ def test_a_namespace_and_a_node_name_are_in_front_of_all_of_them() -> None:
     assert keys(ros, "rmw")["tf"].startswith("0/lab/robot1/tf/tf2_msgs::msg::dds_::TFMessage_/")
 
 
-def test_over_rmw_a_topic_of_two_types_has_a_key_for_each() -> None:
+def test_over_rmw_a_topic_with_two_types_has_a_key_for_each_type() -> None:
     twists = [e.key for e in found(RosConfig()) if e.transport == "rmw" and e.native == "cmd/nav"]
     assert [key.split("/")[2] for key in twists] == [
         "geometry_msgs::msg::dds_::Twist_",
@@ -111,7 +111,7 @@ def test_each_tree_can_be_switched_off(bridge: bool, rmw: bool) -> None:
     assert any(token == "@/abc/@ros2_lv" for token in tokens) == bridge
 
 
-def test_two_claim_the_same_where_one_topic_would_drive_both() -> None:
+def test_two_robots_share_a_claim_if_one_topic_would_drive_both() -> None:
     def shared(one: RosConfig, two: RosConfig) -> bool:
         return bool({*claims(one)} & {*claims(two)})
 
@@ -124,7 +124,7 @@ def test_two_claim_the_same_where_one_topic_would_drive_both() -> None:
     assert claims(RosConfig(bridge=False, rmw=False)) == ()
 
 
-def test_every_name_stands_for_a_row_of_the_topic_table() -> None:
+def test_every_ros_name_belongs_to_a_row_of_the_topic_table() -> None:
     patterns = {topic.key.replace("<source>", ""): topic for topic in TOPICS}
     sources = {source.name for source in CommandsConfig().sources}
     for row in ros_names(RosConfig()):
@@ -140,14 +140,14 @@ def test_every_name_stands_for_a_row_of_the_topic_table() -> None:
         assert row.type in TYPE_HASHES
 
 
-def test_only_what_is_latched_in_the_native_tree_is_latched() -> None:
+def test_only_the_latched_topics_of_the_native_tree_are_latched() -> None:
     assert {e.native for e in found(RosConfig()) if e.latched} == {
         "tf_static",
         "robot_description",
     }
 
 
-def test_every_endpoint_over_rmw_has_a_token_of_its_own() -> None:
+def test_every_rmw_endpoint_has_its_own_token() -> None:
     tokens = [e.token for e in found(RosConfig()) if e.transport == "rmw"]
     assert len(set(tokens)) == len(tokens)
     numbers = [int(token.split("/")[4]) for token in tokens]
@@ -158,7 +158,7 @@ def test_every_endpoint_over_rmw_has_a_token_of_its_own() -> None:
             assert endpoint.token.split("/")[5] == kinds[endpoint.direction]
 
 
-def test_a_bridge_is_told_of_everything_that_has_one_type() -> None:
+def test_every_bridge_endpoint_with_a_single_type_is_announced() -> None:
     silent = {e.native for e in found(RosConfig()) if e.transport == "bridge" and not e.token}
     assert silent == {"cmd/nav", "cmd/dock", "cmd/teleop"}
     chosen = RosConfig(cmd_vel_type="twist_stamped")
@@ -166,19 +166,19 @@ def test_a_bridge_is_told_of_everything_that_has_one_type() -> None:
     assert "/MS/cmd_vel/geometry_msgs§msg§TwistStamped/" in "".join(e.token for e in found(chosen))
 
 
-def test_a_bridge_is_told_nothing_when_announcing_is_off() -> None:
+def test_no_bridge_endpoint_is_announced_if_announcing_is_off() -> None:
     ros = RosConfig(announce=False)
     assert not any(e.token for e in found(ros) if e.transport == "bridge")
     assert node_tokens(ros, ZID) == ("@ros2_lv/0/abc/0/0/NN/%/%/acsard",)
 
 
-def test_the_keys_commands_come_in_on_are_those_of_both_trees() -> None:
+def test_the_command_keys_are_the_incoming_keys_of_both_trees() -> None:
     rate_limited = command_keys(RosConfig())
     assert set(rate_limited) == {e.key for e in found(RosConfig()) if e.direction == "in"}
     assert len(rate_limited) == 6 + 9
 
 
-def test_transforms_that_are_switched_off_are_not_there_at_all() -> None:
+def test_transforms_that_are_switched_off_have_no_endpoint() -> None:
     odometry = OdometryConfig(publish_tf=False, gyro=True)
     off = Config(mcu=REAL, odometry=odometry, lidar=LidarConfig(publish_tf=False), ros=DESCRIBED)
     assert left_out(off) == {"tf", "tf_static"}
@@ -197,14 +197,14 @@ def test_either_static_transform_keeps_tf_static() -> None:
     assert "tf_static" not in left_out(config)
 
 
-def test_a_robot_without_a_urdf_has_no_topic_for_it() -> None:
+def test_a_robot_without_a_urdf_has_no_robot_description() -> None:
     config = Config(mcu=REAL, odometry=OdometryConfig(gyro=True))
     assert left_out(config) == {"robot_description"}
     kept = {e.native for e in endpoints(RosConfig(), ZID, left_out(config))}
     assert {e.native for e in found(RosConfig())} - kept == {"robot_description"}
 
 
-def test_a_gyro_of_ros_is_listened_to_where_it_is_wanted_and_the_robot_has_none_itself() -> None:
+def test_a_gyro_from_ros_is_used_if_configured_on_a_robot_that_is_not_simulated() -> None:
     wanted = OdometryConfig(gyro=True)
     assert left_out(Config(mcu=REAL, odometry=wanted, ros=DESCRIBED)) == set()
     for other in (
@@ -216,7 +216,7 @@ def test_a_gyro_of_ros_is_listened_to_where_it_is_wanted_and_the_robot_has_none_
         assert not [e for e in endpoints(RosConfig(), ZID, left_out(other)) if e.native == "imu"]
 
 
-def test_a_gyro_that_publishes_as_sensors_do_is_heard() -> None:
+def test_the_gyro_subscription_is_best_effort_like_sensor_publishers() -> None:
     bridge, rmw = (
         next(e for e in found(RosConfig()) if e.native == "imu" and e.transport == transport)
         for transport in ("bridge", "rmw")

@@ -13,19 +13,19 @@ from tests.each import each
 LINE = Codec(WheelMap()).stop
 
 
-def test_at_the_right_rate_nothing_happens() -> None:
+def test_at_the_right_baud_rate_data_are_unchanged() -> None:
     assert garbled(LINE, 9600, 9600) == LINE
     assert garbled(b"", 9600, 115200) == b""
 
 
 @each(("sent", "heard"), list(permutations(get_args(Baud), 2)))
-def test_at_a_wrong_rate_no_line_survives(sent: int, heard: int) -> None:
+def test_at_a_wrong_baud_rate_no_line_survives(sent: int, heard: int) -> None:
     got = garbled(LINE * 5, sent, heard)
     assert LINE[:-2] not in got
     assert b"ap0" not in got
 
 
-def test_a_byte_at_half_the_rate_is_what_the_bits_say() -> None:
+def test_a_byte_read_at_twice_its_baud_rate_is_resampled_bit_by_bit() -> None:
     # At 9600 baud 0x00 is nine low bits and a high one. At 19200 these are 18 low samples without a
     # stop bit in time.
     assert garbled(b"\x00", 9600, 19200) == b"\x00"
@@ -33,5 +33,5 @@ def test_a_byte_at_half_the_rate_is_what_the_bits_say() -> None:
     assert garbled(b"\xff", 9600, 19200) == b"\xfe"
 
 
-def test_a_rate_that_is_nearly_right_is_right() -> None:
+def test_a_baud_rate_that_is_nearly_right_changes_no_data() -> None:
     assert garbled(LINE, 115200, 117000) == LINE

@@ -69,14 +69,14 @@ def at_baud(baud: Any) -> Config:
 # answers
 
 
-def test_it_boots_stopped_and_says_nothing_by_itself() -> None:
+def test_the_mcu_boots_stopped_and_sends_nothing_unprompted() -> None:
     mcu = FakeMcu(TRUE)
     assert replies(mcu, 1000 * MS) == []
     assert mcu.vehicle.set_points == STILL
     assert mcu.next_ns() is None
 
 
-def test_it_answers_a_line_with_the_speeds_in_the_same_shape() -> None:
+def test_the_mcu_answers_a_line_with_its_speeds_in_the_same_format() -> None:
     mcu = FakeMcu(TRUE)
     assert drive(mcu, 0, 1)[0][1] == ZERO
     assert [data for _, data in drive(mcu, 10 * MS, 5)] == [LINE] * 5
@@ -93,7 +93,7 @@ def test_it_answers_a_line_with_the_speeds_in_the_same_shape() -> None:
         (b"an00.00,bn00.00,cn00.00,dn00.00\r\n", ZERO),
     ],
 )
-def test_a_steady_speed_is_reported_to_the_byte(sent: bytes, answered: bytes) -> None:
+def test_a_steady_speed_is_reported_byte_for_byte(sent: bytes, answered: bytes) -> None:
     assert drive(FakeMcu(TRUE), 0, 10, sent)[-1][1] == answered
 
 
@@ -113,7 +113,7 @@ def test_a_motor_follows_with_its_lag() -> None:
     assert seen[-1] == 12.5
 
 
-def test_the_vehicle_really_moves() -> None:
+def test_the_commanded_speed_moves_the_vehicle() -> None:
     mcu = FakeMcu(TRUE)
     drive(mcu, 0, 100, b"ap10.00,bp10.00,cp10.00,dp10.00\r\n")
     assert mcu.vehicle.pose.x == pytest.approx(0.5, abs=0.004)
@@ -134,7 +134,7 @@ def test_two_reads_of_the_encoders_within_4_ms_give_the_same_figures() -> None:
 
 
 @pytest.mark.parametrize(("baud", "line_ns"), [(9600, 34_375_000), (115200, 2_864_583)])
-def test_a_line_and_its_answer_each_take_their_time_on_the_wire(baud: int, line_ns: int) -> None:
+def test_a_line_and_its_answer_each_take_their_wire_time(baud: int, line_ns: int) -> None:
     mcu = FakeMcu(at_baud(baud))
     mcu.receive(1000, LINE)
     ((when, _),) = replies(mcu, 200 * MS)
@@ -144,7 +144,7 @@ def test_a_line_and_its_answer_each_take_their_time_on_the_wire(baud: int, line_
 
 
 @pytest.mark.parametrize("baud", [9600, 115200])
-def test_lines_sent_at_once_arrive_one_after_the_other(baud: int) -> None:
+def test_lines_sent_together_arrive_one_after_the_other(baud: int) -> None:
     mcu = FakeMcu(at_baud(baud))
     mcu.receive(0, LINE)
     mcu.receive(0, LINE + LINE)
@@ -163,7 +163,7 @@ def test_answers_leave_one_after_the_other(baud: int) -> None:
     assert all(later - sooner >= line_ns for sooner, later in pairwise(arrived))
 
 
-def test_processing_takes_one_to_five_milliseconds_and_not_always_the_same() -> None:
+def test_processing_takes_a_varying_time_of_one_to_five_milliseconds() -> None:
     found = drive(FakeMcu(TRUE), 0, 40)
     taken = [when - n * 10 * MS - 2 * LINE_NS for n, (when, _) in enumerate(found)]
     assert len(found) >= 39
@@ -172,7 +172,7 @@ def test_processing_takes_one_to_five_milliseconds_and_not_always_the_same() -> 
     assert max(taken) - min(taken) > 2 * MS
 
 
-def test_nothing_arrives_before_it_has_fully_arrived() -> None:
+def test_an_answer_arrives_only_when_it_is_complete() -> None:
     mcu = FakeMcu(TRUE)
     mcu.receive(0, LINE)
     ((when, _),) = replies(mcu, 100 * MS)
@@ -182,11 +182,11 @@ def test_nothing_arrives_before_it_has_fully_arrived() -> None:
     assert other.advance(when) == ZERO
 
 
-def test_it_does_the_same_every_time() -> None:
+def test_the_mcu_is_deterministic() -> None:
     assert drive(FakeMcu(Config()), 0, 50) == drive(FakeMcu(Config()), 0, 50)
 
 
-def test_how_often_it_is_asked_makes_no_difference() -> None:
+def test_the_output_does_not_depend_on_how_often_the_mcu_is_advanced() -> None:
     busy, lazy = FakeMcu(TRUE), FakeMcu(TRUE)
     for mcu in (busy, lazy):
         mcu.receive(0, LINE * 3)
@@ -227,7 +227,7 @@ INVALID = [
 
 
 @each("line", INVALID)
-def test_a_line_that_is_not_whole_and_valid_is_heard_and_nothing_else(line: bytes) -> None:
+def test_a_line_that_is_not_whole_and_valid_is_recorded_but_has_no_effect(line: bytes) -> None:
     mcu = told(line)
     assert mcu.vehicle.set_points == STILL
     assert mcu.valid_lines == 0
@@ -236,7 +236,7 @@ def test_a_line_that_is_not_whole_and_valid_is_heard_and_nothing_else(line: byte
 
 
 @pytest.mark.parametrize("line", [LINE, LINE.replace(b"\r", b""), LINE[:-2] + b",\r\n"])
-def test_line_end_and_trailing_comma_are_free(line: bytes) -> None:
+def test_any_line_end_and_a_trailing_comma_are_accepted(line: bytes) -> None:
     mcu = told(line)
     assert mcu.vehicle.set_points == SPEEDS
     assert mcu.valid_lines == 1
@@ -254,7 +254,7 @@ def test_a_line_in_two_pieces_is_one_line(cut: int) -> None:
     assert [line for _, line in mcu.heard] == [LINE]
 
 
-def test_noise_costs_the_line_it_hits_and_no_other() -> None:
+def test_noise_spoils_only_the_line_that_it_hits() -> None:
     mcu = told(b"\xff~" + LINE + b"garbage\r\n" + LINE)
     assert mcu.valid_lines == 1
     assert [data for _, data in mcu.heard] == [b"\xff~" + LINE, b"garbage\r\n", LINE]
@@ -284,7 +284,7 @@ def test_the_motors_stop_300_ms_after_the_last_valid_line() -> None:
     assert mcu.watchdog_trips == 1
 
 
-def test_the_watchdog_strikes_in_time_however_late_one_looks() -> None:
+def test_the_watchdog_stops_the_motors_in_time_even_if_the_mcu_is_advanced_late() -> None:
     mcu = FakeMcu(TRUE)
     mcu.receive(0, LINE)
     start_ns = acted_ns(mcu)
@@ -301,7 +301,7 @@ def test_valid_lines_in_time_keep_the_motors_running() -> None:
     assert mcu.watchdog_trips == 0
 
 
-def test_invalid_lines_do_not() -> None:
+def test_invalid_lines_do_not_keep_the_motors_running() -> None:
     mcu = FakeMcu(TRUE)
     mcu.receive(0, LINE)
     for n in range(1, 50):
@@ -310,7 +310,7 @@ def test_invalid_lines_do_not() -> None:
     assert mcu.vehicle.set_points == STILL
 
 
-def test_a_watchdog_at_rest_is_no_trip() -> None:
+def test_the_watchdog_does_not_trip_at_rest() -> None:
     mcu = told(ZERO)
     mcu.advance(10_000 * MS)
     assert mcu.watchdog_trips == 0
@@ -331,7 +331,7 @@ def test_without_watchdog_the_motors_run_on() -> None:
         assert mcu.watchdog_trips == 0
 
 
-def test_a_watchdog_that_anything_feeds_runs_on_with_broken_lines_and_not_in_silence() -> None:
+def test_a_watchdog_fed_by_bad_lines_keeps_the_motors_running_until_silence() -> None:
     for fed in (False, True):
         mcu = FakeMcu(TRUE)
         with mcu.watchdog_fed_by_bad_lines() if fed else nullcontext():
@@ -358,7 +358,7 @@ def test_a_reset_stops_the_motors_and_leaves_the_board_deaf_for_its_bootloader()
     assert [data for _, data in drive(mcu, deaf_until, 3)][-1] == LINE
 
 
-def test_a_line_counts_from_the_very_end_of_the_reset() -> None:
+def test_a_line_is_obeyed_from_the_exact_end_of_the_reset() -> None:
     for early_ns, speeds in ((1, STILL), (0, SPEEDS)):
         mcu = FakeMcu(TRUE)
         mcu.reset(0)
@@ -367,7 +367,7 @@ def test_a_line_counts_from_the_very_end_of_the_reset() -> None:
         assert mcu.vehicle.set_points == speeds
 
 
-def test_a_reset_prints_noise_that_is_no_frame() -> None:
+def test_a_reset_prints_noise_that_is_not_a_frame() -> None:
     mcu = FakeMcu(TRUE)
     mcu.reset(0)
     (noise,) = (data for _, data in replies(mcu, RESET_NS))
@@ -375,7 +375,7 @@ def test_a_reset_prints_noise_that_is_no_frame() -> None:
     assert b"ap" not in noise
 
 
-def test_a_reset_forgets_what_was_on_the_wire() -> None:
+def test_a_reset_discards_the_data_on_the_wire() -> None:
     mcu = FakeMcu(TRUE)
     mcu.receive(0, LINE + LINE[:10])
     mcu.reset(1 * MS)
@@ -419,14 +419,14 @@ def story(mcu: FakeMcu, start_ns: int) -> tuple[Heard, list[float], list[float]]
 
 
 @each("fault", NAMED.values())
-def test_a_fault_makes_a_difference(fault: Fault) -> None:
+def test_each_fault_changes_the_behaviour(fault: Fault) -> None:
     faulty = FakeMcu(TRUE)
     with fault(faulty):
         assert story(faulty, 0) != story(FakeMcu(TRUE), 0)
 
 
 @each("fault", NAMED.values())
-def test_after_its_block_a_fault_is_gone(fault: Fault) -> None:
+def test_a_fault_ends_with_its_block(fault: Fault) -> None:
     mended = FakeMcu(TRUE)
     with fault(mended):
         drive(mended, 0, 4, ZERO)
@@ -438,20 +438,20 @@ def test_after_its_block_a_fault_is_gone(fault: Fault) -> None:
 
 
 @each("fault", NAMED.values())
-def test_a_fault_is_gone_also_when_its_block_ends_with_an_error(fault: Fault) -> None:
+def test_a_fault_ends_with_its_block_also_after_an_exception(fault: Fault) -> None:
     mended = FakeMcu(TRUE)
     with pytest.raises(KeyError), fault(mended):
         raise KeyError
     assert story(mended, 0) == story(FakeMcu(TRUE), 0)
 
 
-def test_faults_add_up() -> None:
+def test_several_faults_act_together() -> None:
     mcu = FakeMcu(TRUE)
     with mcu.spaces(), mcu.trailing_comma(), mcu.noise(b"~"):
         assert drive(mcu, 0, 5)[-1][1] == b"~ap12.50, bn08.75, cp15.00, dn10.25,\r\n"
 
 
-def test_a_muted_mcu_drives_but_says_nothing() -> None:
+def test_a_muted_mcu_drives_but_sends_nothing() -> None:
     mcu = FakeMcu(TRUE)
     with mcu.mute():
         assert drive(mcu, 0, 10) == []
@@ -459,7 +459,7 @@ def test_a_muted_mcu_drives_but_says_nothing() -> None:
         assert mcu.valid_lines == 10
 
 
-def test_noise_stands_before_every_answer() -> None:
+def test_the_noise_fault_prepends_noise_to_every_answer() -> None:
     mcu = FakeMcu(TRUE)
     with mcu.noise(b"\x00\xff~"):
         first, *others = (data for _, data in drive(mcu, 0, 5))
@@ -467,7 +467,7 @@ def test_noise_stands_before_every_answer() -> None:
     assert others == [b"\x00\xff~" + LINE] * len(others) != []
 
 
-def test_a_partial_line_is_the_first_half() -> None:
+def test_the_partial_line_fault_sends_the_first_half() -> None:
     mcu = FakeMcu(TRUE)
     with mcu.partial_line():
         assert drive(mcu, 0, 5)[-1][1] == LINE[:16]
@@ -485,7 +485,7 @@ def test_a_slow_mcu_acts_and_answers_later_by_its_delay() -> None:
     assert mcu.vehicle.set_points == SPEEDS
 
 
-def test_replies_longer_than_the_commands_are_missing_once_the_output_buffer_is_full() -> None:
+def test_replies_longer_than_the_commands_are_lost_once_the_output_buffer_is_full() -> None:
     mcu, count = FakeMcu(TRUE), 1000
     with mcu.spaces():
         mcu.receive(0, LINE * count)
@@ -496,7 +496,7 @@ def test_replies_longer_than_the_commands_are_missing_once_the_output_buffer_is_
     assert {len(line) for _, line in came} == {len(LINE) + 3}
 
 
-def test_spaces_follow_every_comma_and_take_their_time() -> None:
+def test_the_spaces_fault_adds_a_space_after_every_comma_with_its_wire_time() -> None:
     mcu = FakeMcu(TRUE)
     with mcu.spaces():
         (when, data) = drive(mcu, 0, 1)[0]
@@ -504,14 +504,16 @@ def test_spaces_follow_every_comma_and_take_their_time() -> None:
     assert when == drive(FakeMcu(TRUE), 0, 1)[0][0] + 3 * 10 * 1_000_000_000 // 115200 + 1
 
 
-def test_a_trailing_comma_ends_the_answer() -> None:
+def test_the_trailing_comma_fault_ends_the_answer_with_a_comma() -> None:
     mcu = FakeMcu(TRUE)
     with mcu.trailing_comma():
         assert drive(mcu, 0, 5)[-1][1] == LINE[:-2] + b",\r\n"
 
 
 @each(("motor", "token"), [(0, b"ap18.75"), (1, b"bn13.12"), (2, b"cp22.50"), (3, b"dn15.38")])
-def test_a_bias_is_on_one_motors_report_and_on_nothing_real(motor: int, token: bytes) -> None:
+def test_a_bias_changes_the_report_of_one_motor_but_not_its_motion(
+    motor: int, token: bytes
+) -> None:
     mcu, sound = FakeMcu(TRUE), FakeMcu(TRUE)
     with mcu.bias(motor, 1.5):
         data = drive(mcu, 0, 5)[-1][1]
@@ -524,7 +526,7 @@ def test_a_bias_is_on_one_motors_report_and_on_nothing_real(motor: int, token: b
     assert mcu.vehicle.angles == sound.vehicle.angles
 
 
-def test_two_biases_hold_at_once() -> None:
+def test_two_biases_can_be_active_together() -> None:
     mcu = FakeMcu(TRUE)
     with mcu.bias(0, 0.0), mcu.bias(2, 0.0):
         assert drive(mcu, 0, 5)[-1][1] == b"ap00.00,bn08.75,cp00.00,dn10.25\r\n"
@@ -544,7 +546,7 @@ def test_a_stuck_encoder_reports_zero_while_its_wheel_turns(motor: int) -> None:
 
 
 @each("motor", range(4))
-def test_a_frozen_encoder_says_the_speed_it_had_whatever_its_wheel_does(motor: int) -> None:
+def test_a_frozen_encoder_keeps_its_last_speed_while_its_wheel_stops(motor: int) -> None:
     mcu = FakeMcu(TRUE)
     before = drive(mcu, 0, 5)[-1][1][:-2].split(b",")
     with mcu.frozen_encoder(motor):
@@ -587,7 +589,7 @@ def test_an_unprompted_mcu_reports_by_its_own_clock_unpadded_and_with_a_comma() 
     assert mcu.valid_lines == 40
 
 
-def test_an_unprompted_mcu_reports_also_when_nothing_is_said_to_it() -> None:
+def test_an_unprompted_mcu_reports_also_without_commands() -> None:
     mcu = FakeMcu(TRUE)
     with mcu.free_running(0.05):
         found = replies(mcu, 1000 * MS)
@@ -611,13 +613,13 @@ def test_entering_unprompted_twice_does_not_double_its_rate() -> None:
     assert out.count(b"\n") <= 10
 
 
-def test_an_unprompted_mcu_says_nothing_while_it_boots() -> None:
+def test_an_unprompted_mcu_sends_nothing_while_it_boots() -> None:
     mcu = FakeMcu(replace(TRUE, sim=SimConfig(boot_time=1.0)))
     with mcu.free_running(0.1):
         assert mcu.advance(900 * MS) == b""
 
 
-def test_a_latching_mcu_is_not_poisoned_by_words() -> None:
+def test_a_comma_latched_mcu_survives_a_speed_that_is_not_a_number() -> None:
     mcu = FakeMcu(Config())
     with mcu.comma_latched():
         mcu.receive(0, b"apnan,bp01.00,cp01.00,dp01.00,\r\n")
@@ -641,7 +643,7 @@ def joined(found: Heard) -> bytes:
     return b"".join(data for _, data in found)
 
 
-def test_a_usb_adapter_hands_on_every_16_ms_and_loses_nothing() -> None:
+def test_a_usb_adapter_delivers_every_16_ms_and_loses_nothing() -> None:
     mcu = FakeMcu(TRUE)
     with mcu.ftdi():
         found = arrivals(mcu)
@@ -660,7 +662,7 @@ def test_a_full_packet_of_the_adapter_does_not_wait() -> None:
     assert joined(found) == joined(arrivals(FakeMcu(TRUE)))
 
 
-def test_what_the_adapter_holds_when_the_fault_ends_still_comes_in_order() -> None:
+def test_data_that_the_adapter_holds_when_the_fault_ends_arrive_in_order() -> None:
     mcu, sound = FakeMcu(TRUE), FakeMcu(TRUE)
     with mcu.ftdi(latency_s=10.0):
         assert drive(mcu, 0, 1) == []
@@ -673,7 +675,7 @@ def test_what_the_adapter_holds_when_the_fault_ends_still_comes_in_order() -> No
     assert len(whole) == len(later) + len(LINE)
 
 
-def test_in_a_stall_nothing_comes_and_after_it_all_of_it_at_once() -> None:
+def test_no_data_arrive_during_a_stall_and_all_of_them_after_it() -> None:
     mcu = FakeMcu(TRUE)
     with mcu.stalls(0.5, 0.15):
         found = arrivals(mcu)
@@ -683,7 +685,7 @@ def test_in_a_stall_nothing_comes_and_after_it_all_of_it_at_once() -> None:
     assert joined(found) == joined(arrivals(FakeMcu(TRUE)))
 
 
-def test_stalls_and_an_adapter_together_lose_nothing_either() -> None:
+def test_stalls_and_an_adapter_together_lose_no_data() -> None:
     mcu = FakeMcu(TRUE)
     with mcu.ftdi(), mcu.stalls(0.3, 0.1):
         found = arrivals(mcu)

@@ -15,7 +15,7 @@ def switches(faults: Faults) -> dict[str, object]:
     return {k: v for k, v in vars(faults).items() if not k.startswith("_")}
 
 
-def test_every_fault_that_needs_no_argument_is_offered_by_its_name() -> None:
+def test_every_fault_without_required_arguments_is_in_the_list_of_faults() -> None:
     methods = vars(Faults) | vars(FakeMcu)
     free = {
         name
@@ -35,7 +35,7 @@ BOARDS = ("free_running", "estop", "bumpers")
 
 
 @each("name", [name for name in FAULTS if name not in BOARDS])
-def test_a_fault_turns_its_switch_and_turns_it_back(name: str) -> None:
+def test_a_fault_changes_its_switch_and_restores_it(name: str) -> None:
     faults = Faults()
     before = switches(faults)
     with getattr(faults, name)():
@@ -43,7 +43,7 @@ def test_a_fault_turns_its_switch_and_turns_it_back(name: str) -> None:
     assert switches(faults) == before
 
 
-def test_every_fifth_is_every_fifth() -> None:
+def test_a_fault_of_every_fifth_reply_hits_each_fifth_reply() -> None:
     faults = Faults()
     with faults.lost_replies(every=5):
         hits = [faults._hit("reply", faults.lose_reply) for _ in range(10)]
@@ -51,7 +51,7 @@ def test_every_fifth_is_every_fifth() -> None:
     assert not any(faults._hit("reply", faults.lose_reply) for _ in range(10))
 
 
-def test_a_bit_error_turns_one_bit_and_another_each_time() -> None:
+def test_a_bit_error_flips_one_bit_and_a_different_one_each_time() -> None:
     faults, data = Faults(), bytes(40)
     with faults.bit_errors(every=1):
         turned = [int.from_bytes(faults._damaged(data), "big") for _ in range(320)]
@@ -60,7 +60,7 @@ def test_a_bit_error_turns_one_bit_and_another_each_time() -> None:
     assert faults._damaged(data) == data
 
 
-def test_no_data_cannot_be_damaged() -> None:
+def test_bit_errors_leave_empty_data_unchanged() -> None:
     faults = Faults()
     with faults.bit_errors(every=1):
         assert faults._damaged(b"") == b""
@@ -70,7 +70,7 @@ EXAMPLE = {"m": "b", "mm": "b:c", "mn": "b:2", "n": "9600", "nn": "5:0.1", "nnn"
 EACH = (*FAULTS, *(f"{name}={EXAMPLE[kinds]}" for name, kinds in ARGUMENTS.items()))
 
 
-def test_each_fault_can_be_turned_on_and_back() -> None:
+def test_each_named_fault_can_be_turned_on_and_off() -> None:
     mcu = FakeMcu(Config())
     before = dict(vars(mcu))
     for text in EACH:
@@ -79,7 +79,7 @@ def test_each_fault_can_be_turned_on_and_back() -> None:
         assert vars(mcu) == before, text
 
 
-def test_what_the_configuration_names_it_has_from_its_start_on() -> None:
+def test_a_fault_in_the_configuration_is_active_from_the_start() -> None:
     for text in EACH:
         mcu, told = FakeMcu(Config()), FakeMcu(Config(sim=SimConfig(faults=(text,))))
         with mcu.having(named(text)):
@@ -87,7 +87,7 @@ def test_what_the_configuration_names_it_has_from_its_start_on() -> None:
                 assert getattr(told, switch) == getattr(mcu, switch), (text, switch)
 
 
-def test_it_has_all_of_them_at_once() -> None:
+def test_several_faults_in_the_configuration_are_active_together() -> None:
     told = FakeMcu(Config(sim=SimConfig(faults=("ftdi", "stalls=5:0.15"))))
     assert (told.latency_ns, told.stall_every_ns, told.stall_ns) == (
         16_000_000, 5_000_000_000, 150_000_000,

@@ -16,13 +16,13 @@ MANY = range(20_000)
 
 
 @given(seed, st.integers(0, 2**40))
-def test_the_same_number_of_a_seed_is_always_the_same(one: int, n: int) -> None:
+def test_the_nth_number_of_a_seed_is_always_the_same(one: int, n: int) -> None:
     assert uniform(one, n) == uniform(one, n)
     assert 0.0 <= uniform(one, n) < 1.0
 
 
 @given(st.integers(0, 2**32))
-def test_neighbouring_seeds_have_nothing_in_common(one: int) -> None:
+def test_neighbouring_seeds_share_no_numbers(one: int) -> None:
     assert not {uniform(one, n) for n in range(50)} & {uniform(one + 1, n) for n in range(50)}
 
 
@@ -40,7 +40,7 @@ def test_normal_numbers_have_mean_0_and_deviation_1() -> None:
     assert sum(abs(one) > 2 for one in drawn) / 20_000 == pytest.approx(0.0455, abs=0.006)
 
 
-def test_normal_numbers_do_not_know_of_each_other() -> None:
+def test_consecutive_normal_numbers_are_uncorrelated() -> None:
     drawn = [gauss(3, n) for n in MANY]
     products = [a * b for a, b in itertools.pairwise(drawn)]
     assert statistics.fmean(products) == pytest.approx(0.0, abs=5 / 20_000**0.5)

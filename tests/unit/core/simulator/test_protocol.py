@@ -19,7 +19,7 @@ def closed(body: bytes) -> bytes:
 
 
 @each("end", [END, b"\n", b",\r\n", b",\n"])
-def test_a_plain_line_is_a_command_to_all_of_them(end: bytes) -> None:
+def test_every_parser_accepts_a_plain_line(end: bytes) -> None:
     assert whole(PLAIN + end) == plain_only(PLAIN + end) == Command(VALUES)
     assert prefix(PLAIN + end) == Command(VALUES)
     assert latched(PLAIN + b",").values == VALUES
@@ -34,7 +34,7 @@ def test_a_plain_line_is_a_command_to_all_of_them(end: bytes) -> None:
         (b",#A0S", b"A0", True),
     ],
 )
-def test_a_checked_line_has_a_sequence_and_requests(
+def test_a_checked_line_is_parsed_with_its_sequence_and_requests(
     suffix: bytes, sequence: bytes, sample: bool
 ) -> None:
     assert whole(closed(PLAIN + suffix)) == Command(VALUES, sequence, sample)
@@ -60,11 +60,11 @@ def test_a_checked_line_has_a_sequence_and_requests(
         b"\x00" + closed(PLAIN + b"#07"),
     ],
 )
-def test_a_suffix_that_is_not_right_in_all_makes_it_no_line(line: bytes) -> None:
+def test_a_line_with_any_error_in_its_suffix_is_refused(line: bytes) -> None:
     assert whole(line) is None
 
 
-def test_the_old_firmwares_run_a_checked_line_as_the_plain_one() -> None:
+def test_the_old_firmwares_obey_a_checked_line_as_a_plain_one() -> None:
     assert prefix(closed(PLAIN + b"#07S")) == Command(VALUES)
     assert latched(closed(PLAIN + b",#07S")).values == VALUES
     assert latched(closed(PLAIN + b"#07S")).values == {0: 12.5, 1: -8.75, 2: 15.0}
@@ -72,17 +72,17 @@ def test_the_old_firmwares_run_a_checked_line_as_the_plain_one() -> None:
 
 
 @each("line", [b"", b"\r\n", b"?", PLAIN[:30], PLAIN[1:], b"\xff" * 50])
-def test_what_is_no_line_is_none(line: bytes) -> None:
+def test_data_that_are_not_a_line_are_refused(line: bytes) -> None:
     assert whole(line) is plain_only(line) is prefix(line) is None
 
 
-def test_a_reply_is_padded_or_not() -> None:
+def test_a_reply_is_written_with_or_without_padding() -> None:
     speeds = (12.5, -8.75, 0.0, -120.0)
     assert protocol.speeds_text(speeds, ",", False) == b"ap12.50,bn08.75,cp00.00,dn99.99"
     assert protocol.speeds_text(speeds, ", ", True) == b"ap12.50, bn8.75, cp0.00, dn99.99"
 
 
-def test_the_suffix_of_a_reply_closes_it_with_its_check() -> None:
+def test_the_suffix_of_a_reply_contains_its_check_and_sample() -> None:
     assert PLAIN + protocol.suffix(PLAIN, b"07", ()) + END == closed(PLAIN + b"#07")
     sample = (65536 + 4000, 1, -1, 32768, -32769)
     assert PLAIN + protocol.suffix(PLAIN, b"07", sample) + END == closed(
@@ -90,7 +90,7 @@ def test_the_suffix_of_a_reply_closes_it_with_its_check() -> None:
     )
 
 
-def test_the_identity_names_the_firmware_and_is_no_command() -> None:
+def test_the_identity_line_names_the_firmware_and_is_not_a_command() -> None:
     line = protocol.identity(3200, 300, sample=True)
     assert line == b"!acsard-mcu 1 counts=3200 watchdog_ms=300 check=1 sample=1\r\n"
     assert whole(line) is prefix(line) is plain_only(line) is None

@@ -28,48 +28,48 @@ def seen(config: Config = TRUE, seconds: float = 1.0, step_ms: int = 5) -> list[
     return sights
 
 
-def test_it_is_looked_at_every_10_ms_however_time_is_cut() -> None:
+def test_the_robot_is_observed_every_10_ms_for_any_step_size() -> None:
     for step_ms in (1, 5, 20):
         assert [sight.at_ns for sight in seen(step_ms=step_ms)] == [
             (n + 1) * LOOK_NS for n in range(100)
         ]
 
 
-def test_a_look_sees_the_true_pose_of_that_very_time() -> None:
+def test_an_observation_has_the_true_pose_of_its_time() -> None:
     config = Config(sim=replace(TRUE.sim, track_multiplier=1.6))
     late, early = seen(config)[-1], seen(config)[49]
     turned = late.pose.yaw - early.pose.yaw
     assert turned == pytest.approx(RATE / 1.6 * 0.5)
 
 
-def test_who_is_looked_at_answers_the_same_bytes() -> None:
+def test_an_observed_board_answers_the_same_bytes() -> None:
     watched, alone = WatchedMcu(TRUE, 0, lambda sight: None), FakeMcu(TRUE)
     for mcu in (watched, alone):
         mcu.receive(0, LINE)
     assert watched.advance(100 * MS) == alone.advance(100 * MS) != b""
 
 
-def test_a_look_is_something_to_do() -> None:
+def test_the_next_observation_is_the_next_event_of_an_idle_board() -> None:
     mcu = WatchedMcu(TRUE, 7, lambda sight: None)
     assert mcu.next_ns() == 7 + LOOK_NS
     mcu.receive(7, LINE)
     assert mcu.next_ns() < 7 + LOOK_NS
 
 
-def test_a_good_gyro_says_the_true_turn() -> None:
+def test_an_ideal_gyro_measures_the_true_turn_rate() -> None:
     sights = seen()
     assert [sight.gyro for sight in sights[50:]] == pytest.approx([RATE] * 50)
     assert sum(sight.gyro for sight in sights) * 0.01 == pytest.approx(sights[-1].pose.yaw)
 
 
-def test_its_bias_is_on_every_sample() -> None:
+def test_the_gyro_bias_is_added_to_every_sample() -> None:
     biased = seen(Config(sim=replace(TRUE.sim, gyro_bias=-0.03)))
     assert [b.gyro - g.gyro for b, g in zip(biased, seen(), strict=True)] == pytest.approx(
         [-0.03] * 100
     )
 
 
-def test_its_noise_is_another_on_every_sample_and_the_same_for_the_same_seed() -> None:
+def test_the_gyro_noise_varies_and_depends_on_the_seed_only() -> None:
     sim = replace(TRUE.sim, gyro_noise=0.02)
     noise = [b.gyro - g.gyro for b, g in zip(seen(Config(sim=sim)), seen(), strict=True)]
     assert statistics.pstdev(noise) == pytest.approx(0.02, rel=0.3)
@@ -78,13 +78,13 @@ def test_its_noise_is_another_on_every_sample_and_the_same_for_the_same_seed() -
 
 
 @pytest.mark.parametrize("periods", [1, 5, 20])
-def test_a_late_gyro_says_later_what_it_would_have_said(periods: int) -> None:
+def test_a_late_gyro_repeats_the_ideal_samples_later(periods: int) -> None:
     late = seen(Config(sim=replace(TRUE.sim, gyro_delay=periods * 0.01)))
     prompt = [0.0] * periods + [sight.gyro for sight in seen()]
     assert [sight.gyro for sight in late] == pytest.approx(prompt[:100])
 
 
-def test_a_delay_between_two_looks_is_kept_too() -> None:
+def test_a_gyro_delay_between_two_observations_is_exact() -> None:
     late = seen(Config(sim=replace(TRUE.sim, gyro_delay=0.025)))
     turned = sum(sight.gyro for sight in late) * 0.01
     assert turned == pytest.approx(seen()[-1].pose.yaw - RATE * 0.025)

@@ -19,7 +19,7 @@ SIGHT = Sight(7, Pose(1.5, -2.0, math.pi / 2), 0.25)
 WALL_NS = 1_700_000_003_250_000_001
 
 
-def test_the_true_pose_is_the_one_that_was_seen_with_the_time_of_the_look() -> None:
+def test_the_true_pose_is_the_observed_one_with_the_time_of_the_observation() -> None:
     told = true_pose(SIGHT, WALL_NS)
     assert told.header.stamp == Time(1_700_000_003, 250_000_001)
     assert told.pose.position == Vector3(1.5, -2.0, 0.0)
@@ -27,13 +27,13 @@ def test_the_true_pose_is_the_one_that_was_seen_with_the_time_of_the_look() -> N
     assert (turn.x, turn.y, turn.z, turn.w) == pytest.approx((0.0, 0.0, 0.5**0.5, 0.5**0.5))
 
 
-def test_the_truth_is_in_no_frame_of_odometry() -> None:
+def test_the_true_pose_is_not_in_a_frame_of_the_odometry() -> None:
     frames = OdometryConfig()
     assert true_pose(SIGHT, WALL_NS).header.frame_id not in (frames.odom_frame, frames.base_frame)
 
 
 @pytest.mark.parametrize("form", FORMATS)
-def test_what_its_gyro_says_is_read_as_any_gyros(form: Format) -> None:
+def test_a_sample_of_the_simulated_gyro_is_read_like_one_of_any_gyro(form: Format) -> None:
     said = turn_rate(SIGHT, "base_link", 0.02, WALL_NS)
     got = reading(Arrival("imu", True, encode(said, form), "", 7, None, ""))
     assert (got.at_ns, got.stamp_ns, got.rate) == (7, WALL_NS, 0.25)

@@ -33,7 +33,7 @@ def moved(seconds: float, *set_points: float, lag: float = 0.0, **changes: float
     return made
 
 
-def test_it_stands_still_until_it_is_asked_to_move() -> None:
+def test_the_vehicle_stands_still_until_it_is_commanded_to_move() -> None:
     made = vehicle()
     made.advance(100.0)
     assert made.speeds == made.angles == [0.0] * 4
@@ -49,20 +49,20 @@ def test_a_motor_approaches_its_set_point_exponentially(seconds: float) -> None:
     assert made.angles == pytest.approx([10.0 * turned, -5.0 * turned, 0.0, 2.0 * turned])
 
 
-def test_after_one_time_constant_63_percent_are_reached() -> None:
+def test_a_motor_reaches_63_percent_after_one_time_constant() -> None:
     assert moved(LAG, 10.0, 10.0, 10.0, 10.0, lag=LAG).speeds == pytest.approx(
         [6.3212] * 4, abs=1e-4
     )
 
 
-def test_without_lag_the_speed_is_there_at_once() -> None:
+def test_without_lag_a_motor_reaches_its_set_point_instantly() -> None:
     made = moved(0.001, 1.0, 2.0, 3.0, 4.0)
     assert made.speeds == [1.0, 2.0, 3.0, 4.0]
     assert made.angles == pytest.approx([0.001, 0.002, 0.003, 0.004])
 
 
 @given(st.lists(st.floats(1e-4, 0.5), min_size=1, max_size=12), four, four)
-def test_speeds_and_angles_do_not_depend_on_how_the_time_is_cut(
+def test_speeds_and_angles_do_not_depend_on_the_time_steps(
     pieces: list[float], start: list[float], goal: list[float]
 ) -> None:
     whole, cut = vehicle(), vehicle()
@@ -78,7 +78,7 @@ def test_speeds_and_angles_do_not_depend_on_how_the_time_is_cut(
 
 
 @given(st.lists(st.floats(1e-4, 0.5), min_size=1, max_size=12), speed, speed)
-def test_a_path_from_rest_does_not_depend_on_how_the_time_is_cut(
+def test_a_path_from_rest_does_not_depend_on_the_time_steps(
     pieces: list[float], left: float, right: float
 ) -> None:
     whole, cut = vehicle(), vehicle()
@@ -91,21 +91,21 @@ def test_a_path_from_rest_does_not_depend_on_how_the_time_is_cut(
 
 
 @pytest.mark.parametrize("dt", [0.0, -1.0])
-def test_no_time_moves_nothing(dt: float) -> None:
+def test_a_time_step_of_zero_or_less_moves_nothing(dt: float) -> None:
     made = moved(1.0, 5.0, 5.0, 5.0, 5.0, lag=LAG)
     before = (list(made.speeds), list(made.angles), made.pose)
     made.advance(dt)
     assert (made.speeds, made.angles, made.pose) == before
 
 
-def test_a_stopped_motor_comes_to_rest_for_good() -> None:
+def test_a_stopped_motor_comes_to_a_complete_rest() -> None:
     made = moved(1.0, 5.0, 5.0, 5.0, 5.0, lag=LAG)
     made.set_points[:] = [0.0] * 4
     made.advance(10.0)
     assert made.speeds == [0.0] * 4
 
 
-def test_straight_on_is_radius_times_angle() -> None:
+def test_straight_ahead_the_distance_is_radius_times_angle() -> None:
     made = moved(2.0, 10.0, 10.0, 10.0, 10.0)
     assert made.pose.x == pytest.approx(10.0 * 2.0 * RADIUS)
     assert (made.pose.y, made.pose.yaw) == (0.0, 0.0)
@@ -118,12 +118,12 @@ def test_motors_a_and_d_are_on_the_right() -> None:
     assert moved(0.1, 0.0, 1.0, 1.0, 0.0).pose.yaw < 0
 
 
-def test_a_turn_on_the_spot_does_not_leave_it() -> None:
+def test_a_turn_on_the_spot_does_not_change_the_position() -> None:
     made = moved(0.7, 3.0, -3.0, -3.0, 3.0)
     assert (made.pose.x, made.pose.y) == pytest.approx((0.0, 0.0))
 
 
-def test_a_quarter_circle_ends_a_radius_ahead_and_a_radius_aside() -> None:
+def test_a_quarter_circle_ends_one_radius_ahead_and_one_radius_to_the_side() -> None:
     # v = 0.5 m/s and w = 0.5 rad/s give a circle of 1 m radius.
     right, left = (0.5 + 0.5 * TRACK / 2) / RADIUS, (0.5 - 0.5 * TRACK / 2) / RADIUS
     made = moved(math.pi, right, left, left, right)
@@ -131,7 +131,7 @@ def test_a_quarter_circle_ends_a_radius_ahead_and_a_radius_aside() -> None:
     assert made.pose.yaw == pytest.approx(math.pi / 2)
 
 
-def test_the_mean_of_a_side_moves_it() -> None:
+def test_the_mean_wheel_speed_of_each_side_moves_the_vehicle() -> None:
     assert moved(0.5, 6.0, 1.0, 5.0, 2.0).pose == moved(0.5, 4.0, 3.0, 3.0, 4.0).pose
 
 
@@ -156,7 +156,7 @@ def test_the_radius_multipliers_and_the_effective_track_shape_the_path() -> None
 
 
 @pytest.mark.parametrize("slip", [0.0, 0.25, 1.0])
-def test_slip_takes_its_share_of_the_turn_and_nothing_of_the_way(slip: float) -> None:
+def test_slip_reduces_the_turn_by_its_share_but_not_the_distance(slip: float) -> None:
     turned = moved(0.1, 3.0, -3.0, -3.0, 3.0, turn_slip=slip)
     assert turned.pose.yaw == pytest.approx((1 - slip) * 0.1)
     assert turned.angles == pytest.approx([0.3, -0.3, -0.3, 0.3])
@@ -164,14 +164,14 @@ def test_slip_takes_its_share_of_the_turn_and_nothing_of_the_way(slip: float) ->
 
 
 @pytest.mark.parametrize("load", [0.0, 0.25, 1.0])
-def test_load_takes_its_share_of_every_speed(load: float) -> None:
+def test_load_reduces_every_speed_by_its_share(load: float) -> None:
     made = moved(2.0, 10.0, 10.0, -10.0, 10.0, load=load)
     assert made.speeds == pytest.approx([s * (1 - load) for s in (10.0, 10.0, -10.0, 10.0)])
     assert made.angles == pytest.approx([s * (1 - load) * 2 for s in (10.0, 10.0, -10.0, 10.0)])
 
 
 @pytest.mark.parametrize("speed", [0.5, -0.12])
-def test_hands_move_it_whatever_its_motors_do(speed: float) -> None:
+def test_a_push_moves_the_vehicle_whatever_its_motors_do(speed: float) -> None:
     made = moved(1.0, 10.0, -10.0, 3.0, 0.0)
     before = made.pose
     made.advance(2.0, push=speed)
@@ -196,12 +196,12 @@ def turned(seconds: float, sim: SimConfig, *set_points: float, steps: int = 1) -
     return made.turned
 
 
-def test_a_wider_true_track_turns_it_less_than_it_is_believed_to() -> None:
+def test_a_wider_true_track_reduces_the_true_turn() -> None:
     sim = SimConfig(motor_time_constant=0.0, track_multiplier=1.6)
     assert turned(10.0, sim) == pytest.approx(10.0 / 1.6)
 
 
-def test_each_sides_true_radius_counts() -> None:
+def test_the_true_wheel_radius_of_each_side_changes_the_true_turn() -> None:
     sim = SimConfig(
         motor_time_constant=0.0, left_radius_multiplier=0.98, right_radius_multiplier=1.01
     )
@@ -214,7 +214,7 @@ def test_each_sides_true_radius_counts() -> None:
 
 @each("direction", [1.0, -1.0])
 @each("dependence", [0.08, -0.3])
-def test_the_track_grows_by_its_share_at_1_rad_per_s_either_way(
+def test_the_track_grows_by_its_share_at_1_rad_per_s_in_both_directions(
     direction: float, dependence: float
 ) -> None:
     sim = SimConfig(motor_time_constant=0.0, track_rate_dependence=dependence)
@@ -225,14 +225,14 @@ def test_the_track_grows_by_its_share_at_1_rad_per_s_either_way(
 
 
 @given(st.floats(-0.4, 2.0), st.floats(0.01, 20.0))
-def test_faster_wheels_never_turn_it_slower(dependence: float, rate: float) -> None:
+def test_faster_wheels_never_turn_the_vehicle_slower(dependence: float, rate: float) -> None:
     sim = SimConfig(motor_time_constant=0.0, track_rate_dependence=dependence)
     slow = turned(1.0, sim, *(rate * wheel for wheel in SPIN))
     fast = turned(1.0, sim, *(1.1 * rate * wheel for wheel in SPIN))
     assert fast > slow > 0.0
 
 
-def test_a_slippery_floor_takes_up_to_its_share_and_another_each_time() -> None:
+def test_a_slippery_floor_takes_a_varying_part_of_the_turn_up_to_its_share() -> None:
     sim = SimConfig(motor_time_constant=0.0, turn_slip=0.4)
     made = Vehicle(sim, DriveConfig())
     made.set_points[:] = SPIN
@@ -246,13 +246,13 @@ def test_a_slippery_floor_takes_up_to_its_share_and_another_each_time() -> None:
     assert sum(kept) / 400 == pytest.approx(0.8, abs=0.03)
 
 
-def test_a_floor_of_the_same_seed_is_the_same_and_another_is_another() -> None:
+def test_the_slip_of_the_floor_depends_on_the_seed_only() -> None:
     one, other = (SimConfig(turn_slip=0.4, seed=seed) for seed in (1, 2))
     assert turned(5.0, one, steps=500) == turned(5.0, one, steps=500)
     assert turned(5.0, one, steps=500) != turned(5.0, other, steps=500)
 
 
-def test_whole_turns_are_counted_beside_the_pose() -> None:
+def test_the_total_turn_counts_whole_turns_that_the_yaw_of_the_pose_wraps() -> None:
     made = moved(12.0, *SPIN)
     assert made.turned == pytest.approx(12.0)
     assert math.remainder(made.turned - made.pose.yaw, math.tau) == pytest.approx(0.0, abs=1e-9)

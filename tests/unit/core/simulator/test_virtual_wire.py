@@ -12,7 +12,7 @@ from acsard.core.simulator.virtual_wire import VirtualWire
 LINE = Codec(WheelMap()).stop
 
 
-def test_what_is_sent_is_answered_in_time() -> None:
+def test_a_line_is_answered_at_its_virtual_time() -> None:
     wire = VirtualWire(FakeMcu(Config()), 1000)
     wire.open(115200)
     wire.send(LINE)
@@ -24,7 +24,7 @@ def test_what_is_sent_is_answered_in_time() -> None:
     assert wire.now_ns() == 20_000_000
 
 
-def test_a_wrong_rate_garbles() -> None:
+def test_a_line_at_a_wrong_baud_rate_is_garbled() -> None:
     mcu = FakeMcu(Config())
     wire = VirtualWire(mcu)
     wire.open(57600)
@@ -36,7 +36,7 @@ def test_a_wrong_rate_garbles() -> None:
         assert wire.listen(100_000_000)[0][1] == LINE
 
 
-def test_a_closed_wire_carries_nothing() -> None:
+def test_sending_on_a_closed_wire_raises_an_error() -> None:
     wire = VirtualWire(FakeMcu(Config()))
     wire.open(115200)
     wire.close()
