@@ -137,7 +137,7 @@ def followed(t: float, last: float, sent: list[float]) -> RobotState:
     return replace(FOLLOWED, linear=last or (0.2 if any(sent) and t < 1.8 else 0.0))
 
 
-def test_a_drive_opens_with_zeros_drives_and_returns_when_the_robot_stands(
+def test_a_drive_starts_with_zeros_and_returns_when_the_robot_is_at_rest(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     world = World(followed)
@@ -152,7 +152,7 @@ def test_a_drive_opens_with_zeros_drives_and_returns_when_the_robot_stands(
     assert world.asked == 0
 
 
-def test_a_state_that_is_published_seldom_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_state_that_is_rarely_published_is_queried(monkeypatch: pytest.MonkeyPatch) -> None:
     world = World(followed)
     world.published = False
     assert world.drive(monkeypatch) < 2.0
@@ -160,7 +160,7 @@ def test_a_state_that_is_published_seldom_is_asked_for(monkeypatch: pytest.Monke
     assert world.asked < 12
 
 
-def test_an_answer_that_comes_on_another_thread_is_read_on_the_one_that_drives(
+def test_an_answer_of_another_thread_is_processed_on_the_driving_thread(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The received state, its time and its objection must belong to one state.
@@ -263,7 +263,7 @@ def test_a_drive_that_is_not_followed_ends_with_the_reason_and_a_zero(
     assert not world.subscribed
 
 
-def test_a_short_drive_that_hardly_counted_does_not_return_as_if_it_had(
+def test_a_short_drive_that_was_hardly_followed_does_not_return_as_a_success(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     with pytest.raises(NotDrivenError, match="has priority"):
@@ -282,7 +282,7 @@ def test_a_moment_without_the_robot_does_not_end_a_drive(monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("begins", [0.1, 0.9], ids=["opening", "driving"])
-def test_a_drive_does_not_go_on_after_this_program_stood_still(
+def test_a_drive_ends_after_the_client_program_stalled(
     monkeypatch: pytest.MonkeyPatch, begins: float
 ) -> None:
     """The daemon publishes its state as always, and one state waits in the queue."""
@@ -297,7 +297,7 @@ def test_a_drive_does_not_go_on_after_this_program_stood_still(
     assert not world.subscribed
 
 
-def test_a_drive_whose_end_passed_while_this_program_stood_still_was_not_finished(
+def test_a_drive_whose_end_passed_during_a_stall_of_the_client_is_not_a_success(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     world = World(followed)
@@ -307,7 +307,7 @@ def test_a_drive_whose_end_passed_while_this_program_stood_still_was_not_finishe
 
 
 @pytest.mark.parametrize("begins", [0.1, 0.9], ids=["opening", "driving"])
-def test_a_drive_does_not_go_on_after_the_bus_accepted_no_command(
+def test_a_drive_ends_if_the_bus_accepts_no_command(
     monkeypatch: pytest.MonkeyPatch, begins: float
 ) -> None:
     world = World(followed)
@@ -335,7 +335,7 @@ def test_a_drive_goes_on_after_a_short_stall(monkeypatch: pytest.MonkeyPatch) ->
     assert world.sent.count(0.5) > 10
 
 
-def test_a_drive_that_only_waits_for_the_robot_to_stand_may_stand_still(
+def test_a_client_may_stall_while_it_only_waits_for_the_robot_to_stop(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     world = World(followed)
@@ -345,7 +345,7 @@ def test_a_drive_that_only_waits_for_the_robot_to_stand_may_stand_still(
 
 @pytest.mark.parametrize("seconds", [0.4, 1.0, 60.0])
 @pytest.mark.parametrize("dies", [0.35, 0.7, 1.0])
-def test_a_robot_that_died_does_not_drive_because_a_storage_still_has_its_state(
+def test_a_stored_state_of_a_dead_robot_does_not_keep_a_drive_running(
     monkeypatch: pytest.MonkeyPatch, seconds: float, dies: float
 ) -> None:
     """The storage belongs to a router and answers with the robot's last state."""
@@ -359,7 +359,7 @@ def test_a_robot_that_died_does_not_drive_because_a_storage_still_has_its_state(
 
 
 @pytest.mark.parametrize("last", [FOLLOWED, STOPPED, replace(FOLLOWED, sender="")])
-def test_the_state_that_a_storage_has_of_a_robot_that_is_long_dead_begins_no_drive(
+def test_a_stored_state_of_a_robot_that_died_long_ago_starts_no_drive(
     monkeypatch: pytest.MonkeyPatch, last: RobotState
 ) -> None:
     world = World(followed)
@@ -378,7 +378,7 @@ def test_a_daemon_of_another_version_is_distinguished_from_a_dead_one(
         world.drive(monkeypatch)
 
 
-def test_a_connection_that_is_closed_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_closed_connection_ends_the_drive(monkeypatch: pytest.MonkeyPatch) -> None:
     world = World(followed)
     world.set_clock(monkeypatch)
     robot: Any = world
@@ -411,7 +411,7 @@ def test_a_drive_on_a_connection_that_is_closed_ends_with_an_error_that_the_docs
             pass
 
 
-def test_what_is_no_number_is_refused_before_anything_is_sent() -> None:
+def test_a_value_that_is_not_a_number_is_refused_before_a_command_is_sent() -> None:
     world: Any = World(followed)
     given: Any
     for given in (float("nan"), float("inf"), "0.1", None, [0.1]):
@@ -426,7 +426,9 @@ def test_what_is_no_number_is_refused_before_anything_is_sent() -> None:
 
 
 @pytest.mark.parametrize("seconds", [0, -1, -0.5])
-def test_a_drive_of_no_time_is_refused_before_anything_is_sent(seconds: float) -> None:
+def test_a_drive_without_a_positive_duration_is_refused_before_a_command_is_sent(
+    seconds: float,
+) -> None:
     world: Any = World(followed)
     with pytest.raises(UsageError, match=f"seconds = {seconds:g}: a drive needs a time above 0"):
         next(drive(world, 5.0, 0.0, seconds))
@@ -449,7 +451,7 @@ def test_a_drive_of_no_time_is_refused_before_anything_is_sent(seconds: float) -
         (replace(STOPPED, mode="ready", sources=[source("app may be late")]), "may be late"),
     ],
 )
-def test_the_objection_is_in_the_words_of_the_daemon(state: RobotState, words: str) -> None:
+def test_the_error_has_the_reason_that_the_daemon_reports(state: RobotState, words: str) -> None:
     found = objection(state, "app", US)
     assert (
         found.startswith(words)
