@@ -156,7 +156,7 @@ def test_a_sender_that_leaves_after_its_timeout_stops_no_other_driver(panel: Pan
         assert panel.commander.end(panel.now + int(late * NS_PER_S), 0.25) == zero
 
 
-def test_a_sender_drives_while_it_asks_for_a_speed(panel: Panel) -> None:
+def test_a_sender_drives_while_its_newest_wish_has_a_speed(panel: Panel) -> None:
     assert not panel.commander.drives(panel.now)
     panel.press(AHEAD)
     assert panel.commander.drives(panel.now)

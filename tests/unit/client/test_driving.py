@@ -192,14 +192,16 @@ def test_an_answer_of_another_thread_is_processed_on_the_driving_thread(
     assert readers == {get_ident()}
 
 
-def test_a_robot_that_something_else_moves_is_not_waited_for(
+def test_a_drive_does_not_wait_long_for_a_robot_that_keeps_moving(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     world = World(lambda t, last, sent: replace(FOLLOWED, linear=0.3))
     assert 2.3 < world.drive(monkeypatch) < 3.0
 
 
-def test_a_robot_that_reports_no_speed_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drive_does_not_wait_long_for_a_robot_that_reports_no_speed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def lost(t: float, last: float, sent: list[float]) -> RobotState:
         state = followed(t, last, sent)
         return state if t < 1.3 else replace(state, linear=None, angular=None)
@@ -207,7 +209,7 @@ def test_a_robot_that_reports_no_speed_is_not_waited_for(monkeypatch: pytest.Mon
     assert 2.0 < World(lost).drive(monkeypatch) < 3.0
 
 
-def test_a_long_ramp_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drive_waits_for_the_end_of_a_long_ramp(monkeypatch: pytest.MonkeyPatch) -> None:
     world = World(lambda t, last, sent: replace(FOLLOWED, linear=max(0.0, 0.5 - t / 20)))
     assert 9.7 < world.drive(monkeypatch) < 10.2
 
@@ -270,7 +272,9 @@ def test_a_short_drive_that_was_hardly_followed_does_not_return_as_a_success(
         World(after(0.45, HIGHER)).drive(monkeypatch, 0.8 * GRACE_S)
 
 
-def test_a_moment_without_the_robot_does_not_end_a_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_short_time_in_which_the_robot_follows_no_source_does_not_end_a_drive(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     held_up = replace(FOLLOWED, mode="ready", reason="waiting for a command", source="")
 
     def says(t: float, last: float, sent: list[float]) -> RobotState:
@@ -285,7 +289,7 @@ def test_a_moment_without_the_robot_does_not_end_a_drive(monkeypatch: pytest.Mon
 def test_a_drive_ends_after_the_client_program_stalled(
     monkeypatch: pytest.MonkeyPatch, begins: float
 ) -> None:
-    """The daemon publishes its state as always, and one state waits in the queue."""
+    """The daemon publishes its state during the stall, and one state waits in the queue."""
     world = World(followed)
     world.stalls = begins, 4.0
     words = r"sent no command for 4\.[01] s.*not finished.*suspended"
@@ -319,7 +323,7 @@ def test_a_drive_ends_if_the_bus_accepts_no_command(
     assert world.sent[-1] == 0.0
 
 
-def test_a_drive_begins_however_long_the_bus_takes_to_subscribe(
+def test_a_slow_subscription_does_not_prevent_a_drive(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     world = World(followed)
@@ -328,7 +332,7 @@ def test_a_drive_begins_however_long_the_bus_takes_to_subscribe(
     assert world.sent.count(0.5) in (20, 21)
 
 
-def test_a_drive_goes_on_after_a_short_stall(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drive_continues_after_a_short_stall(monkeypatch: pytest.MonkeyPatch) -> None:
     world = World(followed)
     world.stalls = 0.9, 0.8 * GRACE_S
     assert world.drive(monkeypatch) < 2.1
@@ -393,7 +397,7 @@ def test_a_closed_connection_ends_the_drive(monkeypatch: pytest.MonkeyPatch) -> 
         next(steps)
 
 
-def test_a_drive_on_a_connection_that_is_closed_ends_with_an_error_that_the_docs_name(
+def test_a_drive_on_a_closed_connection_ends_with_a_no_answer_error(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     world = World(followed)

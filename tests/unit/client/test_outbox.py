@@ -57,7 +57,7 @@ def test_only_the_newest_wish_is_sent_after_the_bus_was_blocked(bus: Bus) -> Non
     assert one.replaced == 2
 
 
-def test_a_speed_that_became_too_old_is_dropped_and_a_zero_is_sent(bus: Bus) -> None:
+def test_an_outdated_speed_is_dropped_but_a_zero_is_sent_at_any_age(bus: Bus) -> None:
     dropped: list[bool] = []
     outbox = Outbox(lambda: dropped.append(True))
     blocker, ahead, zero = Commander(), Commander(), Commander()

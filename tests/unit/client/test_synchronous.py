@@ -91,7 +91,7 @@ def test_two_clients_of_one_connection_keep_the_spacing_between_commands(session
 
 
 @pytest.mark.timeout(10)
-def test_a_signal_s_handler_sends_while_the_same_thread_waits_for_its_turn(
+def test_a_signal_handler_can_send_while_the_interrupted_thread_waits_to_send(
     session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     client, sleep = client_of(session), time.sleep
@@ -181,7 +181,7 @@ def test_an_unknown_key_is_reported_as_the_only_reason(session: Session, name: s
         (no_command("app"), True),
     ],
 )
-def test_over_tls_the_role_is_named_only_if_no_command_arrives(
+def test_over_tls_the_error_names_the_role_only_if_no_command_arrived(
     session: Session, monkeypatch: pytest.MonkeyPatch, objection: str, names_role: bool
 ) -> None:
     ours = client_of(session)

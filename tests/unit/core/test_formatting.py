@@ -48,7 +48,7 @@ def test_a_long_byte_string_shows_whole_escapes_from_its_start_or_its_end() -> N
 
 
 @given(st.text(alphabet=st.characters(exclude_categories=["Cs"], max_codepoint=0xFFFF)))
-def test_json_stays_the_same_and_can_be_printed(text: str) -> None:
+def test_printable_json_decodes_to_the_same_value(text: str) -> None:
     line = json_line(json.dumps(text, ensure_ascii=False))
     assert json.loads(line) == text
     assert line.isprintable()
@@ -107,6 +107,6 @@ def test_a_count_agrees_with_its_noun() -> None:
     assert (many(1, "loss", "losses"), many(2, "loss", "losses")) == ("1 loss", "2 losses")
 
 
-def test_a_long_list_says_how_many_are_left_out() -> None:
+def test_a_shortened_list_ends_with_the_number_of_omitted_items() -> None:
     assert listed(["a", "b"], 2) == "a, b"
     assert listed(["a", "b", "c", "d"], 2, "; ") == "a; b; and 2 more"

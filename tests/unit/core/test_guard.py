@@ -775,7 +775,7 @@ def random_walk(rng: random.Random, config: Config) -> Loop:
 
 
 @EACH_CONFIG
-def test_a_healthy_robot_never_trips_the_guard_and_its_wheels_need_a_link_and_a_fresh_command(
+def test_a_healthy_robot_never_trips_the_guard_and_speeds_up_only_by_fresh_commands(
     config: Config,
 ) -> None:
     moved = 0

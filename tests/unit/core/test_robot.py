@@ -285,7 +285,7 @@ def test_clear_is_refused_while_pressed_and_a_sender_needs_a_zero_after_it() -> 
     assert bench.step(GO).mode == "driving"
 
 
-def test_a_clear_in_the_step_of_the_press_does_not_release_it() -> None:
+def test_a_clear_in_the_step_of_the_press_does_not_release_the_stop() -> None:
     bench = Button()
     bench.driving()
     bench.step(ask="stop")
@@ -503,7 +503,7 @@ def test_a_retreat_goes_on_after_the_release_without_its_limits() -> None:
     assert out.reason == "driving: commanded by app"
 
 
-def test_a_second_bumper_behind_a_retreating_robot_ends_the_retreat() -> None:
+def test_a_press_of_the_bumper_in_the_direction_of_the_retreat_ends_the_retreat() -> None:
     bench = Button(FRONT, AWAY)
     bench.linked().step(REST)
     for _ in range(20):
@@ -517,7 +517,7 @@ def test_a_second_bumper_behind_a_retreating_robot_ends_the_retreat() -> None:
     assert bench.step(GO).applied.linear > 0.0
 
 
-def test_without_the_neutral_first_rule_a_command_against_a_bumper_still_does_not_count() -> None:
+def test_a_command_against_a_bumper_is_ignored_also_without_the_neutral_first_rule() -> None:
     config = replace(AWAY, commands=CommandsConfig(neutral_first=False))
     bench = Button(FREE, config)
     bench.driving()
@@ -582,7 +582,7 @@ def test_a_motor_drivers_fault_is_latched_until_a_clear_after_its_end() -> None:
     assert bench.step(GO).mode == "ready"
 
 
-def test_a_clear_in_the_step_of_a_repeated_driver_fault_does_not_release_it() -> None:
+def test_a_clear_in_the_step_of_a_repeated_driver_fault_does_not_release_the_fault() -> None:
     bench = Button(DRIVER_OK)
     bench.driving()
     bench.status(DRIVER_FAULT).step(GO)
@@ -743,7 +743,7 @@ def test_a_board_that_reports_no_inputs_does_not_inherit_those_of_the_previous_b
     assert bench.step(GO).mode == "driving"
 
 
-def test_a_button_that_is_pressed_while_the_board_is_plugged_in_again_is_never_released() -> None:
+def test_clear_is_refused_until_a_replugged_board_reports_the_button_released() -> None:
     bench = Button(PRESSED_LINE)
     bench.linked()
     replugged(bench, b"")
@@ -959,7 +959,7 @@ def test_without_a_port_the_robot_waits_and_reports_the_reason() -> None:
     assert out.reason == "the serial port is closed; it is being reopened"
 
 
-def test_an_open_port_boots_and_three_good_lines_make_it_ready() -> None:
+def test_after_the_port_opens_three_good_lines_make_the_robot_ready() -> None:
     bench = Bench()
     seen = []
     for _ in range(4):
@@ -1098,7 +1098,7 @@ def test_a_commander_that_returns_after_its_timeout_accelerates_from_the_present
     assert bench.step(GO).applied.linear == pytest.approx(left + 0.01)
 
 
-def test_commands_are_counted_and_refusals_by_reason() -> None:
+def test_commands_are_counted_and_refusals_are_counted_by_reason() -> None:
     bench = Bench().linked()
     bench.step(REST, GO)
     refusals = tuple(Refusal(reason, "") for reason in ("malformed", "malformed", "wildcard"))
@@ -1112,7 +1112,7 @@ def test_commands_are_counted_and_refusals_by_reason() -> None:
     assert counters["command_wildcard"] == 1
 
 
-def test_the_last_refusal_is_shown_in_words() -> None:
+def test_the_last_refusal_is_shown_as_text() -> None:
     bench = Bench().linked()
     assert bench.robot.snapshot(bench.now_ns).refused == ""
     bench.step(refusals=(Refusal("wildcard", "cmd/**: no wildcards"),))
@@ -1298,7 +1298,7 @@ def test_a_clear_without_a_latch_succeeds_and_changes_nothing() -> None:
     assert (bench.mode(), bench.out.applied != REST, twist != REST) == (mode, True, True)
 
 
-def test_a_stop_holds_over_a_lost_link() -> None:
+def test_a_stop_stays_latched_after_a_lost_link() -> None:
     bench = Bench().driving()
     bench.step(ask="stop")
     bench.unplug().step()
@@ -1971,7 +1971,7 @@ def test_wheels_that_turn_without_a_command_are_reported_and_counted() -> None:
     assert bench.mode() == "ready"
 
 
-def test_a_wheel_that_stands_while_the_others_roll_is_reported_and_counted() -> None:
+def test_a_wheel_at_rest_while_the_others_roll_is_reported_and_counted() -> None:
     bench = Bench().driving()
     bench.reply = bench.codec.encode(replace(ROLLING, front_left=0.0))
     told = [one.name for _ in range(200) for one in bench.step(GO).events]
@@ -2041,7 +2041,7 @@ def test_adjustments_for_the_clocks_of_senders_are_counted_in_ms() -> None:
     assert "clock_adjustments_ms" in bench.counters()
 
 
-def test_the_latches_of_a_robot_are_those_of_its_last_step() -> None:
+def test_the_latches_of_the_robot_are_those_of_its_last_step() -> None:
     bench = Bench().linked()
     bench.answer("stop")
     assert bench.robot.latches is bench.out.latches

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from acsard.core.thinning import Band, Curve, Place, Point, Track
 
 
-def test_a_short_curve_is_kept_as_it_is() -> None:
+def test_a_short_curve_is_not_thinned() -> None:
     curve = Curve()
     values = [Point(n / 100, math.sin(n)) for n in range(1500)]
     for point in values:

@@ -235,7 +235,7 @@ def test_a_child_ends_when_its_parent_is_killed() -> None:
 
 
 @pytest.mark.slow
-def test_signs_of_life_reach_the_parent_and_never_wait_for_it() -> None:
+def test_signs_of_life_reach_the_parent_and_never_block_the_child() -> None:
     ours, its = socket.socketpair()
     with ours, its:
         parent = Parent(its.fileno())

@@ -60,7 +60,7 @@ def test_an_instant_is_in_whole_microseconds(monkeypatch: pytest.MonkeyPatch) ->
     assert (at.mono_ns % 1000, at.wall_ns) == (0, WALL_NS + 1_000)
 
 
-def test_a_sleep_is_reported_once_and_the_next_one_too() -> None:
+def test_each_suspend_is_reported_once() -> None:
     slept = [5 * MOMENT_NS]
     asleep = Asleep(lambda: slept[0])
     assert not asleep.was()
@@ -70,14 +70,14 @@ def test_a_sleep_is_reported_once_and_the_next_one_too() -> None:
         assert not asleep.was()
 
 
-def test_a_preemption_between_the_two_clock_readings_is_not_reported_as_sleep() -> None:
+def test_a_preemption_between_the_two_clock_readings_is_not_reported_as_a_suspend() -> None:
     readings = [0, 3 * MOMENT_NS, 0, 0]
     asleep = Asleep(lambda: readings.pop(0))
     assert not asleep.was()
     assert not asleep.was()
 
 
-def test_no_sleep_is_reported_on_a_machine_that_is_awake() -> None:
+def test_no_suspend_is_reported_while_the_machine_is_awake() -> None:
     asleep = Asleep(asleep_ns)
     assert not any(asleep.was() for _ in range(1000))
 

@@ -54,7 +54,7 @@ class Flooded(deque[int]):
         return item
 
 
-def test_a_flood_cannot_hold_the_reader() -> None:
+def test_a_flood_of_items_does_not_block_the_reader() -> None:
     box = Mailbox[int](3)
     box.waiting = Flooded([0, 0, 0], maxlen=3)
     assert box.take() == [0, 0, 0]
@@ -185,7 +185,7 @@ def test_closing_the_mailbox_ends_a_wait_that_has_begun() -> None:
 # the bell
 
 
-def test_a_bell_that_rang_many_times_ends_one_wait() -> None:
+def test_a_bell_that_rang_several_times_ends_only_one_wait() -> None:
     bell = Bell()
     for _ in range(3):
         bell.ring()

@@ -59,7 +59,7 @@ def test_each_process_that_has_the_device_open_is_listed_once(device: str) -> No
 
 
 def test_the_holder_of_a_device_is_the_process_with_the_lock(device: str) -> None:
-    assert holder_of(device) is None, "we ourselves do not"
+    assert holder_of(device) is None, "this process does not count as the holder"
     with another(device, "lock") as locker, another(device), another(device):
         found = holder_of(device)
         assert found is not None

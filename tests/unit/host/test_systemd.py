@@ -141,7 +141,7 @@ def test_ready_is_sent_in_one_datagram(manager: Manager) -> None:
     assert manager.heard() == [{"READY": "1"}]
 
 
-def test_stopping_is_reported_with_why(manager: Manager) -> None:
+def test_stopping_is_reported_with_a_status(manager: Manager) -> None:
     systemd(manager).stopping()
     assert manager.heard() == [{"STOPPING": "1", "STATUS": "ramping to zero"}]
 
@@ -192,8 +192,10 @@ def test_the_watchdog_is_fed_at_its_interval_and_not_in_each_step(
     gaps = [b - a for a, b in itertools.pairwise(fed)]
     least = 200 * MS // FEEDS_PER_WATCHDOG
     assert min(gaps) >= least
-    assert max(gaps) < least + period_ms * MS, "at the first step when it is due"
-    assert max(gaps) <= 100 * MS, "systemd's advice: at half the time"
+    assert max(gaps) < least + period_ms * MS, (
+        "the watchdog is fed at the first step when it is due"
+    )
+    assert max(gaps) <= 100 * MS, "systemd advises to feed the watchdog at half its time"
 
 
 @pytest.mark.parametrize(
@@ -288,7 +290,7 @@ def test_a_full_queue_neither_blocks_nor_raises_and_the_watchdog_is_fed_after_it
     began = time.monotonic()
     steps = fill(there)
     assert time.monotonic() - began < 5.0
-    assert 0 < len(manager.heard()) < steps, "it was full"
+    assert 0 < len(manager.heard()) < steps, "the queue was not full"
     there.step(outputs(2000 * NS_PER_S))
     assert {"WATCHDOG": "1"} in manager.heard()
 

@@ -398,7 +398,7 @@ def test_all_contradictions_are_reported_together() -> None:
     assert len(found) == 6
 
 
-def test_rules_between_keys_are_reported_with_the_mistakes_of_other_keys() -> None:
+def test_broken_rules_between_keys_are_reported_with_the_mistakes_of_other_keys() -> None:
     found = problems_of(
         """
         colour = 1

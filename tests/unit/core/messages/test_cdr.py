@@ -401,7 +401,7 @@ def test_padding_is_never_read(frame: int) -> None:
 
 
 @each("surplus", [1, 3, 4, 7, 1000])
-def test_bytes_after_the_message_are_padding(surplus: int) -> None:
+def test_bytes_after_the_message_are_ignored(surplus: int) -> None:
     for payload, message in valid():
         assert Cdr(type(message)).decode(payload + b"\xff" * surplus) == message
 
@@ -487,7 +487,7 @@ def test_sequences_and_arrays_of_structs_are_decoded_as_they_were_encoded() -> N
 
 
 def test_sequences_arrays_and_structs_are_written_item_by_item_in_order() -> None:
-    """Reads the payload value by value with only the struct module."""
+    """Read the payload value by value with only the struct module."""
     payload = encoded(OUTER)
     at = 4
 

@@ -315,7 +315,7 @@ def test_the_commands_name_the_speed_limit_that_slows_the_robot() -> None:
     assert (one.level, one.message) == (OK, "commanded by app; speed limit: 0.3 m/s, set by x")
 
 
-def test_two_programs_on_one_source_are_a_warning_that_names_the_source() -> None:
+def test_two_senders_of_one_source_are_a_warning_that_names_the_source() -> None:
     two = SourceStatus("nav", 10, 0.1, Wait("senders", senders=1))
     alone = SourceStatus("app", 50, 0.1, Wait("nothing"))
     one = row("commands", snapshot=seen(sources=(alone, two)))

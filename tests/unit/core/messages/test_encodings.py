@@ -211,7 +211,7 @@ def test_cdr_that_is_not_the_message_is_refused_as_malformed(payload: bytes) -> 
 
 
 @each("surplus", [1, 3, 4, 7, 100])
-def test_surplus_bytes_after_cdr_are_padding(surplus: int) -> None:
+def test_surplus_bytes_after_a_cdr_message_are_ignored(surplus: int) -> None:
     assert twists.decode("", AS_CDR + b"\xff" * surplus) == TWIST
 
 

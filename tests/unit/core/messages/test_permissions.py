@@ -16,7 +16,7 @@ from tests.each import each
 
 
 @pytest.mark.parametrize("role", ["", *ROLES])
-def test_a_role_has_its_own_permissions_and_those_below_it(role: str) -> None:
+def test_a_role_has_its_own_permissions_and_those_of_lower_roles(role: str) -> None:
     assert [least for least in ROLES if has(role, least)] == list(
         ROLES[: ROLES.index(role) + 1] if role in ROLES else ()
     )
