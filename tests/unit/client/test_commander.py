@@ -53,7 +53,7 @@ def test_each_wish_is_sent_once_after_one_zero(panel: Panel) -> None:
     assert panel.gone == [REST, *[AHEAD] * 5]
 
 
-def test_nothing_is_sent_without_a_wish(panel: Panel) -> None:
+def test_no_command_is_sent_without_a_new_wish(panel: Panel) -> None:
     panel.press(AHEAD, times=2)
     before = len(panel.gone)
     panel.wait(100 * NS_PER_S)
@@ -61,14 +61,14 @@ def test_nothing_is_sent_without_a_wish(panel: Panel) -> None:
     assert panel.commander.due_ns() is None
 
 
-def test_a_silence_is_followed_by_a_zero_first(panel: Panel) -> None:
+def test_the_first_command_after_a_silence_is_preceded_by_a_zero(panel: Panel) -> None:
     panel.press(AHEAD)
     panel.wait(SILENCE_NS)
     panel.press(LEFT)
     assert panel.gone == [REST, AHEAD, REST, LEFT]
 
 
-def test_a_burst_that_was_held_back_moves_nothing(panel: Panel) -> None:
+def test_a_delayed_burst_of_commands_does_not_move_the_robot(panel: Panel) -> None:
     panel.press(AHEAD, times=3)
     panel.wait(2 * NS_PER_S)
     for _ in range(20):
@@ -81,7 +81,7 @@ def test_a_burst_that_was_held_back_moves_nothing(panel: Panel) -> None:
 
 
 @pytest.mark.parametrize("sizes", [(200,), (10, 20, 40, 30)])
-def test_a_burst_that_outlasts_the_wait_for_it_moves_nothing(
+def test_a_delayed_burst_longer_than_the_gathering_time_does_not_move_the_robot(
     panel: Panel, sizes: tuple[int, ...]
 ) -> None:
     panel.press(AHEAD, times=3)
@@ -99,14 +99,14 @@ def test_a_panel_that_sends_often_drives_after_the_first_wait(panel: Panel) -> N
     assert len(panel.gone) > 90
 
 
-def test_after_a_burst_the_present_wish_is_sent(panel: Panel) -> None:
+def test_after_a_burst_the_newest_wish_is_sent(panel: Panel) -> None:
     panel.press(AHEAD, times=4, every_ns=0)
     panel.wait(100 * MS)
     panel.press(LEFT, times=2)
     assert panel.gone == [REST, LEFT, LEFT]
 
 
-def test_of_the_wishes_that_wait_the_newest_is_sent(panel: Panel) -> None:
+def test_only_the_newest_of_several_waiting_wishes_is_sent(panel: Panel) -> None:
     panel.press(AHEAD, times=2)
     panel.commander.take(Wish(AHEAD), panel.now)
     panel.commander.take(Wish(LEFT), panel.now)
@@ -133,7 +133,7 @@ def test_only_the_first_wish_after_a_silence_waits_for_a_burst(panel: Panel) -> 
     assert panel.commander.send(panel.now) == Wish(AHEAD)
 
 
-def test_a_sender_that_leaves_while_it_drives_leaves_one_zero(panel: Panel) -> None:
+def test_a_sender_that_leaves_while_driving_sends_one_zero(panel: Panel) -> None:
     panel.press(AHEAD, times=2)
     panel.commander.take(Wish(AHEAD), panel.now)
     assert panel.commander.end(panel.now) == Wish(REST)
@@ -141,7 +141,7 @@ def test_a_sender_that_leaves_while_it_drives_leaves_one_zero(panel: Panel) -> N
     assert panel.commander.due_ns() is None
 
 
-def test_a_sender_that_does_not_drive_leaves_nothing(panel: Panel) -> None:
+def test_a_sender_that_leaves_while_not_driving_sends_no_zero(panel: Panel) -> None:
     assert panel.commander.end(panel.now) is None
     panel.press(AHEAD, times=2)
     panel.press(REST)
@@ -156,7 +156,7 @@ def test_a_sender_that_leaves_after_its_timeout_stops_no_other_driver(panel: Pan
         assert panel.commander.end(panel.now + int(late * NS_PER_S), 0.25) == zero
 
 
-def test_a_sender_drives_while_it_asks_for_a_speed(panel: Panel) -> None:
+def test_a_sender_drives_while_its_newest_wish_has_a_speed(panel: Panel) -> None:
     assert not panel.commander.drives(panel.now)
     panel.press(AHEAD)
     assert panel.commander.drives(panel.now)
@@ -165,7 +165,7 @@ def test_a_sender_drives_while_it_asks_for_a_speed(panel: Panel) -> None:
     assert not panel.commander.drives(panel.now)
 
 
-def test_a_stamp_goes_with_its_wish_and_zeros_are_by_the_same_clock(panel: Panel) -> None:
+def test_a_wish_keeps_its_stamp_and_added_zeros_are_stamped_by_the_same_clock(panel: Panel) -> None:
     panel.commander.take(Wish(AHEAD, 1000), panel.now)
     assert panel.commander.send(panel.now + 3) == Wish(REST, 1003)
     panel.now += GATHER_NS
@@ -175,7 +175,7 @@ def test_a_stamp_goes_with_its_wish_and_zeros_are_by_the_same_clock(panel: Panel
     assert panel.commander.end(panel.now + 5) == Wish(REST, 1005 + 2 * GATHER_NS)
 
 
-def test_a_sender_that_stamps_no_more_has_zeros_without_a_stamp(panel: Panel) -> None:
+def test_a_sender_that_stopped_stamping_has_zeros_without_a_stamp(panel: Panel) -> None:
     panel.commander.take(Wish(AHEAD, 1000), panel.now)
     panel.commander.take(Wish(AHEAD), panel.now)
     assert panel.commander.send(panel.now) == Wish(REST)
@@ -194,7 +194,7 @@ def test_a_zero_at_the_end_of_a_burst_is_sent(panel: Panel) -> None:
     assert panel.gone == [REST, REST]
 
 
-def test_a_sender_with_zeros_and_stamps_of_its_own_is_passed_on_as_it_is() -> None:
+def test_commands_of_a_sender_with_its_own_zeros_and_stamps_are_passed_on_unchanged() -> None:
     commander = Commander()
     for n, wish in enumerate((Wish(AHEAD, 1), Wish(AHEAD, 2, True), Wish(REST, 3))):
         commander.take(wish, n * NS_PER_S)
@@ -203,14 +203,14 @@ def test_a_sender_with_zeros_and_stamps_of_its_own_is_passed_on_as_it_is() -> No
         assert commander.due_ns() is None
 
 
-def test_the_last_zero_of_a_sender_with_a_steady_clock_is_by_that_clock() -> None:
+def test_the_last_zero_of_a_sender_with_a_steady_clock_has_a_stamp_of_that_clock() -> None:
     commander = Commander()
     commander.take(Wish(AHEAD, 1000, True), 0)
     commander.send(0)
     assert commander.end(7) == Wish(REST, 1007, True)
 
 
-def test_a_zero_has_no_older_stamp_than_the_commands_before_it() -> None:
+def test_a_zero_has_a_stamp_not_older_than_the_commands_before_it() -> None:
     sender = Sender("joe/aa")
     sender.sign(9, steady=True)
     assert sender.sign(8, steady=True).stamp == 8  # a late speed must look late

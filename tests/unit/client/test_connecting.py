@@ -43,7 +43,7 @@ except PermissionError as error:
 """
 
 
-def test_certificates_that_one_may_not_read_are_a_permission_error(shared: Path) -> None:
+def test_certificates_without_read_permission_raise_a_permission_error(shared: Path) -> None:
     for name in ("ca.pem", "certificate.pem", "key.pem"):
         (shared / name).write_text("of somebody else")
         (shared / name).chmod(0o600 if os.geteuid() == 0 else 0)
@@ -63,7 +63,7 @@ def test_a_directory_without_certificates_is_reported_and_not_taken_for_a_missin
     assert isinstance(error.value, ValueError)
 
 
-def test_every_error_that_the_client_tells_of_can_be_had_from_it() -> None:
+def test_every_documented_error_is_exported_by_the_client() -> None:
     assert client.__doc__ is not None
     told = {line.split()[0] for line in client.__doc__.splitlines() if line.startswith("    ")}
     errors = {name for name in told if name.endswith("Error")}
@@ -71,7 +71,7 @@ def test_every_error_that_the_client_tells_of_can_be_had_from_it() -> None:
     assert all(issubclass(getattr(client, name), client.AcsardError) for name in errors)
 
 
-def test_a_daemon_that_is_not_there_is_one_sentence_without_the_bus_s_own_errors() -> None:
+def test_a_missing_daemon_is_reported_without_the_errors_of_zenoh() -> None:
     with pytest.raises(client.UnreachableError) as raised, client.connect("tcp/127.0.0.1:1"):
         pass
     shown = "".join(traceback.format_exception(raised.value))

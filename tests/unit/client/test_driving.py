@@ -137,7 +137,7 @@ def followed(t: float, last: float, sent: list[float]) -> RobotState:
     return replace(FOLLOWED, linear=last or (0.2 if any(sent) and t < 1.8 else 0.0))
 
 
-def test_a_drive_opens_with_zeros_drives_and_returns_when_the_robot_stands(
+def test_a_drive_starts_with_zeros_and_returns_when_the_robot_is_at_rest(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     world = World(followed)
@@ -152,7 +152,7 @@ def test_a_drive_opens_with_zeros_drives_and_returns_when_the_robot_stands(
     assert world.asked == 0
 
 
-def test_a_state_that_is_published_seldom_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_state_that_is_rarely_published_is_queried(monkeypatch: pytest.MonkeyPatch) -> None:
     world = World(followed)
     world.published = False
     assert world.drive(monkeypatch) < 2.0
@@ -160,7 +160,7 @@ def test_a_state_that_is_published_seldom_is_asked_for(monkeypatch: pytest.Monke
     assert world.asked < 12
 
 
-def test_an_answer_that_comes_on_another_thread_is_read_on_the_one_that_drives(
+def test_an_answer_of_another_thread_is_processed_on_the_driving_thread(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The received state, its time and its objection must belong to one state.
@@ -192,14 +192,16 @@ def test_an_answer_that_comes_on_another_thread_is_read_on_the_one_that_drives(
     assert readers == {get_ident()}
 
 
-def test_a_robot_that_something_else_moves_is_not_waited_for(
+def test_a_drive_does_not_wait_long_for_a_robot_that_keeps_moving(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     world = World(lambda t, last, sent: replace(FOLLOWED, linear=0.3))
     assert 2.3 < world.drive(monkeypatch) < 3.0
 
 
-def test_a_robot_that_reports_no_speed_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drive_does_not_wait_long_for_a_robot_that_reports_no_speed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def lost(t: float, last: float, sent: list[float]) -> RobotState:
         state = followed(t, last, sent)
         return state if t < 1.3 else replace(state, linear=None, angular=None)
@@ -207,7 +209,7 @@ def test_a_robot_that_reports_no_speed_is_not_waited_for(monkeypatch: pytest.Mon
     assert 2.0 < World(lost).drive(monkeypatch) < 3.0
 
 
-def test_a_long_ramp_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drive_waits_for_the_end_of_a_long_ramp(monkeypatch: pytest.MonkeyPatch) -> None:
     world = World(lambda t, last, sent: replace(FOLLOWED, linear=max(0.0, 0.5 - t / 20)))
     assert 9.7 < world.drive(monkeypatch) < 10.2
 
@@ -263,14 +265,16 @@ def test_a_drive_that_is_not_followed_ends_with_the_reason_and_a_zero(
     assert not world.subscribed
 
 
-def test_a_short_drive_that_hardly_counted_does_not_return_as_if_it_had(
+def test_a_short_drive_that_was_hardly_followed_does_not_return_as_a_success(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     with pytest.raises(NotDrivenError, match="has priority"):
         World(after(0.45, HIGHER)).drive(monkeypatch, 0.8 * GRACE_S)
 
 
-def test_a_moment_without_the_robot_does_not_end_a_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_short_time_in_which_the_robot_follows_no_source_does_not_end_a_drive(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     held_up = replace(FOLLOWED, mode="ready", reason="waiting for a command", source="")
 
     def says(t: float, last: float, sent: list[float]) -> RobotState:
@@ -282,10 +286,10 @@ def test_a_moment_without_the_robot_does_not_end_a_drive(monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("begins", [0.1, 0.9], ids=["opening", "driving"])
-def test_a_drive_does_not_go_on_after_this_program_stood_still(
+def test_a_drive_ends_after_the_client_program_stalled(
     monkeypatch: pytest.MonkeyPatch, begins: float
 ) -> None:
-    """The daemon publishes its state as always, and one state waits in the queue."""
+    """The daemon publishes its state during the stall, and one state waits in the queue."""
     world = World(followed)
     world.stalls = begins, 4.0
     words = r"sent no command for 4\.[01] s.*not finished.*suspended"
@@ -297,7 +301,7 @@ def test_a_drive_does_not_go_on_after_this_program_stood_still(
     assert not world.subscribed
 
 
-def test_a_drive_whose_end_passed_while_this_program_stood_still_was_not_finished(
+def test_a_drive_whose_end_passed_during_a_stall_of_the_client_is_not_a_success(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     world = World(followed)
@@ -307,7 +311,7 @@ def test_a_drive_whose_end_passed_while_this_program_stood_still_was_not_finishe
 
 
 @pytest.mark.parametrize("begins", [0.1, 0.9], ids=["opening", "driving"])
-def test_a_drive_does_not_go_on_after_the_bus_accepted_no_command(
+def test_a_drive_ends_if_the_bus_accepts_no_command(
     monkeypatch: pytest.MonkeyPatch, begins: float
 ) -> None:
     world = World(followed)
@@ -319,7 +323,7 @@ def test_a_drive_does_not_go_on_after_the_bus_accepted_no_command(
     assert world.sent[-1] == 0.0
 
 
-def test_a_drive_begins_however_long_the_bus_takes_to_subscribe(
+def test_a_slow_subscription_does_not_prevent_a_drive(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     world = World(followed)
@@ -328,14 +332,14 @@ def test_a_drive_begins_however_long_the_bus_takes_to_subscribe(
     assert world.sent.count(0.5) in (20, 21)
 
 
-def test_a_drive_goes_on_after_a_short_stall(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drive_continues_after_a_short_stall(monkeypatch: pytest.MonkeyPatch) -> None:
     world = World(followed)
     world.stalls = 0.9, 0.8 * GRACE_S
     assert world.drive(monkeypatch) < 2.1
     assert world.sent.count(0.5) > 10
 
 
-def test_a_drive_that_only_waits_for_the_robot_to_stand_may_stand_still(
+def test_a_client_may_stall_while_it_only_waits_for_the_robot_to_stop(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     world = World(followed)
@@ -345,7 +349,7 @@ def test_a_drive_that_only_waits_for_the_robot_to_stand_may_stand_still(
 
 @pytest.mark.parametrize("seconds", [0.4, 1.0, 60.0])
 @pytest.mark.parametrize("dies", [0.35, 0.7, 1.0])
-def test_a_robot_that_died_does_not_drive_because_a_storage_still_has_its_state(
+def test_a_stored_state_of_a_dead_robot_does_not_keep_a_drive_running(
     monkeypatch: pytest.MonkeyPatch, seconds: float, dies: float
 ) -> None:
     """The storage belongs to a router and answers with the robot's last state."""
@@ -359,7 +363,7 @@ def test_a_robot_that_died_does_not_drive_because_a_storage_still_has_its_state(
 
 
 @pytest.mark.parametrize("last", [FOLLOWED, STOPPED, replace(FOLLOWED, sender="")])
-def test_the_state_that_a_storage_has_of_a_robot_that_is_long_dead_begins_no_drive(
+def test_a_stored_state_of_a_robot_that_died_long_ago_starts_no_drive(
     monkeypatch: pytest.MonkeyPatch, last: RobotState
 ) -> None:
     world = World(followed)
@@ -378,7 +382,7 @@ def test_a_daemon_of_another_version_is_distinguished_from_a_dead_one(
         world.drive(monkeypatch)
 
 
-def test_a_connection_that_is_closed_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_closed_connection_ends_the_drive(monkeypatch: pytest.MonkeyPatch) -> None:
     world = World(followed)
     world.set_clock(monkeypatch)
     robot: Any = world
@@ -393,7 +397,7 @@ def test_a_connection_that_is_closed_ends_it(monkeypatch: pytest.MonkeyPatch) ->
         next(steps)
 
 
-def test_a_drive_on_a_connection_that_is_closed_ends_with_an_error_that_the_docs_name(
+def test_a_drive_on_a_closed_connection_ends_with_a_no_answer_error(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     world = World(followed)
@@ -411,7 +415,7 @@ def test_a_drive_on_a_connection_that_is_closed_ends_with_an_error_that_the_docs
             pass
 
 
-def test_what_is_no_number_is_refused_before_anything_is_sent() -> None:
+def test_a_value_that_is_not_a_number_is_refused_before_a_command_is_sent() -> None:
     world: Any = World(followed)
     given: Any
     for given in (float("nan"), float("inf"), "0.1", None, [0.1]):
@@ -426,7 +430,9 @@ def test_what_is_no_number_is_refused_before_anything_is_sent() -> None:
 
 
 @pytest.mark.parametrize("seconds", [0, -1, -0.5])
-def test_a_drive_of_no_time_is_refused_before_anything_is_sent(seconds: float) -> None:
+def test_a_drive_without_a_positive_duration_is_refused_before_a_command_is_sent(
+    seconds: float,
+) -> None:
     world: Any = World(followed)
     with pytest.raises(UsageError, match=f"seconds = {seconds:g}: a drive needs a time above 0"):
         next(drive(world, 5.0, 0.0, seconds))
@@ -449,7 +455,7 @@ def test_a_drive_of_no_time_is_refused_before_anything_is_sent(seconds: float) -
         (replace(STOPPED, mode="ready", sources=[source("app may be late")]), "may be late"),
     ],
 )
-def test_the_objection_is_in_the_words_of_the_daemon(state: RobotState, words: str) -> None:
+def test_the_error_has_the_reason_that_the_daemon_reports(state: RobotState, words: str) -> None:
     found = objection(state, "app", US)
     assert (
         found.startswith(words)

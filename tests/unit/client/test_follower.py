@@ -35,7 +35,7 @@ def asked(follower: Follower, since: float, until: float) -> list[float]:
     return [now for now in times if follower.asks(now)]
 
 
-def test_a_state_is_as_old_as_the_time_since_its_arrival() -> None:
+def test_the_age_of_a_state_is_the_time_since_its_arrival() -> None:
     follower = Follower(100.0)
     assert follower.age(101.0) == 1.0
     follower.published(STATE, 101.5)
@@ -50,13 +50,13 @@ def test_a_robot_that_publishes_often_is_never_queried() -> None:
         follower.published(at(n), (n + 1) / 10)
 
 
-def test_a_robot_that_publishes_seldom_is_queried_at_even_intervals() -> None:
+def test_a_robot_that_rarely_publishes_is_queried_at_even_intervals() -> None:
     times = asked(Follower(0.0), 0.0, 10.0)
     assert times == pytest.approx([ASK_S * n for n in range(1, len(times) + 1)], abs=10 * TICK)
     assert len(times) > 25
 
 
-def test_a_silent_robot_is_reported_after_a_longer_time_if_it_was_never_heard() -> None:
+def test_a_robot_that_never_sent_a_state_is_reported_silent_after_a_longer_time() -> None:
     follower = Follower(0.0)
     assert not follower.silent(FIRST_S - TICK)
     assert follower.silent(FIRST_S + TICK)
@@ -65,7 +65,7 @@ def test_a_silent_robot_is_reported_after_a_longer_time_if_it_was_never_heard() 
     assert follower.silent(10.0 + SILENT_S + TICK)
 
 
-def test_a_robot_that_is_queried_seldom_is_not_silent_between_its_answers() -> None:
+def test_a_robot_that_is_rarely_queried_is_not_silent_between_its_answers() -> None:
     follower, now = Follower(0.0, FLEET_ASK_S), 0.0
     follower.published(at(1), now)
     for sec in range(2, 10):
@@ -75,7 +75,7 @@ def test_a_robot_that_is_queried_seldom_is_not_silent_between_its_answers() -> N
         assert follower.answered(at(sec), now)
 
 
-def test_the_first_answer_does_not_prove_that_the_daemon_runs_and_is_checked_at_once() -> None:
+def test_the_first_answer_is_no_sign_of_life_and_a_second_query_follows_immediately() -> None:
     follower = Follower(0.0)
     assert follower.asks(1.0)
     assert not follower.answered(at(5), 1.1)
@@ -97,7 +97,7 @@ def test_the_state_that_a_storage_repeats_is_no_sign_of_life() -> None:
     assert follower.state == at(5)
 
 
-def test_a_robot_whose_clock_was_set_back_is_heard_by_its_second_answer() -> None:
+def test_the_second_answer_of_a_robot_with_a_set_back_clock_is_a_sign_of_life() -> None:
     follower = Follower(0.0)
     follower.published(at(10**6), 1.0)
     assert not follower.answered(at(3), 2.0)
@@ -112,7 +112,7 @@ def test_a_published_state_counts_whatever_its_stamp_is() -> None:
     assert (follower.state, follower.age(2.0)) == (at(1), 0.0)
 
 
-def test_counters_that_decrease_are_those_of_another_daemon() -> None:
+def test_decreasing_counters_show_a_restarted_daemon() -> None:
     assert not restarted(None, STATE)
     assert not restarted(BEFORE, STATE)
     assert restarted(STATE, BEFORE)
@@ -155,7 +155,7 @@ def test_the_states_that_arrived_are_returned_in_order() -> None:
     assert watch.age(0.2) == 0.1
 
 
-def test_an_answer_counts_less_than_a_state_that_was_published_later() -> None:
+def test_a_state_published_after_the_answer_replaces_the_answer() -> None:
     robot = Robot()
     watch = Watch(robot, 0.0)
     robot.queue.append(sample_of(at(1)))
@@ -178,7 +178,7 @@ def test_a_state_that_was_published_before_the_answer_comes_first() -> None:
     assert watch.look(ASK_S + 0.2) == [at(2), at(3)]
 
 
-def test_messages_that_cannot_be_read_are_counted_until_one_can() -> None:
+def test_unreadable_messages_are_counted_until_a_readable_one_arrives() -> None:
     robot = Robot()
     watch = Watch(robot, 0.0)
     robot.queue.extend([UNREADABLE] * 3)
@@ -189,7 +189,7 @@ def test_messages_that_cannot_be_read_are_counted_until_one_can() -> None:
     assert watch.unreadable == 0
 
 
-def test_a_flood_does_not_hold_the_caller() -> None:
+def test_a_flood_of_messages_does_not_block_the_caller() -> None:
     robot = Robot()
     watch = Watch(robot, 0.0)
     robot.queue.extend([UNREADABLE] * (QUEUED + 7))

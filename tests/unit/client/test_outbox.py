@@ -44,7 +44,7 @@ def bus() -> Iterator[Bus]:
     bus.free.set()
 
 
-def test_of_the_wishes_behind_a_blocked_bus_only_the_newest_is_sent(bus: Bus) -> None:
+def test_only_the_newest_wish_is_sent_after_the_bus_was_blocked(bus: Bus) -> None:
     outbox, blocker, one = Outbox(), Commander(), Commander()
     bus.block()
     outbox.take(blocker, bus.put, ZERO)
@@ -57,7 +57,7 @@ def test_of_the_wishes_behind_a_blocked_bus_only_the_newest_is_sent(bus: Bus) ->
     assert one.replaced == 2
 
 
-def test_a_speed_that_became_too_old_is_dropped_and_a_zero_is_sent(bus: Bus) -> None:
+def test_an_outdated_speed_is_dropped_but_a_zero_is_sent_at_any_age(bus: Bus) -> None:
     dropped: list[bool] = []
     outbox = Outbox(lambda: dropped.append(True))
     blocker, ahead, zero = Commander(), Commander(), Commander()
@@ -104,7 +104,7 @@ def test_no_zero_is_sent_for_a_drive_that_ended_before_a_suspend(
     assert bus.sent == [AHEAD]
 
 
-def test_a_sender_that_leaves_while_the_bus_is_blocked_still_gets_its_zero(bus: Bus) -> None:
+def test_the_zero_of_a_sender_that_leaves_while_the_bus_is_blocked_is_sent(bus: Bus) -> None:
     outbox, one = Outbox(), Commander()
     bus.block()
     outbox.take(one, bus.put, AHEAD)
@@ -126,7 +126,7 @@ def test_the_last_zero_is_sent_before_the_thread_ends(bus: Bus) -> None:
     assert not outbox.dead.done()
 
 
-def test_a_thread_that_dies_is_known() -> None:
+def test_the_death_of_the_sending_thread_is_reported() -> None:
     def deadly(wish: Wish) -> None:
         raise SystemExit
 

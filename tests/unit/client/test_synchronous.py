@@ -66,7 +66,7 @@ def client_of(session: Session) -> Client:
     return Client(fake, "acsar", "app")
 
 
-def test_each_command_has_its_sender_its_number_and_when_it_was_sent(session: Session) -> None:
+def test_each_command_has_its_sender_its_sequence_number_and_its_time(session: Session) -> None:
     client = client_of(session)
     before_ns = time.time_ns()
     for _ in range(3):
@@ -80,7 +80,7 @@ def test_each_command_has_its_sender_its_number_and_when_it_was_sent(session: Se
     assert stamps[-1] <= time.time_ns() + 1_000_000
 
 
-def test_two_of_one_connection_keep_their_commands_apart_too(session: Session) -> None:
+def test_two_clients_of_one_connection_keep_the_spacing_between_commands(session: Session) -> None:
     """The daemon drops a command that arrives within a millisecond of another one on its key."""
     one = client_of(session)
     other = one.like("acsar")
@@ -91,7 +91,7 @@ def test_two_of_one_connection_keep_their_commands_apart_too(session: Session) -
 
 
 @pytest.mark.timeout(10)
-def test_a_signal_s_handler_sends_while_the_same_thread_waits_for_its_turn(
+def test_a_signal_handler_can_send_while_the_interrupted_thread_waits_to_send(
     session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     client, sleep = client_of(session), time.sleep
@@ -128,7 +128,7 @@ def test_the_end_of_a_connection_sends_a_zero_to_each_robot_that_may_still_move(
     assert session.closed
 
 
-def test_after_the_longest_timeout_the_end_of_a_connection_stops_no_other_sender(
+def test_after_the_longest_timeout_the_end_of_a_connection_sends_no_zero(
     session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot = client_of(session)
@@ -140,7 +140,7 @@ def test_after_the_longest_timeout_the_end_of_a_connection_stops_no_other_sender
     assert len(session.heard) == sent
 
 
-def test_on_a_closed_connection_each_method_says_so(session: Session) -> None:
+def test_each_method_reports_a_closed_connection(session: Session) -> None:
     robot = client_of(session)
     session.close()
     for method in (
@@ -163,9 +163,7 @@ def test_two_sessions_of_one_process_are_two_senders(session: Session) -> None:
 
 
 @pytest.mark.parametrize("name", ["odm", "statte"])
-def test_a_key_that_there_is_not_is_the_one_reason_that_is_reported(
-    session: Session, name: str
-) -> None:
+def test_an_unknown_key_is_reported_as_the_only_reason(session: Session, name: str) -> None:
     with pytest.raises(NoAnswerError) as raised:
         client_of(session).reply(name)
     told = str(raised.value)
@@ -183,7 +181,7 @@ def test_a_key_that_there_is_not_is_the_one_reason_that_is_reported(
         (no_command("app"), True),
     ],
 )
-def test_over_tls_the_role_is_named_only_if_no_command_arrives(
+def test_over_tls_the_error_names_the_role_only_if_no_command_arrived(
     session: Session, monkeypatch: pytest.MonkeyPatch, objection: str, names_role: bool
 ) -> None:
     ours = client_of(session)
@@ -195,7 +193,7 @@ def test_over_tls_the_role_is_named_only_if_no_command_arrives(
     assert ("your certificate anna has the role operator" in str(found)) == names_role
 
 
-def test_over_tls_a_viewer_is_refused_whatever_the_robot_objects(
+def test_over_tls_a_viewer_gets_a_permission_error_whatever_the_robot_reports(
     session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ours = client_of(session)
@@ -205,7 +203,7 @@ def test_over_tls_a_viewer_is_refused_whatever_the_robot_objects(
     assert isinstance(found, client.NotPermittedError)
 
 
-def test_a_drive_of_which_nothing_arrives_ends_with_an_error_that_the_docs_name(
+def test_a_drive_without_arriving_commands_ends_with_a_documented_error(
     session: Session,
 ) -> None:
     found = client_of(session).unheard(UnheardError(no_command("app")))

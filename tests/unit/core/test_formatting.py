@@ -26,14 +26,14 @@ MOST = 64
 HOSTILE = "a\x1b]0;PWNED\x07b\x9b2J\u202ec\r\nd\te"
 
 
-def test_nothing_that_a_terminal_obeys_is_left() -> None:
+def test_terminal_control_characters_are_replaced() -> None:
     assert printable(HOSTILE) == "a\ufffd]0;PWNED\ufffdb\ufffd2J\ufffdc  d e"
     assert lines(HOSTILE) == "a\ufffd]0;PWNED\ufffdb\ufffd2J\ufffdc \nd e"
     assert printable("Zürich, 8.5 °C") == "Zürich, 8.5 °C"
 
 
 @each("data", [bytes(range(256)), b"\r\n", "é→`".encode(), b""])
-def test_bytes_are_shown_printable_and_few(data: bytes) -> None:
+def test_bytes_are_shown_as_printable_text_of_limited_length(data: bytes) -> None:
     text = printable_bytes(data, MOST)
     assert text.isprintable()
     assert text.removesuffix("…").isascii()
@@ -41,14 +41,14 @@ def test_bytes_are_shown_printable_and_few(data: bytes) -> None:
     assert text.endswith("…") == (len(data) > MOST)
 
 
-def test_of_many_bytes_the_first_or_the_last_are_shown_and_none_in_half() -> None:
+def test_a_long_byte_string_shows_whole_escapes_from_its_start_or_its_end() -> None:
     data = b"\xff" * MOST + b"end"
     assert printable_bytes(data, MOST) == r"\xff" * (MOST // 4) + "…"
     assert printable_bytes(data, MOST, last=True) == "…" + r"\xff" * ((MOST - 3) // 4) + "end"
 
 
 @given(st.text(alphabet=st.characters(exclude_categories=["Cs"], max_codepoint=0xFFFF)))
-def test_json_stays_the_same_and_can_be_printed(text: str) -> None:
+def test_printable_json_decodes_to_the_same_value(text: str) -> None:
     line = json_line(json.dumps(text, ensure_ascii=False))
     assert json.loads(line) == text
     assert line.isprintable()
@@ -97,7 +97,7 @@ def test_a_duration_has_its_two_largest_units(seconds: float, text: str) -> None
     [(1.5, "  +1.50"), (-0.001, "  +0.00"), (-2.0, "  -2.00"), (1e12, " +1e+12"),
      (math.inf, "   +inf"), (math.nan, "      -")],
 )  # fmt: skip
-def test_a_number_has_its_sign_and_its_place(value: float, text: str) -> None:
+def test_a_number_is_shown_with_its_sign_in_a_fixed_width(value: float, text: str) -> None:
     assert signed(value, 2, 7) == text
 
 
@@ -107,6 +107,6 @@ def test_a_count_agrees_with_its_noun() -> None:
     assert (many(1, "loss", "losses"), many(2, "loss", "losses")) == ("1 loss", "2 losses")
 
 
-def test_a_long_list_says_how_many_are_left_out() -> None:
+def test_a_shortened_list_ends_with_the_number_of_omitted_items() -> None:
     assert listed(["a", "b"], 2) == "a, b"
     assert listed(["a", "b", "c", "d"], 2, "; ") == "a; b; and 2 more"

@@ -209,11 +209,13 @@ def test_a_ramp_to_zero_passes_to_the_end(trailing_comma: bool) -> None:
         b"ap90.00,bp90.00,cp90.00,dp90.00\r\nap01.00,bp01.00,cp01.00,dp01.00\r\n",
     ],
 )
-def test_what_is_not_a_whole_line_of_this_dialect_becomes_stop(guard: Guarded, data: bytes) -> None:
+def test_bytes_that_are_not_a_complete_line_of_the_dialect_become_stop(
+    guard: Guarded, data: bytes
+) -> None:
     assert objection(guard, outputs(data)) == NOT_A_LINE
 
 
-def test_with_a_trailing_comma_only_lines_with_one_pass() -> None:
+def test_a_guard_for_trailing_commas_passes_only_lines_with_a_trailing_comma() -> None:
     stop = STOP[:-2] + b",\r\n"
     guard = Guarded(stop, 40.0, SOURCES)
     good = b"ap12.50,bn08.75,cp15.00,dn10.25,\r\n"
@@ -251,7 +253,7 @@ def test_a_wheel_at_its_limit_passes_however_the_limit_is_rounded(limit: float) 
 # no link
 
 
-def test_without_a_link_no_wheel_moves_not_even_more_slowly(guard: Guarded) -> None:
+def test_without_a_link_even_a_slower_line_becomes_stop(guard: Guarded) -> None:
     sent(guard, 10.0)
     assert objection(guard, outputs(line(1.0), linked=False)) == NO_LINK
     assert objection(guard, outputs(line(0.0, 0.0, 0.0, 0.01), linked=False)) == NO_LINK
@@ -263,7 +265,7 @@ def test_without_a_link_no_wheel_moves_not_even_more_slowly(guard: Guarded) -> N
 @pytest.mark.parametrize("wheel", range(4))
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize(("before", "speed"), [(10.0, 10.01), (10.0, -0.01), (0.01, -0.01)])
-def test_without_a_command_no_wheel_may_grow_or_turn_round(
+def test_without_a_command_no_wheel_may_speed_up_or_reverse(
     guard: Guarded, wheel: int, sign: float, before: float, speed: float
 ) -> None:
     sent(guard, sign * before)
@@ -272,7 +274,7 @@ def test_without_a_command_no_wheel_may_grow_or_turn_round(
     assert objection(guard, coasting(line(*speeds))) == GROWS
 
 
-def test_a_wheel_that_stands_may_go_on_standing_while_others_slow_down(guard: Guarded) -> None:
+def test_a_wheel_at_rest_may_stay_at_rest_while_others_slow_down(guard: Guarded) -> None:
     sent(guard, 5.0, 0.0, -5.0, 0.0)
     assert objection(guard, coasting(line(4.0, 0.0, -4.0, 0.0))) == ""
 
@@ -280,17 +282,17 @@ def test_a_wheel_that_stands_may_go_on_standing_while_others_slow_down(guard: Gu
 @pytest.mark.parametrize(
     "mode", ["inactive", "waiting", "ready", "stopped", "fault", "shutdown", "", "Driving"]
 )
-def test_a_wheel_grows_only_in_mode_driving(guard: Guarded, mode: str) -> None:
+def test_a_wheel_may_speed_up_only_in_mode_driving(guard: Guarded, mode: str) -> None:
     assert objection(guard, outputs(line(1.0), mode=mode)) == GROWS
 
 
-def test_a_wheel_grows_only_for_a_configured_source(guard: Guarded) -> None:
+def test_a_wheel_may_speed_up_only_for_a_configured_source(guard: Guarded) -> None:
     assert objection(guard, outputs(line(1.0), source="stranger")) == GROWS
     assert objection(guard, outputs(line(1.0), source="")) == GROWS
 
 
 @pytest.mark.parametrize(("source", "timeout_ms"), [("app", 250), ("slow", 1000)])
-def test_a_wheel_grows_only_for_a_command_within_the_timeout_of_its_source(
+def test_a_wheel_may_speed_up_only_for_a_command_within_the_timeout_of_its_source(
     guard: Guarded, source: str, timeout_ms: float
 ) -> None:
     fresh = outputs(line(1.0), source=source, age_ms=timeout_ms)
@@ -311,46 +313,46 @@ def test_a_command_from_the_far_future_is_not_fresh(guard: Guarded) -> None:
 # the last sent line
 
 
-def test_a_line_that_did_not_go_out_is_not_what_the_next_is_compared_with(guard: Guarded) -> None:
+def test_the_next_line_is_not_compared_with_a_line_that_was_not_sent(guard: Guarded) -> None:
     sent(guard, 5.0)
     assert objection(guard, outputs(line(6.0))) == ""  # passed but not sent
     assert objection(guard, coasting(line(6.0))) == GROWS
     assert objection(guard, coasting(line(5.0))) == ""
 
 
-def test_a_slower_line_that_did_not_go_out_does_not_lower_the_comparison(guard: Guarded) -> None:
+def test_a_slower_line_that_was_not_sent_does_not_lower_the_allowed_speed(guard: Guarded) -> None:
     sent(guard, 5.0)
     assert objection(guard, coasting(line(3.0))) == ""  # passed but not sent
     assert objection(guard, coasting(line(4.0))) == ""
 
 
-def test_each_line_sent_lowers_what_the_next_may_say(guard: Guarded) -> None:
+def test_each_sent_line_lowers_the_speed_that_the_next_line_may_have(guard: Guarded) -> None:
     sent(guard, 5.0)
     assert objection(guard, coasting(line(3.0))) == ""
     guard.note_sent()
     assert objection(guard, coasting(line(3.01))) == GROWS
 
 
-def test_after_a_trip_what_was_sent_is_the_stop(guard: Guarded) -> None:
+def test_after_a_trip_the_last_sent_line_is_the_stop(guard: Guarded) -> None:
     sent(guard, 5.0)
     assert objection(guard, coasting(line(6.0))) == GROWS
     guard.note_sent()
     assert objection(guard, coasting(line(1.0))) == GROWS
 
 
-def test_a_trip_that_did_not_go_out_leaves_the_last_line_sent(guard: Guarded) -> None:
+def test_a_trip_whose_stop_was_not_sent_keeps_the_last_sent_line(guard: Guarded) -> None:
     sent(guard, 5.0)
     assert objection(guard, coasting(line(6.0))) == GROWS
     assert objection(guard, coasting(line(4.0))) == ""
 
 
-def test_a_step_without_a_line_leaves_the_last_line_sent(guard: Guarded) -> None:
+def test_a_step_without_a_line_keeps_the_last_sent_line(guard: Guarded) -> None:
     sent(guard, 5.0)
     assert guard.check(outputs(None)) is None
     assert objection(guard, coasting(line(5.0))) == ""
 
 
-def test_the_trip_is_of_the_last_line_only(guard: Guarded) -> None:
+def test_the_trip_reason_belongs_to_the_last_checked_line_only(guard: Guarded) -> None:
     assert objection(guard, coasting(line(1.0))) == GROWS
     assert objection(guard, outputs(line(1.0))) == ""
     assert objection(guard, coasting(line(2.0))) == GROWS
@@ -402,7 +404,7 @@ class Clocked:
         return trip
 
 
-def test_ten_minutes_of_one_speed_after_a_stop_is_cut_short_when_the_longest_ramp_is_over() -> None:
+def test_a_constant_speed_after_a_stop_is_cut_short_after_the_longest_ramp() -> None:
     clocked = Clocked()
     trips = [clocked.trip(ms, "stopped") for ms in range(10, 600_000, 10)]
     first = next(n for n, trip in enumerate(trips) if trip)
@@ -435,7 +437,7 @@ def test_a_stale_command_in_mode_driving_does_not_keep_the_robot_going() -> None
     assert clocked.guard.check(stale) == (STOP, LATE)
 
 
-def test_each_fresh_command_begins_the_time_anew() -> None:
+def test_each_fresh_command_restarts_the_ramp_time() -> None:
     clocked = Clocked()
     for ms in range(0, 60_000, 250):
         clocked.drive(ms)
@@ -443,7 +445,7 @@ def test_each_fresh_command_begins_the_time_anew() -> None:
     assert clocked.trip(59_750 + 2301, "ready") == LATE
 
 
-def test_a_stop_in_the_middle_of_a_ramp_has_its_own_time_and_no_more_than_the_ramp() -> None:
+def test_a_stop_during_a_ramp_has_its_own_time_but_not_longer_than_the_ramp() -> None:
     clocked = Clocked()
     assert clocked.trip(1000, "ready") == clocked.trip(1100, "stopped") == ""
     assert clocked.trip(1900, "stopped") == ""
@@ -453,7 +455,7 @@ def test_a_stop_in_the_middle_of_a_ramp_has_its_own_time_and_no_more_than_the_ra
     assert late.trip(2301, "stopped") == LATE
 
 
-def test_a_stop_that_is_cleared_leaves_the_time_of_the_ramp() -> None:
+def test_after_a_cleared_stop_the_time_of_the_ramp_counts_again() -> None:
     clocked = Clocked()
     assert clocked.trip(0, "stopped") == ""
     assert clocked.trip(500, "ready", line_due=False) == ""
@@ -462,7 +464,7 @@ def test_a_stop_that_is_cleared_leaves_the_time_of_the_ramp() -> None:
     assert clocked.trip(1801, "stopped") == LATE
 
 
-def test_a_second_stop_has_its_own_time_even_right_behind_a_command() -> None:
+def test_a_second_stop_has_its_own_time_even_right_after_a_command() -> None:
     clocked = Clocked()
     assert clocked.trip(100, "stopped") == ""
     clocked.drive(600)
@@ -471,7 +473,7 @@ def test_a_second_stop_has_its_own_time_even_right_behind_a_command() -> None:
     assert clocked.trip(2101, "stopped") == LATE
 
 
-def test_new_settings_keep_the_time_and_the_longer_ramp_of_a_robot_in_motion() -> None:
+def test_new_settings_neither_restart_nor_shorten_the_ramp_time_of_a_moving_robot() -> None:
     clocked = Clocked()
     slower = replace(SLOW_TO_STOP, linear_speed=0.1, linear_deceleration=5.0)
     for ms in range(0, 2300, 100):
@@ -497,7 +499,7 @@ def test_new_settings_with_a_longer_ramp_give_a_robot_in_motion_more_time(
     assert clocked.trip(last_ms + 1, mode) == LATE
 
 
-def test_a_ramp_that_was_longer_counts_no_more_once_the_robot_was_at_rest() -> None:
+def test_an_earlier_longer_ramp_does_not_count_after_the_robot_was_at_rest() -> None:
     clocked = Clocked()
     clocked.guard.use(Config(limits=LimitsConfig(linear_speed=0.4, angular_speed=0.4)))  # 0.4 s
     assert clocked.trip(100, "ready", 0.0) == ""
@@ -506,7 +508,7 @@ def test_a_ramp_that_was_longer_counts_no_more_once_the_robot_was_at_rest() -> N
     assert clocked.trip(1701, "ready") == LATE
 
 
-def test_the_ramp_of_a_robot_that_skids_is_that_of_its_wider_track() -> None:
+def test_the_longest_ramp_is_calculated_from_the_effective_track() -> None:
     limits = LimitsConfig(linear_speed=0.0, angular_speed=50.0, wheel_speed=10.0)
     narrow, wide = (
         Guard(STOP, Config(limits=limits, drive=DriveConfig(wheel_separation_multiplier=factor)))
@@ -515,7 +517,7 @@ def test_the_ramp_of_a_robot_that_skids_is_that_of_its_wider_track() -> None:
     assert narrow.memory.ramp_ns == pytest.approx(2 * wide.memory.ramp_ns, rel=1e-6)
 
 
-def test_at_rest_new_settings_bring_their_own_ramp() -> None:
+def test_new_settings_at_rest_replace_the_longest_ramp() -> None:
     clocked = Clocked()
     assert clocked.trip(100, "ready", 0.0) == ""
     # this ramp takes 0.4 s
@@ -535,11 +537,13 @@ def test_at_rest_new_settings_bring_their_own_ramp() -> None:
         (LimitsConfig(linear_speed=0.0, angular_speed=50.0, wheel_speed=10.0), 833),
     ],
 )
-def test_the_longest_ramp_is_worked_by_hand(limits: LimitsConfig, ramp_ms: int) -> None:
+def test_the_longest_ramp_equals_the_time_calculated_by_hand(
+    limits: LimitsConfig, ramp_ms: int
+) -> None:
     assert Guard(STOP, Config(limits=limits)).memory.ramp_ns // MS == ramp_ms
 
 
-def test_a_guard_goes_on_from_the_memory_of_another() -> None:
+def test_a_guard_continues_from_the_memory_of_another_guard() -> None:
     clocked = Clocked()
     assert clocked.trip(10, "stopped") == ""
     memory = clocked.guard.memory
@@ -549,7 +553,7 @@ def test_a_guard_goes_on_from_the_memory_of_another() -> None:
     assert clocked.trip(811, "stopped") == LATE
 
 
-def test_a_line_that_moves_before_any_command_is_late() -> None:
+def test_a_line_with_motion_before_any_command_is_late() -> None:
     guard = Guard(STOP, Config(), Memory(line(1.0)))
     assert guard.check(coasting(line(1.0))) == (STOP, LATE)
 
@@ -620,7 +624,7 @@ class Loop:
         return Command("app", Twist(linear, angular), self.now_ns)
 
 
-def test_one_trip_is_one_fault_that_names_it() -> None:
+def test_one_trip_causes_one_fault_that_names_its_reason() -> None:
     loop = Loop(Config(), wheel_speed=5.0)  # the robot itself assumes 40 rad/s
     loop.step(heard=3)
     loop.step(loop.command(0.0))
@@ -705,7 +709,7 @@ def happen(loop: Loop, what: str, steps: int, ms: float, full: Twist) -> None:
     signs=st.tuples(st.sampled_from((-1, 0, 1)), st.sampled_from((-1, 0, 1))),
     happenings=st.lists(st.tuples(st.sampled_from(HAPPENINGS), st.integers(0, 12)), max_size=6),
 )
-def test_no_legal_ramp_is_cut_short_whatever_happens_in_it(
+def test_no_permitted_ramp_is_cut_short_whatever_events_interrupt_it(
     config: Config, ms: float, signs: tuple[int, int], happenings: list[tuple[str, int]]
 ) -> None:
     assume(not contradictions(config))
@@ -771,7 +775,7 @@ def random_walk(rng: random.Random, config: Config) -> Loop:
 
 
 @EACH_CONFIG
-def test_a_healthy_robot_never_trips_the_guard_and_its_wheels_need_a_link_and_a_fresh_command(
+def test_a_healthy_robot_never_trips_the_guard_and_speeds_up_only_by_fresh_commands(
     config: Config,
 ) -> None:
     moved = 0
@@ -801,7 +805,7 @@ NO_CHECK = "the line moves a wheel without the checksum that mcu.link_check requ
 @pytest.mark.parametrize("comma", [False, True])
 @pytest.mark.parametrize("letters", [b"", b"S"])
 @given(sequence=st.integers(0, 255), speed=st.floats(-40.0, 40.0))
-def test_a_line_with_a_right_check_passes(
+def test_a_line_with_a_correct_checksum_passes(
     comma: bool, letters: bytes, sequence: int, speed: float
 ) -> None:
     codec = Codec(WheelMap(), comma)
@@ -809,7 +813,7 @@ def test_a_line_with_a_right_check_passes(
     assert objection(Guarded(codec.stop, 40.0, SOURCES), outputs(sealed)) == ""
 
 
-def test_what_a_checked_line_says_is_judged_as_ever(guard: Guarded) -> None:
+def test_a_checked_line_must_keep_the_same_limits_as_any_other_line(guard: Guarded) -> None:
     assert objection(guard, outputs(seal(line(41.0), 7))) == TOO_FAST
     assert objection(guard, outputs(seal(line(1.0), 7), linked=False)) == NO_LINK
     assert objection(guard, coasting(seal(line(1.0), 7))) == GROWS
@@ -818,7 +822,9 @@ def test_what_a_checked_line_says_is_judged_as_ever(guard: Guarded) -> None:
 
 @each("place", range(42))
 @each("bit", range(8))
-def test_a_checked_line_with_one_bit_wrong_is_none(guard: Guarded, place: int, bit: int) -> None:
+def test_a_checked_line_with_one_flipped_bit_is_refused(
+    guard: Guarded, place: int, bit: int
+) -> None:
     good = seal(line(12.5, -8.75, 15.0, -10.25), 7, b"S")
     bad = b"%b%c%b" % (good[:place], good[place] ^ 1 << bit, good[place + 1 :])
     assert objection(guard, outputs(bad)) == NOT_A_LINE
@@ -828,7 +834,7 @@ def test_a_checked_line_with_one_bit_wrong_is_none(guard: Guarded, place: int, b
     ("suffix", "letters"),
     [(b"#07", b"Z"), (b"#07", b"SS"), (b"#0", b""), (b"#007", b""), (b"#0a", b""), (b",#07", b"")],
 )
-def test_another_suffix_is_none_even_under_a_right_check(
+def test_an_unknown_suffix_is_refused_even_with_a_correct_checksum(
     guard: Guarded, suffix: bytes, letters: bytes
 ) -> None:
     body = line(1.0)[:-2] + suffix + letters
@@ -836,13 +842,13 @@ def test_another_suffix_is_none_even_under_a_right_check(
     assert objection(guard, outputs(closed)) == NOT_A_LINE
 
 
-def test_the_comma_of_the_dialect_is_not_left_out_of_a_checked_line() -> None:
+def test_a_checked_line_without_the_comma_of_the_dialect_is_refused() -> None:
     guard = Guarded(STOP[:-2] + b",\r\n", 40.0, SOURCES)
     guard.check(outputs(seal(line(1.0), 7)))
     assert guard.trip == NOT_A_LINE
 
 
-def test_where_the_check_is_required_no_wheel_moves_without() -> None:
+def test_a_line_without_a_required_checksum_moves_no_wheel() -> None:
     guard = Guarded(STOP, 40.0, SOURCES, require_check=True)
     assert objection(guard, outputs(line(1.0))) == NO_CHECK
     assert objection(guard, outputs(STOP)) == ""

@@ -217,7 +217,7 @@ class Button(Bench):
         return self
 
 
-def test_a_press_is_a_zero_line_and_a_stop_in_the_same_step() -> None:
+def test_a_press_sends_a_zero_line_and_latches_a_stop_in_the_same_step() -> None:
     bench = Button()
     bench.driving()
     out = bench.status(PRESSED_LINE).step(GO)
@@ -232,7 +232,7 @@ def test_a_press_is_a_zero_line_and_a_stop_in_the_same_step() -> None:
     }
 
 
-def test_a_press_between_two_ticks_goes_at_once_if_the_line_may() -> None:
+def test_a_press_between_two_ticks_sends_zero_immediately_if_a_line_is_allowed() -> None:
     bench = Button()
     bench.driving()
     inputs = Inputs(
@@ -242,7 +242,7 @@ def test_a_press_between_two_ticks_goes_at_once_if_the_line_may() -> None:
     assert (out.mode, out.line) == ("stopped", ZERO_LINE)
 
 
-def test_a_press_between_two_ticks_is_zero_speed_even_if_no_line_may_go() -> None:
+def test_a_press_between_two_ticks_sets_zero_speed_even_if_no_line_is_allowed() -> None:
     bench = Button()
     bench.driving()
     out = bench.status(PRESSED_LINE).step(GO, tick=False)
@@ -250,7 +250,7 @@ def test_a_press_between_two_ticks_is_zero_speed_even_if_no_line_may_go() -> Non
     assert bench.step(GO).line == ZERO_LINE
 
 
-def test_a_zero_line_that_did_not_leave_is_repeated_as_zero() -> None:
+def test_a_zero_line_that_was_not_sent_is_repeated_as_zero() -> None:
     bench = Button()
     bench.driving()
     bench.status(PRESSED_LINE).step(GO)
@@ -285,7 +285,7 @@ def test_clear_is_refused_while_pressed_and_a_sender_needs_a_zero_after_it() -> 
     assert bench.step(GO).mode == "driving"
 
 
-def test_a_clear_in_the_step_of_the_press_does_not_release_it() -> None:
+def test_a_clear_in_the_step_of_the_press_does_not_release_the_stop() -> None:
     bench = Button()
     bench.driving()
     bench.step(ask="stop")
@@ -323,7 +323,7 @@ def test_a_press_is_latched_in_every_mode(before: str) -> None:
     assert out.line in (None, ZERO_LINE)
 
 
-def test_silence_about_the_input_is_a_press_also_without_a_port() -> None:
+def test_an_unreported_emergency_stop_counts_as_pressed_even_without_a_port() -> None:
     bench = Button()
     bench.linked()
     bench.unplug()
@@ -359,7 +359,7 @@ def test_a_restarted_daemon_starts_with_the_latch_of_the_press() -> None:
     )
 
 
-def test_wheels_that_roll_without_power_are_no_fault() -> None:
+def test_wheels_that_roll_without_power_cause_no_fault() -> None:
     bench = Bench(fault_time=0.2)
     bench.linked().step(REST)
     for _ in range(100):
@@ -372,7 +372,7 @@ def test_wheels_that_roll_without_power_are_no_fault() -> None:
         assert bench.step().mode == "stopped"
 
 
-def test_damaged_status_lines_are_counted_and_say_nothing_about_the_link() -> None:
+def test_damaged_status_lines_are_counted_and_do_not_change_the_link() -> None:
     bench = Button(b"!status estop=prxssed\r\n!status estop=ok*0000\r\n")
     bench.driving()
     for _ in range(20):
@@ -421,7 +421,7 @@ AWAY = Config(safety=SafetyConfig(bumpers=("front", "rear"), bumper="away"))
 BACK = Twist(-0.5, 0.4)
 
 
-def test_a_bumper_stops_the_robot_at_once_until_a_clear_after_the_release() -> None:
+def test_a_bumper_stops_the_robot_immediately_until_a_clear_after_the_release() -> None:
     bench = Button(FREE)
     bench.driving()
     out = bench.status(FRONT).step(GO)
@@ -503,7 +503,7 @@ def test_a_retreat_goes_on_after_the_release_without_its_limits() -> None:
     assert out.reason == "driving: commanded by app"
 
 
-def test_a_second_bumper_behind_a_retreating_robot_ends_the_retreat() -> None:
+def test_a_press_of_the_bumper_in_the_direction_of_the_retreat_ends_the_retreat() -> None:
     bench = Button(FRONT, AWAY)
     bench.linked().step(REST)
     for _ in range(20):
@@ -517,7 +517,7 @@ def test_a_second_bumper_behind_a_retreating_robot_ends_the_retreat() -> None:
     assert bench.step(GO).applied.linear > 0.0
 
 
-def test_without_the_neutral_first_rule_a_command_against_a_bumper_still_does_not_count() -> None:
+def test_a_command_against_a_bumper_is_ignored_also_without_the_neutral_first_rule() -> None:
     config = replace(AWAY, commands=CommandsConfig(neutral_first=False))
     bench = Button(FREE, config)
     bench.driving()
@@ -582,7 +582,7 @@ def test_a_motor_drivers_fault_is_latched_until_a_clear_after_its_end() -> None:
     assert bench.step(GO).mode == "ready"
 
 
-def test_a_clear_in_the_step_of_a_repeated_driver_fault_does_not_release_it() -> None:
+def test_a_clear_in_the_step_of_a_repeated_driver_fault_does_not_release_the_fault() -> None:
     bench = Button(DRIVER_OK)
     bench.driving()
     bench.status(DRIVER_FAULT).step(GO)
@@ -604,7 +604,7 @@ def test_a_clear_in_the_step_of_a_repeated_guard_trip_does_not_release_the_fault
     assert bench.answer("clear").success
 
 
-def test_a_driver_without_power_behind_the_emergency_stop_is_no_fault() -> None:
+def test_a_motor_driver_without_power_after_a_press_causes_no_fault() -> None:
     bench = Button(PRESSED_LINE + DRIVER_FAULT)
     bench.linked()
     assert bench.mode() == "stopped"
@@ -642,7 +642,7 @@ def test_a_driver_fault_counts_if_it_was_reported_before_the_press(
 
 
 @each("restarted", [False, True])
-def test_drivers_that_lack_power_after_a_press_hold_the_stop_until_they_are_sound(
+def test_drivers_without_power_after_a_press_block_the_clear_until_they_recover(
     restarted: bool,
 ) -> None:
     bench = Button(OK_LINE + DRIVER_OK)
@@ -662,7 +662,7 @@ def test_drivers_that_lack_power_after_a_press_hold_the_stop_until_they_are_soun
     assert bench.status(OK_LINE + DRIVER_FAULT).step().mode == "fault"
 
 
-def test_a_clear_that_releases_only_a_fault_leaves_the_drivers_excused() -> None:
+def test_after_a_clear_of_only_the_fault_drivers_may_still_lack_power() -> None:
     bench = Button(OK_LINE + DRIVER_OK)
     bench.linked()
     bench.status(PRESSED_LINE).step()
@@ -674,7 +674,7 @@ def test_a_clear_that_releases_only_a_fault_leaves_the_drivers_excused() -> None
     assert bench.status(OK_LINE + DRIVER_FAULT).step().mode == "stopped"
 
 
-def test_a_driver_fault_after_a_silence_of_the_button_counts() -> None:
+def test_a_driver_fault_after_the_emergency_stop_was_unreported_counts() -> None:
     bench = Button(OK_LINE + DRIVER_OK)
     bench.linked()
     bench.status(b"")
@@ -685,9 +685,7 @@ def test_a_driver_fault_after_a_silence_of_the_button_counts() -> None:
     assert bench.status(OK_LINE + DRIVER_FAULT).step().mode == "fault"
 
 
-def test_after_a_clear_a_driver_fault_counts_though_the_board_never_reported_sound_drivers() -> (
-    None
-):
+def test_after_a_clear_a_driver_fault_counts_even_if_no_driver_was_ever_reported_ok() -> None:
     bench = Button(OK_LINE)
     bench.linked()
     bench.status(PRESSED_LINE).step()
@@ -702,7 +700,7 @@ def test_with_an_ignored_button_a_driver_fault_always_counts() -> None:
     assert bench.mode() == "fault"
 
 
-def test_a_driver_fault_of_a_silent_button_is_none() -> None:
+def test_a_driver_fault_while_the_emergency_stop_is_unreported_does_not_count() -> None:
     bench = Button(OK_LINE + DRIVER_OK)
     bench.linked()
     bench.status(b"")
@@ -724,7 +722,7 @@ def replugged(bench: Button, status: bytes, closed_steps: int = 100) -> Button:
 
 
 @each("line", [DRIVER_FAULT, PRESSED_LINE, b"!status bumpers=X.\r\n", b"!status estop=ok\r\n"])
-def test_a_board_that_reports_no_input_does_not_inherit_those_of_the_board_before(
+def test_a_board_that_reports_no_inputs_does_not_inherit_those_of_the_previous_board(
     line: bytes,
 ) -> None:
     bench = Button(line)
@@ -745,7 +743,7 @@ def test_a_board_that_reports_no_input_does_not_inherit_those_of_the_board_befor
     assert bench.step(GO).mode == "driving"
 
 
-def test_a_button_that_is_pressed_while_the_board_is_plugged_in_again_is_never_released() -> None:
+def test_clear_is_refused_until_a_replugged_board_reports_the_button_released() -> None:
     bench = Button(PRESSED_LINE)
     bench.linked()
     replugged(bench, b"")
@@ -758,7 +756,7 @@ def test_a_button_that_is_pressed_while_the_board_is_plugged_in_again_is_never_r
     assert bench.answer("clear").success
 
 
-def test_a_port_that_opens_again_and_again_still_latches_the_silence() -> None:
+def test_a_port_that_reopens_repeatedly_still_latches_the_missing_report() -> None:
     bench = Button()
     bench.linked()
     bench.reply = None
@@ -800,7 +798,7 @@ def test_a_board_that_restarts_must_still_report_its_inputs() -> None:
     assert not bench.answer("clear").success
 
 
-def test_a_late_step_leaves_a_new_board_the_whole_time_for_its_reports() -> None:
+def test_a_late_step_does_not_shorten_the_time_for_the_reports_of_a_new_board() -> None:
     bench = Button(DRIVER_FAULT)
     bench.linked()
     replugged(bench, b"")
@@ -811,7 +809,7 @@ def test_a_late_step_leaves_a_new_board_the_whole_time_for_its_reports() -> None
     assert bench.answer("clear").success
 
 
-def test_a_computer_that_is_late_now_and_then_forgets_the_board_before_too() -> None:
+def test_reports_of_the_previous_board_expire_even_if_steps_are_sometimes_late() -> None:
     bench = Button(DRIVER_FAULT)
     bench.linked()
     replugged(bench, b"")
@@ -906,7 +904,7 @@ def test_a_silent_battery_does_not_stop_a_driving_robot() -> None:
     assert battery == BatteryStatus("unknown")
 
 
-def test_a_restarted_daemon_keeps_the_stop_and_judges_the_battery_anew() -> None:
+def test_a_restarted_daemon_keeps_the_stop_until_the_battery_report_or_its_timeout() -> None:
     bench = Button(EMPTY_LINE, GUARDED)
     for _ in range(400):
         bench.step()
@@ -945,7 +943,7 @@ def test_a_restarted_daemon_refuses_clear_until_the_board_has_reported_the_cause
     assert after.answer("clear").success
 
 
-def test_a_restarted_daemon_that_waits_for_a_report_in_vain_allows_clear_after_3_s() -> None:
+def test_a_restarted_daemon_allows_clear_after_3_s_without_a_report() -> None:
     latches = Button(PRESSED_LINE).linked().out.latches.after_restart()
     after = Bench(latches=latches).linked()
     allowed = [after.answer("clear").success for _ in range(320)]
@@ -955,13 +953,13 @@ def test_a_restarted_daemon_that_waits_for_a_report_in_vain_allows_clear_after_3
 # the link
 
 
-def test_without_a_port_the_robot_waits_and_says_why() -> None:
+def test_without_a_port_the_robot_waits_and_reports_the_reason() -> None:
     out = Bench().out
     assert (out.mode, out.link, out.linked) == ("waiting", "down", False)
     assert out.reason == "the serial port is closed; it is being reopened"
 
 
-def test_an_open_port_boots_and_three_good_lines_make_it_ready() -> None:
+def test_after_the_port_opens_three_good_lines_make_the_robot_ready() -> None:
     bench = Bench()
     seen = []
     for _ in range(4):
@@ -971,7 +969,7 @@ def test_an_open_port_boots_and_three_good_lines_make_it_ready() -> None:
     assert seen == [booting, booting, ("ready", "up", True), ("ready", "up", True)]
 
 
-def test_each_change_of_the_link_is_an_event_once() -> None:
+def test_each_change_of_the_link_is_one_event() -> None:
     def levels(outputs: Outputs) -> dict[str, str]:
         return {event.name: event.level for event in outputs.events}
 
@@ -997,7 +995,7 @@ def test_every_feedback_line_is_an_estimate_with_its_own_stamp() -> None:
     assert first.speeds == second.speeds == ROLLING
 
 
-def test_a_step_without_a_tick_folds_feedback_and_sends_nothing() -> None:
+def test_a_step_without_a_tick_uses_feedback_and_sends_no_line() -> None:
     bench = Bench().driving()
     out = bench.step(GO, tick=False)
     assert len(out.estimates) == 1
@@ -1066,7 +1064,7 @@ def test_the_speed_grows_by_the_acceleration_up_to_the_command() -> None:
     assert out.applied == GO
 
 
-def test_the_line_says_what_is_applied() -> None:
+def test_the_line_has_the_wheel_speeds_of_the_applied_twist() -> None:
     bench = Bench().driving(Twist(0.3, 1.0), steps=100)
     # The wheels turn at 3 and 9 rad/s.
     assert bench.out.line == b"ap09.00,bp03.00,cp03.00,dp09.00\r\n"
@@ -1092,7 +1090,7 @@ def test_a_silent_commander_is_followed_until_its_timeout_and_then_ramped_to_zer
     assert out.reason.startswith("waiting for a command")
 
 
-def test_a_commander_that_returns_after_its_timeout_drives_on_from_the_speed_left() -> None:
+def test_a_commander_that_returns_after_its_timeout_accelerates_from_the_present_speed() -> None:
     bench = Bench().driving()
     for _ in range(35):
         bench.step()
@@ -1100,7 +1098,7 @@ def test_a_commander_that_returns_after_its_timeout_drives_on_from_the_speed_lef
     assert bench.step(GO).applied.linear == pytest.approx(left + 0.01)
 
 
-def test_commands_are_counted_and_refusals_by_reason() -> None:
+def test_commands_are_counted_and_refusals_are_counted_by_reason() -> None:
     bench = Bench().linked()
     bench.step(REST, GO)
     refusals = tuple(Refusal(reason, "") for reason in ("malformed", "malformed", "wildcard"))
@@ -1114,7 +1112,7 @@ def test_commands_are_counted_and_refusals_by_reason() -> None:
     assert counters["command_wildcard"] == 1
 
 
-def test_the_last_refusal_is_shown_in_words() -> None:
+def test_the_last_refusal_is_shown_as_text() -> None:
     bench = Bench().linked()
     assert bench.robot.snapshot(bench.now_ns).refused == ""
     bench.step(refusals=(Refusal("wildcard", "cmd/**: no wildcards"),))
@@ -1125,7 +1123,7 @@ def test_the_last_refusal_is_shown_in_words() -> None:
     assert refused == "source stranger: this source is not in commands.sources"
 
 
-def test_lines_are_counted_and_rejects_by_reason_and_zeros_left_out() -> None:
+def test_lines_and_rejects_by_reason_are_counted_and_zero_counters_are_left_out() -> None:
     bench = Bench().linked()
     bench.reply = b"hello\r\n" + bench.codec.stop
     bench.step()
@@ -1135,7 +1133,7 @@ def test_lines_are_counted_and_rejects_by_reason_and_zeros_left_out() -> None:
     assert "line_too_long" not in counters
 
 
-def test_commands_are_heard_in_a_step_without_a_tick() -> None:
+def test_commands_are_accepted_in_a_step_without_a_tick() -> None:
     bench = Bench().linked()
     bench.step(REST, tick=False)
     bench.step(GO, tick=False)
@@ -1143,7 +1141,7 @@ def test_commands_are_heard_in_a_step_without_a_tick() -> None:
     assert bench.mode() == "driving"
 
 
-def test_the_higher_source_drives_and_the_snapshot_tells_the_lower_why() -> None:
+def test_the_higher_source_drives_and_the_snapshot_names_it_to_the_lower_source() -> None:
     bench = Bench().driving()
     bench.step(REST, source="teleop")
     assert bench.step(GO).source == "teleop"
@@ -1156,7 +1154,7 @@ def test_the_higher_source_drives_and_the_snapshot_tells_the_lower_why() -> None
 # a lost link
 
 
-def test_an_unplugged_port_is_rest_in_the_same_step() -> None:
+def test_an_unplugged_port_sets_zero_speed_in_the_same_step() -> None:
     bench = Bench().driving()
     out = bench.unplug().step(GO, tick=False)
     assert (out.mode, out.link, out.linked) == ("waiting", "down", False)
@@ -1170,7 +1168,7 @@ def test_a_lost_port_clears_every_command() -> None:
     assert {source.age_s for source in sources} == {None}
 
 
-def test_who_commands_while_the_port_is_closed_is_shown_all_the_same() -> None:
+def test_a_source_that_commands_while_the_port_is_closed_is_shown() -> None:
     bench = Bench().linked().unplug()
     bench.step()
     bench.step(GO)
@@ -1179,7 +1177,7 @@ def test_who_commands_while_the_port_is_closed_is_shown_all_the_same() -> None:
     assert ages["app"] == 0.1
 
 
-def test_without_neutral_first_nobody_is_asked_for_it_before_the_port_is_there() -> None:
+def test_without_neutral_first_no_source_waits_for_a_zero_before_the_port_opens() -> None:
     bench = Bench(Config(commands=CommandsConfig(neutral_first=False))).unplug()
     bench.opened = 0  # the port was never open
     bench.step(GO)
@@ -1187,7 +1185,7 @@ def test_without_neutral_first_nobody_is_asked_for_it_before_the_port_is_there()
     assert waits["app"] == ""
 
 
-def test_a_silent_mcu_is_rest_after_quiet() -> None:
+def test_a_silent_mcu_makes_the_link_stale_and_the_speed_zero() -> None:
     bench = Bench().driving()
     bench.reply = None
     for _ in range(10):
@@ -1207,14 +1205,14 @@ def test_without_feedback_only_zero_lines_go_out_ten_times_a_second() -> None:
     assert {line for line in lines if line} == {ZERO_LINE}
 
 
-def test_the_first_line_of_a_new_robot_is_zero_and_goes_at_once() -> None:
+def test_the_first_step_of_a_new_robot_sends_a_zero_line() -> None:
     bench = Bench()
     bench.reply = None
     assert bench.step().line == ZERO_LINE
     assert bench.step().line is None
 
 
-def test_while_it_boots_every_line_is_zero() -> None:
+def test_while_the_link_boots_every_line_is_zero() -> None:
     bench = Bench(Config(commands=CommandsConfig(neutral_first=False)))
     assert bench.step(REST).line == ZERO_LINE
     assert bench.step(GO).line == ZERO_LINE
@@ -1291,7 +1289,7 @@ def test_a_refused_request_is_no_event() -> None:
     assert names(bench.out) == []
 
 
-def test_a_clear_of_nothing_succeeds_says_so_and_changes_nothing() -> None:
+def test_a_clear_without_a_latch_succeeds_and_changes_nothing() -> None:
     bench = Bench().driving()
     mode, twist = bench.mode(), bench.out.applied
     assert bench.step(GO, ask="clear").answers == (
@@ -1300,7 +1298,7 @@ def test_a_clear_of_nothing_succeeds_says_so_and_changes_nothing() -> None:
     assert (bench.mode(), bench.out.applied != REST, twist != REST) == (mode, True, True)
 
 
-def test_a_stop_holds_over_a_lost_link() -> None:
+def test_a_stop_stays_latched_after_a_lost_link() -> None:
     bench = Bench().driving()
     bench.step(ask="stop")
     bench.unplug().step()
@@ -1338,7 +1336,7 @@ def test_deactivating_ramps_to_zero_by_the_normal_deceleration() -> None:
     assert bench.out.reason == off
 
 
-def test_activating_switches_it_on_and_each_source_must_be_neutral() -> None:
+def test_after_an_activation_each_source_must_be_neutral() -> None:
     bench = Bench().driving()
     bench.step(ask="deactivate")
     assert bench.answer("activate") == Answer(7, True, "active")
@@ -1357,7 +1355,7 @@ def test_activating_an_active_robot_changes_nothing() -> None:
     assert bench.step(GO).applied == GO
 
 
-def test_each_change_of_mode_by_request_is_an_event_however_soon_it_comes() -> None:
+def test_each_change_of_mode_by_request_is_an_event_even_in_quick_succession() -> None:
     bench = Bench().linked()
     for _ in range(2):
         assert names(bench.step(ask="stop")) == ["stop", "mode"]
@@ -1367,14 +1365,14 @@ def test_each_change_of_mode_by_request_is_an_event_however_soon_it_comes() -> N
 # the pose
 
 
-def test_set_pose_puts_the_robot_there() -> None:
+def test_set_pose_sets_the_pose_of_the_next_estimate() -> None:
     bench = Bench().linked()
     answer = bench.answer("set_pose", Pose(1.0, 2.0, 0.5))
     assert answer == Answer(7, True, "pose is x 1, y 2, yaw 0.5")
     assert bench.step().estimates[-1].pose == Pose(1.0, 2.0, 0.5)
 
 
-def test_reset_odometry_is_the_pose_zero() -> None:
+def test_reset_odometry_sets_the_pose_to_zero() -> None:
     bench = Bench().linked()
     bench.step(ask="set_pose", pose=Pose(1.0, 2.0, 0.5))
     assert bench.answer("reset_odometry") == Answer(7, True, "pose is x 0, y 0, yaw 0")
@@ -1400,7 +1398,9 @@ def test_several_requests_of_one_step_are_answered_in_order() -> None:
 
 
 @pytest.mark.parametrize("order", [("stop", "clear"), ("clear", "stop")])
-def test_a_clear_that_came_with_a_stop_does_not_undo_it(order: tuple[Verb, Verb]) -> None:
+def test_a_clear_in_the_same_step_as_a_stop_does_not_release_the_stop(
+    order: tuple[Verb, Verb],
+) -> None:
     bench = Bench().linked()
     bench.step(ask="stop")
     bench.now_ns += 10 * MS
@@ -1408,7 +1408,7 @@ def test_a_clear_that_came_with_a_stop_does_not_undo_it(order: tuple[Verb, Verb]
     assert bench.robot.step(Inputs(bench.now, True, True, 1, requests=requests)).mode == "stopped"
 
 
-def test_a_clear_asked_before_the_stop_was_obeyed_does_not_undo_it() -> None:
+def test_a_clear_requested_before_the_stop_was_applied_does_not_release_the_stop() -> None:
     bench = Bench().linked()
     asked_ns = bench.now_ns + 5 * MS
     bench.step(ask="stop")
@@ -1423,13 +1423,13 @@ def test_a_clear_asked_before_the_stop_was_obeyed_does_not_undo_it() -> None:
     assert bench.robot.step(Inputs(bench.now, True, True, 1, requests=again)).answers[0].success
 
 
-def test_a_service_called_as_fast_as_can_be_is_a_line_of_log_a_second() -> None:
+def test_a_service_that_is_called_continuously_causes_one_event_per_second() -> None:
     bench = Bench().linked()
     said = [event for _ in range(250) for event in bench.step(ask="reset_odometry").events]
     assert [event.count for event in said] == [1, 100, 100]
 
 
-def test_a_stop_that_comes_ahead_of_its_query_and_with_it_is_one_event() -> None:
+def test_a_stop_that_arrives_before_its_query_and_with_it_is_one_event() -> None:
     bench = Bench().linked()
     for number in (1, 2):
         asked_ns = bench.now_ns
@@ -1471,7 +1471,7 @@ def test_missed_periods_are_reported_with_their_number() -> None:
     assert bench.counters()["missed_periods"] == 4
 
 
-def test_what_the_shell_has_to_say_comes_first_and_as_seldom_as_the_rest() -> None:
+def test_events_from_outside_the_robot_come_first_and_are_throttled() -> None:
     bench = Bench()
     told: list[Event] = []
     lost = Event("port_lost", "it is gone", "warning")
@@ -1484,7 +1484,7 @@ def test_what_the_shell_has_to_say_comes_first_and_as_seldom_as_the_rest() -> No
     assert sum(event.count for event in lines) > 900
 
 
-def test_over_one_line_in_a_hundred_that_cannot_be_true_is_reported_with_what_to_do() -> None:
+def test_more_than_one_implausible_line_in_a_hundred_is_an_event() -> None:
     bench, told = Bench().linked(), Counter[str]()
     for i in range(2000):
         bench.reply = bench.codec.encode(WheelSpeeds(99.0, 0.0, 0.0, 0.0) if i % 50 == 0 else STILL)
@@ -1493,7 +1493,7 @@ def test_over_one_line_in_a_hundred_that_cannot_be_true_is_reported_with_what_to
     assert bench.out.mode == "ready"
 
 
-def test_lines_that_cannot_be_true_are_told_as_rejected() -> None:
+def test_implausible_lines_are_reported_as_rejected() -> None:
     bench = Bench().linked()
     bench.reply = bench.codec.encode(WheelSpeeds(99.0, 99.0, 99.0, 99.0))
     assert names(bench.step())[0] == "lines_rejected"
@@ -1552,7 +1552,7 @@ def test_a_guard_trip_is_a_latched_fault_and_an_error_event() -> None:
     assert (bench.mode(), bench.out.applied) == ("fault", REST)
 
 
-def test_after_a_guard_trip_the_robot_goes_on_from_the_stop_that_was_sent() -> None:
+def test_after_a_guard_trip_the_robot_continues_from_the_stop_that_was_sent() -> None:
     bench = Bench().driving()
     assert bench.step(GO, guard_trip="a wheel is too fast").line == ZERO_LINE
 
@@ -1580,7 +1580,7 @@ def test_a_third_impossible_line_is_a_fault_that_brakes_by_the_stop_deceleration
     assert bench.counters()["line_implausible"] == 3
 
 
-def test_a_lost_link_begins_the_count_of_impossible_lines_anew() -> None:
+def test_a_lost_link_resets_the_count_of_impossible_lines() -> None:
     bench = impossible(Bench().driving(), 2)
     bench.unplug().step()
     impossible(bench.replug(), 3)
@@ -1594,7 +1594,7 @@ def test_a_fault_clears_every_command() -> None:
     assert {source.age_s for source in sources} == {None}
 
 
-def test_after_clear_impossible_lines_are_counted_anew() -> None:
+def test_clear_resets_the_count_of_impossible_lines() -> None:
     bench = impossible(Bench().driving(), 3)
     bench.reply = bench.codec.encode(WheelSpeeds(99.0, 99.0, 99.0, 99.0))
     bench.step(ask="clear")
@@ -1633,7 +1633,7 @@ def test_shutting_down_is_one_event() -> None:
 # lines that did not leave
 
 
-def test_a_superseded_line_never_happened() -> None:
+def test_after_superseded_lines_the_speed_grows_from_the_last_sent_line() -> None:
     # Every second line leaves, so two periods have passed since the last sent one.
     bench = Bench().linked()
     bench.step(REST)
@@ -1658,7 +1658,7 @@ def test_while_lines_are_superseded_the_speed_cannot_run_away_from_the_last_line
         assert out.applied.linear <= 0.11 + 0.05 + 1e-9
 
 
-def test_a_superseded_line_in_a_ramp_brakes_as_time_passes() -> None:
+def test_after_a_superseded_line_a_ramp_brakes_for_the_whole_elapsed_time() -> None:
     bench = Bench().driving()
     for _ in range(26):
         bench.step()
@@ -1667,14 +1667,14 @@ def test_a_superseded_line_in_a_ramp_brakes_as_time_passes() -> None:
     assert bench.step(superseded=True).applied.linear == pytest.approx(0.47)  # 0.49 and 20 ms
 
 
-def test_what_was_not_said_for_too_long_is_not_resumed() -> None:
+def test_after_too_long_without_a_sent_line_the_speed_starts_from_zero() -> None:
     bench = Bench().driving()
     assert bench.step(GO, ms=250).applied == GO
     assert bench.step(GO, ms=260).applied == REST
     assert bench.step(GO).applied.linear == pytest.approx(0.01)
 
 
-def test_lines_superseded_for_too_long_begin_again_from_rest() -> None:
+def test_after_lines_were_superseded_for_too_long_the_speed_is_zero() -> None:
     bench = Bench().driving()
     bench.step(GO)  # the first line that does not leave; the MCU received the one before it last
     path = [bench.step(GO, superseded=True).applied.linear for _ in range(26)]
@@ -1682,14 +1682,14 @@ def test_lines_superseded_for_too_long_begin_again_from_rest() -> None:
     assert path[24:] == [0.0, 0.0]
 
 
-def test_a_stalled_loop_does_not_leap() -> None:
+def test_after_a_stall_the_speed_grows_by_at_most_50_ms_of_acceleration() -> None:
     bench = Bench().linked()
     bench.step(REST)
     bench.step(GO)
     assert bench.step(GO, ms=200).applied.linear == pytest.approx(0.01 + 0.05)
 
 
-def test_at_a_slow_rate_a_stalled_loop_leaps_one_and_a_half_periods_at_most() -> None:
+def test_at_a_slow_rate_a_stall_adds_at_most_1_5_periods_of_acceleration() -> None:
     slow = Config(
         control=ControlConfig(rate=10.0),
         commands=CommandsConfig(sources=(Source("app", 50, 1.0),)),
@@ -1699,7 +1699,7 @@ def test_at_a_slow_rate_a_stalled_loop_leaps_one_and_a_half_periods_at_most() ->
     assert bench.step(GO, ms=240).applied.linear == pytest.approx(0.15)
 
 
-def test_a_stalled_loop_brakes_for_all_the_time_that_passed() -> None:
+def test_after_a_stall_the_robot_brakes_for_the_whole_elapsed_time() -> None:
     bench = Bench().driving()
     bench.reply = bench.codec.stop
     for _ in range(25):
@@ -1722,7 +1722,9 @@ def test_a_line_superseded_before_the_port_was_lost_does_not_bring_its_speed_bac
 
 
 @pytest.mark.parametrize("neutral_first", [True, False])
-def test_nor_when_the_port_was_lost_and_found_between_two_ticks(neutral_first: bool) -> None:
+def test_a_superseded_speed_does_not_return_if_the_port_reopened_between_two_ticks(
+    neutral_first: bool,
+) -> None:
     bench = Bench(Config(commands=CommandsConfig(neutral_first))).driving()
     bench.step(GO)  # this line does not leave
     bench.replug()
@@ -1790,7 +1792,7 @@ def test_the_same_inputs_give_the_same_outputs(seed: int) -> None:
     assert len({outputs.mode for outputs in first}) > 2
 
 
-def test_without_auto_activate_a_robot_is_ready_in_the_step_that_activates_it() -> None:
+def test_without_auto_activate_a_robot_is_ready_in_the_step_of_the_activation() -> None:
     bench = Bench(Config(control=ControlConfig(auto_activate=False))).linked()
     assert bench.mode() == "inactive"
     bench.step(ask="activate")
@@ -1817,7 +1819,7 @@ OFF = Latches(inactive=Latch(9, WALL_NS, "joe", "switched off by joe", kept=True
         (OFF, "inactive", "was switched off by joe at 2027-01-15 08:00:00 UTC, before the restart"),
     ],
 )
-def test_a_robot_starts_in_the_mode_of_its_latches_and_one_event_says_so(
+def test_a_robot_starts_in_the_mode_of_its_latches_with_one_event(
     latches: Latches, mode: str, why: str
 ) -> None:
     bench = Bench(latches=latches)
@@ -1851,7 +1853,7 @@ def test_a_lowered_limit_is_kept_until_it_is_raised_to_that_of_the_file() -> Non
     assert bench.set({"limits.linear_speed": 1.0}) == {}
 
 
-def test_a_lowered_limit_holds_after_a_restart_and_an_event_says_so() -> None:
+def test_a_lowered_limit_holds_after_a_restart_and_an_event_reports_it() -> None:
     bench = Bench(latches=Latches(lowered=SLOW))
     (event,) = bench.out.events
     assert (event.name, event.level) == ("set", "warning")
@@ -1882,7 +1884,7 @@ def test_at_a_slow_rate_a_commanded_zero_brakes_by_the_whole_deceleration() -> N
     assert speeds == pytest.approx([0.9, 0.8, 0.7])
 
 
-def test_bytes_faster_than_the_wire_carries_them_end_nothing() -> None:
+def test_a_flood_of_bytes_faster_than_the_wire_raises_no_error() -> None:
     """A board floods the USB link, or the baud rate is set too low.
 
     Reads with one and the same time are not a clock.
@@ -1907,7 +1909,7 @@ def test_bytes_faster_than_the_wire_carries_them_end_nothing() -> None:
 # the gyro, the wheels and the clocks, as the robot reports them
 
 
-def test_the_track_that_a_gyro_taught_is_an_event_and_is_used_from_then_on() -> None:
+def test_a_track_learned_from_the_gyro_is_an_event_and_is_used_afterwards() -> None:
     bench = Bench(Config(odometry=OdometryConfig(gyro=True, learned_track=True))).linked()
     for _ in range(150):
         bench.step(gyro=0.0)
@@ -1969,7 +1971,7 @@ def test_wheels_that_turn_without_a_command_are_reported_and_counted() -> None:
     assert bench.mode() == "ready"
 
 
-def test_a_wheel_that_stands_while_the_others_roll_is_reported_and_counted() -> None:
+def test_a_wheel_at_rest_while_the_others_roll_is_reported_and_counted() -> None:
     bench = Bench().driving()
     bench.reply = bench.codec.encode(replace(ROLLING, front_left=0.0))
     told = [one.name for _ in range(200) for one in bench.step(GO).events]
@@ -1977,7 +1979,7 @@ def test_a_wheel_that_stands_while_the_others_roll_is_reported_and_counted() -> 
     assert bench.counters()["wheel_faults"] >= 1
 
 
-def test_a_setting_that_cannot_be_is_refused_and_changes_nothing() -> None:
+def test_an_invalid_setting_is_refused_and_changes_nothing() -> None:
     bench = Bench().linked()
     before = bench.robot.config
     settings: dict[str, Plain] = {"limits.linear_speed": -1.0}
@@ -2002,9 +2004,7 @@ def test_a_timeout_that_is_set_applies_and_each_sender_must_be_neutral_again() -
 
 
 @pytest.mark.parametrize(("refused_ms", "mode"), [(502, "ready"), (2, "ready"), (0, "driving")])
-def test_a_refused_message_ends_only_the_wait_of_zeros_before_it(
-    refused_ms: int, mode: str
-) -> None:
+def test_a_refused_message_disarms_only_the_zeros_before_it(refused_ms: int, mode: str) -> None:
     bench = Bench().linked()
     zero_ns = bench.now_ns + MS
     refused = Refusal("malformed", "it cannot be read", "app", "", zero_ns + refused_ms * MS)
@@ -2026,7 +2026,7 @@ def test_a_refused_message_ends_only_the_wait_of_zeros_before_it(
     assert bench.mode() == mode
 
 
-def test_the_first_commands_of_a_clock_are_counted_apart_from_those_refused() -> None:
+def test_first_commands_of_a_new_sender_are_counted_apart_from_refused_ones() -> None:
     bench = Bench().linked()
     bench.step(REST, late_ms=0.0)
     counters = bench.counters()
@@ -2034,14 +2034,14 @@ def test_the_first_commands_of_a_clock_are_counted_apart_from_those_refused() ->
     assert not [name for name in counters if name.startswith("command_")]
 
 
-def test_what_foreign_clocks_were_forgiven_is_counted_in_ms() -> None:
+def test_adjustments_for_the_clocks_of_senders_are_counted_in_ms() -> None:
     bench = Bench().linked()
     for number in range(300):
         bench.step(REST, late_ms=min(max(0.0, 10.0 * (number - 100)), 300.0), ms=50)
     assert "clock_adjustments_ms" in bench.counters()
 
 
-def test_the_latches_of_a_robot_are_those_of_its_last_step() -> None:
+def test_the_latches_of_the_robot_are_those_of_its_last_step() -> None:
     bench = Bench().linked()
     bench.answer("stop")
     assert bench.robot.latches is bench.out.latches

@@ -810,24 +810,24 @@ def explore(examples: int, steps: int) -> None:
 
 
 @pytest.mark.parametrize("examples", [12, pytest.param(40, marks=pytest.mark.slow)])
-def test_nothing_that_can_happen_makes_the_robot_break_its_word(examples: int) -> None:
+def test_no_sequence_of_events_breaks_an_invariant_of_the_robot(examples: int) -> None:
     explore(examples, 30)
 
 
-def test_a_link_that_comes_up_between_two_ticks_says_what_the_robot_waits_for() -> None:
+def test_a_link_that_comes_up_between_two_ticks_reports_what_the_robot_waits_for() -> None:
     machine = RobotMachine()
     machine.start(config=CONFIGS[0], rolling=False)
     machine.good_lines_come(count=3, age_us=0)
     machine.a_step_comes_early_or_late(ms=0.5, tick=False)
 
 
-def test_a_second_of_impossible_feedback_is_not_made_up_for_at_the_next_speed() -> None:
+def test_the_distance_of_a_second_of_impossible_feedback_is_not_made_up_later() -> None:
     machine = RobotMachine()
     machine.start(config=CONFIGS[0], rolling=True)
     machine.impossible_lines_come_for_a_while(count=100)
 
 
-def test_settings_for_a_robot_at_rest_wait_until_the_lines_that_say_so_have_gone() -> None:
+def test_settings_for_a_robot_at_rest_are_refused_until_the_zero_lines_were_sent() -> None:
     machine = RobotMachine()
     machine.start(config=CONFIGS[0], rolling=True)
     machine.cruise("app", Twist(0.5, 0.0), 60, 1)
@@ -845,13 +845,13 @@ def test_settings_for_a_robot_at_rest_wait_until_the_lines_that_say_so_have_gone
     assert not answer.success
 
 
-def test_a_softer_acceleration_holds_at_once_whatever_the_jerk_was() -> None:
+def test_a_lower_acceleration_limit_applies_immediately_despite_the_jerk_limit() -> None:
     machine = RobotMachine()
     machine.start(config=CONFIGS[3], rolling=True)
     machine.a_limit_is_set(name="linear_acceleration", share=0.3)
 
 
-def test_a_stall_before_the_first_answer_of_a_new_port_is_made_up_for_once() -> None:
+def test_a_stall_before_the_first_reply_of_a_new_port_is_integrated_only_once() -> None:
     machine = RobotMachine()
     machine.start(config=CONFIGS[0], rolling=True)
     machine.the_port_is_lost_and_found_between_two_steps()
@@ -861,5 +861,5 @@ def test_a_stall_before_the_first_answer_of_a_new_port_is_made_up_for_once() -> 
 
 @pytest.mark.soak
 @pytest.mark.timeout(3600)
-def test_nothing_that_can_happen_a_hundred_times_over_makes_it_break_its_word() -> None:
+def test_no_long_sequence_of_events_breaks_an_invariant_of_the_robot() -> None:
     explore(2000, 60)

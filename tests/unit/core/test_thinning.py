@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from acsard.core.thinning import Band, Curve, Place, Point, Track
 
 
-def test_a_short_curve_is_kept_as_it_is() -> None:
+def test_a_short_curve_is_not_thinned() -> None:
     curve = Curve()
     values = [Point(n / 100, math.sin(n)) for n in range(1500)]
     for point in values:
@@ -20,7 +20,7 @@ def test_a_short_curve_is_kept_as_it_is() -> None:
     assert curve.points() == values
 
 
-def test_ten_minutes_of_a_hundred_values_a_second_keeps_its_one_peak() -> None:
+def test_thinning_a_long_curve_keeps_its_only_peak() -> None:
     curve, peak = Curve(most=200), 37_777
     for n in range(60_000):
         curve.add(n / 100, 9.0 if n == peak else -7.0 if n == peak + 1 else 0.0)
@@ -33,7 +33,9 @@ def test_ten_minutes_of_a_hundred_values_a_second_keeps_its_one_peak() -> None:
 
 
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=60), st.integers(2, 20))
-def test_lowest_and_highest_of_any_curve_are_drawn(values: list[float], most: int) -> None:
+def test_thinning_keeps_the_lowest_and_highest_value_of_any_curve(
+    values: list[float], most: int
+) -> None:
     curve = Curve(most)
     for n, value in enumerate(values):
         curve.add(n * 0.37, value)
@@ -42,7 +44,7 @@ def test_lowest_and_highest_of_any_curve_are_drawn(values: list[float], most: in
     assert len(drawn) <= 2 * most
 
 
-def test_where_there_is_no_value_the_line_is_broken() -> None:
+def test_missing_and_infinite_values_break_the_curve() -> None:
     curve = Curve()
     for t, value in ((0.0, 1.0), (0.1, None), (0.2, math.inf), (0.3, 2.0)):
         curve.add(t, value)
@@ -51,7 +53,7 @@ def test_where_there_is_no_value_the_line_is_broken() -> None:
     assert math.isnan(gap.value)
 
 
-def test_a_long_break_is_still_one_when_bins_are_wide() -> None:
+def test_a_long_gap_remains_one_gap_after_thinning() -> None:
     curve = Curve(most=20)
     for n in range(1000):
         curve.add(n / 10, None if 400 <= n < 600 else 1.0)
@@ -61,7 +63,7 @@ def test_a_long_break_is_still_one_when_bins_are_wide() -> None:
     assert points[gap + 1].t >= 60.0
 
 
-def test_a_band_says_from_when_to_when() -> None:
+def test_a_band_reports_the_begin_and_end_of_each_span() -> None:
     band = Band(("fault", "driving"))
     for t, kind in (
         (0.0, "driving"),
@@ -77,7 +79,7 @@ def test_a_band_says_from_when_to_when() -> None:
     ]  # fmt: skip
 
 
-def test_of_too_many_spans_the_worst_kind_stays() -> None:
+def test_thinning_too_many_spans_keeps_the_most_severe_kind() -> None:
     band = Band(("fault", "driving", "ready"), most=30)
     for n in range(3000):
         band.add(n / 10, "fault" if n == 1234 else "driving" if n % 2 else "ready")
@@ -89,7 +91,7 @@ def test_of_too_many_spans_the_worst_kind_stays() -> None:
     assert (spans[0].begin, spans[-1].end) == (0.0, 300.0)
 
 
-def test_a_path_is_thinned_and_no_place_is_far_from_what_is_kept() -> None:
+def test_every_place_of_a_thinned_path_is_near_a_kept_place() -> None:
     dice, track = random.Random(1), Track(most=100)
     x = y = 0.0
     driven = []
@@ -104,7 +106,7 @@ def test_a_path_is_thinned_and_no_place_is_far_from_what_is_kept() -> None:
     assert max(away) <= 2 * track.stride
 
 
-def test_a_jump_of_the_pose_is_kept_as_one() -> None:
+def test_thinning_a_path_keeps_a_jump_of_the_pose() -> None:
     track = Track(most=50)
     for n in range(1000):
         track.add(Place(n / 100, n / 100 + (5.0 if n >= 500 else 0.0), 0.0, 0.0, new=n == 500))
@@ -112,7 +114,7 @@ def test_a_jump_of_the_pose_is_kept_as_one() -> None:
     assert jump.x >= 10.0
 
 
-def test_a_robot_that_stands_is_one_place() -> None:
+def test_the_path_of_a_robot_at_rest_is_one_place() -> None:
     track = Track()
     for n in range(1000):
         track.add(Place(n / 10, 1.0, 2.0, 0.0))
@@ -130,7 +132,7 @@ def test_a_path_of_the_last_minutes_forgets_older_places() -> None:
     assert places[-1].t == 100.0
 
 
-def test_a_step_that_no_robot_drives_restarts_the_path() -> None:
+def test_an_impossibly_long_step_restarts_the_path() -> None:
     track = Track(jump=1.0)
     for n in range(10):
         track.add(Place(n / 10, 0.1 * n, 0.0, 0.0))

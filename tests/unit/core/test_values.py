@@ -26,7 +26,7 @@ def test_four_wheel_values_are_in_the_order_of_wheels() -> None:
 
 
 @each("cls", STRUCTS)
-def test_every_noun_is_frozen(cls: type[msgspec.Struct]) -> None:
+def test_every_value_type_is_frozen(cls: type[msgspec.Struct]) -> None:
     assert cls.__struct_config__.frozen
 
 

@@ -63,7 +63,9 @@ def test_a_file_keeps_its_owner_unless_another_is_given(file: Path) -> None:
     assert (file.stat().st_uid, file.stat().st_gid) == (9, 10)
 
 
-def test_a_file_of_another_user_becomes_ours(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_replaced_file_of_another_user_belongs_to_the_present_user(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refuse(*_: int) -> None:
         raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
 
@@ -93,7 +95,7 @@ def test_a_file_of_another_user_stays_in_its_group(
 
 
 @pytest.mark.parametrize("call", ["fchmod", "fsync", "replace"])
-def test_after_an_error_the_old_file_is_there_and_no_other(
+def test_after_an_error_only_the_old_file_exists(
     file: Path, monkeypatch: pytest.MonkeyPatch, call: str
 ) -> None:
     monkeypatch.setattr(os, call, fail)

@@ -98,7 +98,7 @@ def test_a_child_that_is_released_sees_the_end_of_its_input() -> None:
     assert codes == [0]
 
 
-def test_a_child_that_is_released_before_it_starts_ends_at_once() -> None:
+def test_a_child_that_is_released_before_its_start_ends_immediately() -> None:
     child = Child(program(UNTIL_CLOSED))
     child.release()
     assert child.run() == 0
@@ -111,7 +111,7 @@ def test_a_child_without_a_first_sign_of_life_is_killed(monkeypatch: pytest.Monk
     assert "stopped or hung" in child.silent
 
 
-def test_a_child_that_falls_silent_is_killed_although_it_is_stopped(
+def test_a_stopped_child_without_signs_of_life_is_killed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(module, "START_NS", 3600 * NS_PER_S)
@@ -129,7 +129,7 @@ def test_a_child_that_gives_signs_of_life_is_not_killed(monkeypatch: pytest.Monk
     assert (child.run(), child.silent) == (0, "")
 
 
-def test_a_child_has_a_session_of_its_own_and_does_not_speak_for_our_unit(
+def test_a_child_has_its_own_session_and_no_notify_socket_of_its_parent(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("NOTIFY_SOCKET", "/run/us")
@@ -158,7 +158,7 @@ async def test_a_child_is_killed_and_collected_when_its_block_fails() -> None:
     assert child.returncode == -signal.SIGKILL
 
 
-def test_a_child_is_collected_although_nobody_reads_its_output() -> None:
+def test_a_child_whose_output_is_not_read_is_collected() -> None:
     flood = "import os\nwhile True: os.write(1, bytes(65536))"
 
     async def story() -> int | None:
@@ -177,7 +177,7 @@ async def test_a_child_that_has_ended_keeps_its_exit_code_and_its_output() -> No
     assert (out, child.returncode) == (b"1\n", 3)
 
 
-async def test_a_child_gets_its_limits_and_one_that_has_ended_needs_none() -> None:
+async def test_a_running_child_gets_its_limits_and_an_ended_child_raises_no_error() -> None:
     limits = Limits(nice=19, memory_bytes=64 << 20)
     text = "import sys; sys.stdin.read(1); bytearray(100 << 20)"
     async with running(program(text), limits, stdin=PIPE, stderr=PIPE) as child:
@@ -235,7 +235,7 @@ def test_a_child_ends_when_its_parent_is_killed() -> None:
 
 
 @pytest.mark.slow
-def test_signs_of_life_reach_the_parent_and_never_wait_for_it() -> None:
+def test_signs_of_life_reach_the_parent_and_never_block_the_child() -> None:
     ours, its = socket.socketpair()
     with ours, its:
         parent = Parent(its.fileno())
@@ -244,7 +244,7 @@ def test_signs_of_life_reach_the_parent_and_never_wait_for_it() -> None:
         assert set(ours.recv(1 << 20)) == set(b".")
 
 
-def test_a_parent_that_closed_its_end_is_gone_and_takes_no_signs_of_life() -> None:
+def test_a_parent_that_closed_its_end_is_gone_and_beats_raise_no_error() -> None:
     ours, its = socket.socketpair()
     with its:
         parent = Parent(its.fileno())
@@ -258,7 +258,7 @@ def test_a_parent_that_closed_its_end_is_gone_and_takes_no_signs_of_life() -> No
         parent.beat()
 
 
-def test_a_terminal_takes_no_signs_of_life_and_still_blocks_for_other_programs() -> None:
+def test_a_terminal_receives_no_signs_of_life_and_remains_blocking() -> None:
     ours, its = os.openpty()
     parent = Parent(its)
     parent.beat()
@@ -268,7 +268,7 @@ def test_a_terminal_takes_no_signs_of_life_and_still_blocks_for_other_programs()
     os.close(its)
 
 
-def test_the_end_of_a_pipe_is_the_end_of_the_parent() -> None:
+def test_a_parent_is_gone_when_its_end_of_the_pipe_is_closed() -> None:
     reads, writes = os.pipe()
     parent = Parent(reads)
     parent.beat()
@@ -284,12 +284,12 @@ S = 10**9
 MOST = 3 * S
 
 
-def test_it_is_too_long_when_it_is_longer() -> None:
+def test_a_silence_is_too_long_when_it_exceeds_the_limit() -> None:
     silence = Silence(MOST)
     assert [silence.too_long(False, S // 2) for _ in range(7)] == [False] * 6 + [True]
 
 
-def test_who_says_something_has_all_the_time_again() -> None:
+def test_a_sign_of_life_restarts_the_time_limit_of_the_silence() -> None:
     silence = Silence(MOST)
     for _ in range(5):
         assert not any(silence.too_long(False, S // 2) for _ in range(6))
@@ -297,6 +297,6 @@ def test_who_says_something_has_all_the_time_again() -> None:
 
 
 @given(st.lists(st.integers(0, 10**13), max_size=6))
-def test_however_long_the_machine_stands_still_that_is_nobodys_silence(stalls: list[int]) -> None:
+def test_a_stall_of_the_machine_does_not_count_as_silence(stalls: list[int]) -> None:
     silence = Silence(MOST)
     assert not any(silence.too_long(False, stall) for stall in stalls)

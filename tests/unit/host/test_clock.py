@@ -34,7 +34,9 @@ class Machine:
 
 
 @pytest.mark.parametrize("takes", [0, 1, 3])
-def test_both_are_of_one_moment(monkeypatch: pytest.MonkeyPatch, takes: int) -> None:
+def test_both_clocks_are_read_at_the_same_moment(
+    monkeypatch: pytest.MonkeyPatch, takes: int
+) -> None:
     machine = Machine(takes)
     monkeypatch.setattr(clock, "mono_ns", machine.mono_ns)
     monkeypatch.setattr(time, "time_ns", machine.wall_ns)
@@ -42,7 +44,9 @@ def test_both_are_of_one_moment(monkeypatch: pytest.MonkeyPatch, takes: int) -> 
     assert at.wall_ns - at.mono_ns == WALL_NS
 
 
-def test_a_machine_that_always_does_ends_the_trying(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reading_both_clocks_stops_retrying_on_a_slow_machine(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     machine = Machine(1000)
     monkeypatch.setattr(clock, "mono_ns", machine.mono_ns)
     monkeypatch.setattr(time, "time_ns", machine.wall_ns)
@@ -56,7 +60,7 @@ def test_an_instant_is_in_whole_microseconds(monkeypatch: pytest.MonkeyPatch) ->
     assert (at.mono_ns % 1000, at.wall_ns) == (0, WALL_NS + 1_000)
 
 
-def test_a_sleep_is_reported_once_and_the_next_one_too() -> None:
+def test_each_suspend_is_reported_once() -> None:
     slept = [5 * MOMENT_NS]
     asleep = Asleep(lambda: slept[0])
     assert not asleep.was()
@@ -66,14 +70,14 @@ def test_a_sleep_is_reported_once_and_the_next_one_too() -> None:
         assert not asleep.was()
 
 
-def test_who_loses_the_processor_between_the_two_clocks_has_not_slept() -> None:
+def test_a_preemption_between_the_two_clock_readings_is_not_reported_as_a_suspend() -> None:
     readings = [0, 3 * MOMENT_NS, 0, 0]
     asleep = Asleep(lambda: readings.pop(0))
     assert not asleep.was()
     assert not asleep.was()
 
 
-def test_this_machine_is_awake() -> None:
+def test_no_suspend_is_reported_while_the_machine_is_awake() -> None:
     asleep = Asleep(asleep_ns)
     assert not any(asleep.was() for _ in range(1000))
 

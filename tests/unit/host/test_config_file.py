@@ -29,7 +29,7 @@ def changed(file: Path) -> list[tuple[str, str]]:
     return [(before, after) for before, after in pairs if before != after]
 
 
-def test_only_the_values_of_the_reference_change(tmp_path: Path) -> None:
+def test_a_change_of_the_reference_file_changes_only_the_values(tmp_path: Path) -> None:
     file = tmp_path / "acsard.toml"
     file.write_text(REFERENCE.read_text())
     file.chmod(0o640)
@@ -45,7 +45,7 @@ def test_only_the_values_of_the_reference_change(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["acsard.toml"]
 
 
-def test_a_file_that_would_not_check_is_left_as_it_was(tmp_path: Path) -> None:
+def test_an_edit_that_makes_the_file_invalid_leaves_it_unchanged(tmp_path: Path) -> None:
     file = tmp_path / "acsard.toml"
     file.write_text("[mcu]\n")
     with pytest.raises(MendableError, match="was not changed"):
@@ -54,7 +54,7 @@ def test_a_file_that_would_not_check_is_left_as_it_was(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["acsard.toml"]
 
 
-def test_what_the_library_cannot_do_is_reported(
+def test_an_error_of_the_toml_library_leaves_the_file_unchanged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fails(text: str) -> None:
@@ -67,7 +67,7 @@ def test_what_the_library_cannot_do_is_reported(
     assert (tmp_path / "acsard.toml").read_text() == "# mine\n"
 
 
-def test_a_link_stays_one(tmp_path: Path) -> None:
+def test_a_change_through_a_symbolic_link_keeps_the_link(tmp_path: Path) -> None:
     (tmp_path / "real.toml").write_text("# mine\n")
     link = tmp_path / "acsard.toml"
     link.symlink_to("real.toml")
@@ -81,7 +81,7 @@ def test_a_missing_file_is_reported(tmp_path: Path) -> None:
         change(tmp_path / "none.toml", KEYS)
 
 
-def test_a_new_file_is_made_only_where_that_is_meant(tmp_path: Path) -> None:
+def test_a_missing_file_is_created_if_the_caller_permits_it(tmp_path: Path) -> None:
     file = tmp_path / "acsard.toml"
     assert change(file, KEYS, new=True) == KEYS
     assert parse(file.read_bytes()).mcu.baud_rate == 57600
@@ -89,7 +89,7 @@ def test_a_new_file_is_made_only_where_that_is_meant(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["acsard.toml"]
 
 
-def test_keys_may_be_made_from_what_the_file_says(tmp_path: Path) -> None:
+def test_new_values_may_be_calculated_from_the_present_configuration(tmp_path: Path) -> None:
     file = tmp_path / "acsard.toml"
     file.write_bytes(b"# mine\r\n[mcu]\r\nencoder_counts = 5\r\n")
     change(file, lambda config: {"mcu.encoder_counts": 2 * config.mcu.encoder_counts})

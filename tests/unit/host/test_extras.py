@@ -30,7 +30,9 @@ def installed(where: Path, **direct: object) -> Distribution:
 
 
 @pytest.mark.parametrize("editable", [True, False])
-def test_from_a_clone_it_is_that_clone_again(tmp_path: Path, editable: bool) -> None:
+def test_an_installation_from_a_clone_installs_the_extra_from_the_clone(
+    tmp_path: Path, editable: bool
+) -> None:
     clone = tmp_path / "my clone"
     clone.mkdir()
     (clone / "pyproject.toml").touch()
@@ -39,16 +41,18 @@ def test_from_a_clone_it_is_that_clone_again(tmp_path: Path, editable: bool) -> 
 
 
 @pytest.mark.parametrize("url", ["file:///gone/away", "https://example.org/acsard.whl"])
-def test_from_what_is_gone_it_is_the_libraries_alone(tmp_path: Path, url: str) -> None:
+def test_an_installation_from_a_missing_source_installs_only_the_libraries(
+    tmp_path: Path, url: str
+) -> None:
     assert wanted_by(installed(tmp_path, url=url), "tls") == ["one<2,>=1", "two"]
 
 
-def test_from_nobody_knows_where_it_is_the_libraries_alone(tmp_path: Path) -> None:
+def test_an_installation_from_an_unknown_source_installs_only_the_libraries(tmp_path: Path) -> None:
     assert wanted_by(installed(tmp_path), "web") == ["three"]
 
 
 @pytest.mark.parametrize("extra", get_args(Extra))
-def test_what_is_told_is_for_the_venv_at_hand(extra: Extra) -> None:
+def test_the_advised_command_installs_into_the_present_venv(extra: Extra) -> None:
     words = shlex.split(install(extra))
     # the user who runs the tests may not be the one who installed
     if not os.access(sys.prefix, os.W_OK):
@@ -57,7 +61,7 @@ def test_what_is_told_is_for_the_venv_at_hand(extra: Extra) -> None:
     assert words[-1] == f"{ROOT}[{extra}]"
 
 
-def test_all_has_every_convenience_and_the_tests_have_them_too() -> None:
+def test_the_extra_all_has_every_optional_library_and_test_has_them_too() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = {name: set(wanted) for name, wanted in project["optional-dependencies"].items()}
     each = [extras[name] for name in get_args(Extra)]

@@ -69,7 +69,7 @@ def test_this_computer_has_the_files_that_every_linux_has() -> None:
     assert any(one.pid == 1 for one in Kernel().programs())
 
 
-def test_conditions_may_be_taken_over_instead_of_read(tmp_path: Path) -> None:
+def test_given_conditions_replace_those_of_the_files(tmp_path: Path) -> None:
     kernel = Kernel(write(tmp_path, QUIET | {HWMON + "in0_lcrit_alarm": "1\n"}))
     assert kernel.read(Conditions()).conditions == Conditions()
     assert kernel.read().conditions.undervoltage
@@ -83,7 +83,7 @@ def test_without_pressure_stall_information_the_idle_time_with_io_counts(tmp_pat
     assert kernel.read().disk_ns == 17690 * TICK
 
 
-def test_the_delays_of_the_own_thread_and_its_bytes_are_read(tmp_path: Path) -> None:
+def test_the_disk_delays_and_bytes_of_the_own_thread_are_read(tmp_path: Path) -> None:
     files = {OWN_STAT: own(faults=9, blocked=7), OWN_IO: IO.format(read=1 << 20)}
     reading = Kernel(write(tmp_path, QUIET | files)).read()
     assert (reading.major_faults, reading.own_disk_ns) == (9, 7 * TICK)
@@ -140,7 +140,7 @@ def test_a_clock_is_slow_if_its_limit_is_far_below_the_full_clock(
     assert found == (None if limit is None else SlowClock(governor, limit, 1500))
 
 
-def test_both_versions_of_cgroups_say_how_long_there_was_no_quota(tmp_path: Path) -> None:
+def test_the_throttled_time_is_read_from_both_versions_of_cgroups(tmp_path: Path) -> None:
     assert quota("nr_throttled 3\nthrottled_usec 250000\n") == 250 * MS
     assert quota("nr_throttled 3\nthrottled_time 250000000\n") == 250 * MS
     files = QUIET | {CGROUP: "throttled_usec 70000\n"}
@@ -152,12 +152,12 @@ def test_both_versions_of_cgroups_say_how_long_there_was_no_quota(tmp_path: Path
     assert Kernel(write(tmp_path / "1", files)).read().quota_ns == 80 * MS
 
 
-def test_the_times_of_a_thread_are_read_and_absent_without_them() -> None:
+def test_the_scheduling_times_of_a_thread_are_read_and_zero_if_absent() -> None:
     assert scheduled(b"682840 117991 2\n") == Scheduled(682840, 117991)
     assert scheduled(b"") == Scheduled()
 
 
-def test_a_program_is_known_by_its_number_name_time_and_policy() -> None:
+def test_the_stat_of_a_program_gives_its_pid_name_time_and_priority() -> None:
     assert program(own(), TICK) == Program(812, "acsard run", 288 * TICK, 20)
     assert not program(own(), TICK).real_time
     assert program(own(priority=-21), TICK).real_time
@@ -167,7 +167,7 @@ def test_a_program_is_known_by_its_number_name_time_and_policy() -> None:
         program("", TICK)
 
 
-def test_the_busiest_program_is_the_one_that_ran_most_between_two_looks() -> None:
+def test_the_busiest_program_is_the_one_that_ran_most_between_two_readings() -> None:
     before = [Program(1, "init", 900 * MS), Program(7, "hog", 100 * MS)]
     after = [Program(1, "init", 910 * MS), Program(7, "hog", 250 * MS), Program(8, "new", 999 * MS)]
     assert busiest(before, after, 200 * MS, 20) == Program(7, "hog", 150 * MS)
@@ -180,7 +180,7 @@ def test_the_busiest_program_is_the_one_that_ran_most_between_two_looks() -> Non
     [(20, 20, True), (20, 39, False), (20, 25, True), (20, -21, True), (-11, 20, False),
      (-11, -11, True), (-11, -2, False), (-11, -21, True)],
 )  # fmt: skip
-def test_a_program_that_the_thread_displaces_is_not_blamed(
+def test_a_program_of_lower_priority_than_the_thread_is_not_blamed(
     thread: int, program_s: int, counts: bool
 ) -> None:
     before, after = [Program(7, "hog", 0, program_s)], [Program(7, "hog", 150 * MS, program_s)]

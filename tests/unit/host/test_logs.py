@@ -71,7 +71,7 @@ def rendered(**line: Any) -> dict[str, str]:
 # fields of a log line
 
 
-def test_an_event_is_its_message_and_its_fields() -> None:
+def test_an_event_has_a_message_and_one_field_per_value() -> None:
     line = rendered(timestamp="now", level="warning", event="link_down", text="cable pulled")
     assert line == {
         "MESSAGE": "link_down: cable pulled",
@@ -93,7 +93,7 @@ def test_a_line_without_a_text_shows_its_fields_in_the_message() -> None:
     ("level", "priority"),
     [("debug", "7"), ("info", "6"), ("warning", "4"), ("error", "3"), ("odd", "6")],
 )
-def test_levels_are_syslog_s_priorities(level: str, priority: str) -> None:
+def test_a_level_becomes_the_syslog_priority(level: str, priority: str) -> None:
     assert rendered(level=level, event="x")["PRIORITY"] == priority
 
 
@@ -118,19 +118,19 @@ def test_a_line_end_in_a_value_becomes_a_space() -> None:
 # the stream
 
 
-def test_each_write_is_a_datagram(journal: Journal) -> None:
+def test_each_write_sends_one_datagram(journal: Journal) -> None:
     stream = JournalStream(journal.path)
     stream.write("MESSAGE=one\n")
     stream.write("MESSAGE=two\n")
     assert [journal.entry(), journal.entry()] == [{"MESSAGE": "one"}, {"MESSAGE": "two"}]
 
 
-def test_what_is_no_utf_8_is_replaced(journal: Journal) -> None:
+def test_text_that_is_not_utf_8_is_replaced(journal: Journal) -> None:
     JournalStream(journal.path).write("MESSAGE=\udcff")
     assert journal.entry() == {"MESSAGE": "?"}
 
 
-def test_where_no_journal_is_the_stream_says_so(tmp_path: Path) -> None:
+def test_a_missing_journal_socket_raises_an_os_error(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="No such file"):
         JournalStream(str(tmp_path / "nothing"))
 
@@ -138,7 +138,7 @@ def test_where_no_journal_is_the_stream_says_so(tmp_path: Path) -> None:
 # which stream is the journal's
 
 
-def test_a_stream_is_the_journal_s_when_the_environment_names_it() -> None:
+def test_a_stream_is_the_journal_if_the_environment_names_it() -> None:
     with socket.socketpair()[0].makefile("w") as stream:
         found = os.fstat(stream.fileno())
         assert is_journal(stream, {"JOURNAL_STREAM": f"{found.st_dev}:{found.st_ino}"})
@@ -169,7 +169,7 @@ def test_an_event_of_the_log_arrives_with_its_fields(
     assert entry["MESSAGE"] == "link_up: linked"
 
 
-def test_without_a_journal_the_log_goes_on_as_json(
+def test_without_a_journal_the_log_is_written_as_json(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(JournalStream.__init__, "__defaults__", (str(tmp_path / "nothing"),))
@@ -181,7 +181,7 @@ def test_without_a_journal_the_log_goes_on_as_json(
         assert '"event": "link_up"' in stream.read()
 
 
-def test_a_journal_that_goes_away_stops_nobody(
+def test_a_journal_that_disappears_raises_no_error(
     journal: Journal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(JournalStream.__init__, "__defaults__", (journal.path,))
@@ -210,7 +210,7 @@ def entries(path: Path, *events: Event) -> list[dict[str, Any]]:
     return [json.loads(line) for line in written(path, *events)]
 
 
-def test_an_event_says_who_and_how_often_only_where_there_is_something_to_say(
+def test_sender_and_count_of_an_event_are_logged_only_if_present(
     tmp_path: Path,
 ) -> None:
     plain, full = entries(
@@ -223,7 +223,7 @@ def test_an_event_says_who_and_how_often_only_where_there_is_something_to_say(
 
 
 @pytest.mark.parametrize("form", ["json", "console", "logfmt"])
-def test_no_text_of_a_stranger_moves_the_cursor_or_makes_a_line(
+def test_control_characters_of_a_logged_text_are_replaced(
     tmp_path: Path, form: Literal["json", "console", "logfmt"]
 ) -> None:
     evil = "cmd/\x1b[2J\n\r\x00\u202eapp"
@@ -234,7 +234,7 @@ def test_no_text_of_a_stranger_moves_the_cursor_or_makes_a_line(
     assert "\u202e" not in line
 
 
-def test_a_value_has_an_end(tmp_path: Path) -> None:
+def test_a_long_value_is_truncated(tmp_path: Path) -> None:
     (line,) = entries(tmp_path, Event("command_refused", "x" * 10_000))
     assert len(line["text"]) == MAX_VALUE
 
@@ -249,7 +249,7 @@ def test_an_event_below_the_level_is_not_written(tmp_path: Path) -> None:
         assert [json.loads(line)["event"] for line in stream] == ["link_down"]
 
 
-def test_from_another_level_on_it_tells_more_or_less(tmp_path: Path) -> None:
+def test_a_changed_log_level_applies_to_the_next_events(tmp_path: Path) -> None:
     with (tmp_path / "log").open("w+") as stream:
         log = Log(LogConfig(format="json", level="warning"), stream)
         for level in ("warning", "info", "error", "info"):

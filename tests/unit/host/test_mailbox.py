@@ -30,7 +30,7 @@ def took_s(begin_ns: int) -> float:
 # the items
 
 
-def test_items_come_out_once_and_in_the_order_in_which_they_came() -> None:
+def test_items_are_returned_once_and_in_the_order_of_arrival() -> None:
     box = filled(4, 3)
     assert (len(box.waiting), box.pop(), box.take(), box.take(), box.pop(), len(box.waiting)) == (
         3, 0, [1, 2], [], None, 0,
@@ -54,7 +54,7 @@ class Flooded(deque[int]):
         return item
 
 
-def test_a_flood_cannot_hold_the_reader() -> None:
+def test_a_flood_of_items_does_not_block_the_reader() -> None:
     box = Mailbox[int](3)
     box.waiting = Flooded([0, 0, 0], maxlen=3)
     assert box.take() == [0, 0, 0]
@@ -64,20 +64,20 @@ def test_a_flood_cannot_hold_the_reader() -> None:
 # the wake-up
 
 
-def test_an_item_that_came_before_the_wait_ends_it_at_once() -> None:
+def test_an_item_that_arrived_before_the_wait_ends_the_wait_immediately() -> None:
     box = filled(4, 1)
     assert box.wait(0.0)
     assert box.wait(None)
 
 
-def test_a_wait_for_nothing_ends_after_its_time() -> None:
+def test_a_wait_without_items_ends_after_its_timeout() -> None:
     begin_ns = clock.mono_ns()
     assert not Mailbox[int](4).wait(0.05)
     assert 0.05 <= took_s(begin_ns) < WAIT_S
 
 
 @pytest.mark.parametrize("seconds", [0.0, -1.0])
-def test_without_time_to_wait_it_looks_only(seconds: float) -> None:
+def test_a_wait_with_zero_or_negative_timeout_returns_immediately(seconds: float) -> None:
     assert not Mailbox[int](4).wait(seconds)
     assert not Bell().wait(seconds)
 
@@ -97,7 +97,7 @@ def test_an_item_ends_a_wait_that_has_begun() -> None:
     writer.join(WAIT_S)
 
 
-def test_no_wake_up_is_lost_however_writers_and_reader_meet() -> None:
+def test_no_wake_up_is_lost_between_concurrent_writers_and_the_reader() -> None:
     # The reader waits without a limit, so a lost wake-up leaves it waiting for ever.
     writers, each = 4, 2000
     box, seen, done = Mailbox[int](writers * each), [0], threading.Event()
@@ -148,7 +148,7 @@ def test_a_callback_that_is_set_late_is_called_for_the_items_before_it(
     assert len(calls) == woken
 
 
-def test_a_callback_that_fails_fails_its_writer_and_the_item_is_there() -> None:
+def test_an_error_of_the_callback_reaches_the_writer_and_the_item_is_stored() -> None:
     def fail() -> None:
         raise ValueError("a bug")
 
@@ -161,7 +161,7 @@ def test_a_callback_that_fails_fails_its_writer_and_the_item_is_there() -> None:
 # the end
 
 
-def test_a_closed_mailbox_still_gives_its_items_and_never_makes_its_reader_wait() -> None:
+def test_a_closed_mailbox_still_returns_its_items_and_never_blocks_its_reader() -> None:
     box = filled(4, 2)
     assert not box.closed
     box.close()
@@ -174,7 +174,7 @@ def test_a_closed_mailbox_still_gives_its_items_and_never_makes_its_reader_wait(
     )
 
 
-def test_to_close_ends_a_wait_that_has_begun() -> None:
+def test_closing_the_mailbox_ends_a_wait_that_has_begun() -> None:
     box = Mailbox[int](4)
     closer = threading.Timer(0.05, box.close)
     closer.start()
@@ -185,7 +185,7 @@ def test_to_close_ends_a_wait_that_has_begun() -> None:
 # the bell
 
 
-def test_a_bell_that_rang_many_times_ends_one_wait() -> None:
+def test_a_bell_that_rang_several_times_ends_only_one_wait() -> None:
     bell = Bell()
     for _ in range(3):
         bell.ring()

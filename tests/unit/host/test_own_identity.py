@@ -23,7 +23,7 @@ from acsard.host.own_identity import own_name, sender_id
         ("", ""),
     ],
 )
-def test_it_is_the_user_the_machine_and_the_program(
+def test_the_own_name_has_user_machine_and_program(
     monkeypatch: pytest.MonkeyPatch, program: str, told: str
 ) -> None:
     monkeypatch.setattr(sys, "argv", [program])
@@ -31,13 +31,13 @@ def test_it_is_the_user_the_machine_and_the_program(
     assert own_name() == f"{user}@{machine}{told}"
 
 
-def test_a_user_that_nobody_knows_is_a_number(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_user_without_a_name_is_shown_as_a_number(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "getuid", lambda: 4_000_000_000)
     assert own_name().startswith("4000000000@")
 
 
 @pytest.mark.parametrize("name", ["joe", "a/b/c", "\U0001f916" * 100])
-def test_a_sender_id_fits_into_an_attachment_and_no_two_are_alike(name: str) -> None:
+def test_a_sender_id_is_unique_and_fits_into_an_attachment(name: str) -> None:
     one, other = sender_id(name), sender_id(name)
     assert one != other
     assert one.rpartition("/")[0] == name[:MAX_NAME]

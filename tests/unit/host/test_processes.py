@@ -50,7 +50,7 @@ def device() -> Iterator[str]:
         os.close(end)
 
 
-def test_everybody_who_has_it_open_is_told_once(device: str) -> None:
+def test_each_process_that_has_the_device_open_is_listed_once(device: str) -> None:
     again = os.open(device, os.O_RDWR | os.O_NOCTTY)
     with another(device) as pid:
         assert sorted(one.pid for one in holders(device)) == sorted([os.getpid(), pid])
@@ -58,15 +58,15 @@ def test_everybody_who_has_it_open_is_told_once(device: str) -> None:
     assert [one.pid for one in holders(device)] == [os.getpid()]
 
 
-def test_who_has_locked_it_is_who_keeps_us_out(device: str) -> None:
-    assert holder_of(device) is None, "we ourselves do not"
+def test_the_holder_of_a_device_is_the_process_with_the_lock(device: str) -> None:
+    assert holder_of(device) is None, "this process does not count as the holder"
     with another(device, "lock") as locker, another(device), another(device):
         found = holder_of(device)
         assert found is not None
         assert found.pid == locker
 
 
-def test_without_a_lock_it_is_another_who_has_it_open(device: str) -> None:
+def test_without_a_lock_the_holder_is_another_process_with_the_device_open(device: str) -> None:
     own = os.open(device, os.O_RDWR | os.O_NOCTTY)
     fcntl.flock(own, fcntl.LOCK_EX)
     with another(device) as pid:
@@ -84,7 +84,7 @@ def test_the_other_end_of_a_pty_is_found_and_a_real_device_has_none(device: str)
 
 
 @pytest.mark.parametrize("path", ["/dev/acsar_that_is_not", "/etc/passwd", "/tmp"])
-def test_what_is_no_device_is_held_by_nobody(path: str) -> None:
+def test_a_path_that_is_not_a_device_has_no_holder(path: str) -> None:
     assert list(holders(path)) == []
     assert holder_of(path) is None
     assert master_of(path) is None
@@ -104,7 +104,7 @@ def test_a_process_that_is_not_there_has_no_name() -> None:
     assert name_of(ended.pid) == ""
 
 
-def test_who_has_to_wait_for_a_processor_is_seen_to() -> None:
+def test_the_time_that_a_process_waited_for_a_processor_is_read() -> None:
     spin = "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\nwhile True: pass"
     two = [subprocess.Popen([sys.executable, "-c", spin]) for _ in range(2)]
     try:

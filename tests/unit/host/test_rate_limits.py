@@ -12,46 +12,46 @@ from acsard.host.rate_limits import Bucket, Buckets, Places, Rate
 GUESSES_OF_ONE, GUESSES = Rate(10 / 60, 10.0), Rate(100 / 60, 100.0)
 
 
-def test_a_bucket_lets_its_rate_through_and_some_at_once() -> None:
+def test_a_bucket_permits_an_initial_burst_and_then_its_rate() -> None:
     bucket = Bucket(Rate(10.0, 20.0))
     assert [bucket.take(0) for _ in range(21)] == [True] * 20 + [False]
     taken = sum(bucket.take(n * NS_PER_S // 1000) for n in range(10_000))
     assert 99 <= taken <= 100  # within ten seconds
 
 
-def test_a_bucket_holds_no_more_than_its_most_after_a_long_rest() -> None:
+def test_a_bucket_holds_at_most_its_burst_size_after_a_long_pause() -> None:
     bucket = Bucket(Rate(10.0, 20.0))
     assert sum(bucket.take(3600 * NS_PER_S) for _ in range(100)) == 20
 
 
-def test_wrong_tokens_are_enough_after_some_and_a_minute_forgets_them() -> None:
+def test_an_address_has_a_limited_number_of_token_guesses_per_minute() -> None:
     guesses, most = Buckets(GUESSES_OF_ONE, GUESSES), int(GUESSES_OF_ONE.most)
     assert [guesses.take("a", 0) for _ in range(most + 1)] == [True] * most + [False]
     assert guesses.take("b", 0)
     assert all(guesses.take("a", 61 * NS_PER_S) for _ in range(most))
 
 
-def test_an_address_has_no_moment_at_which_it_may_guess_twice_as_often() -> None:
+def test_the_guess_limit_does_not_double_at_the_boundary_of_a_minute() -> None:
     guesses = Buckets(GUESSES_OF_ONE, GUESSES)
     assert guesses.take("b", 0)
     tenths = [n * NS_PER_S // 10 for n in range(595, 610) for _ in range(20)]
     assert sum(guesses.take("a", at_ns) for at_ns in tenths) <= GUESSES_OF_ONE.most + 1
 
 
-def test_many_addresses_together_are_held_too() -> None:
+def test_all_addresses_together_have_a_guess_limit() -> None:
     guesses = Buckets(GUESSES_OF_ONE, GUESSES)
     assert all(guesses.take(f"10.0.0.{n}", 0) for n in range(int(GUESSES.most)))
     assert not guesses.take("never seen", 0)
 
 
-def test_an_address_that_may_guess_no_more_uses_up_nothing_of_the_others() -> None:
+def test_refused_guesses_of_one_address_do_not_reduce_the_limit_of_others() -> None:
     guesses = Buckets(GUESSES_OF_ONE, GUESSES)
     for _ in range(2 * int(GUESSES.most)):
         guesses.take("a", 0)
     assert guesses.take("b", 0)
 
 
-def test_a_name_that_rests_is_forgotten_so_that_names_fill_no_memory() -> None:
+def test_inactive_names_are_removed_to_bound_the_memory() -> None:
     guesses = Buckets(GUESSES_OF_ONE, GUESSES)
     tracemalloc.start()
     try:
@@ -63,7 +63,7 @@ def test_a_name_that_rests_is_forgotten_so_that_names_fill_no_memory() -> None:
     assert held < 200_000  # bytes; all names together take 2.3 MB
 
 
-def test_places_are_bounded_by_address_and_in_all() -> None:
+def test_places_are_limited_per_address_and_in_total() -> None:
     places = Places(3, 2)
     assert [places.enter("a") for _ in range(3)] == [True, True, False]
     assert [places.enter("b"), places.enter("c")] == [True, False]
@@ -78,14 +78,14 @@ def test_a_bucket_for_one_unit_sets_a_shortest_interval_to_the_nanosecond() -> N
     assert [bucket.take(at_ns) for at_ns in times] == [True, False, False, True, False, True, False]
 
 
-def test_a_bucket_that_refuses_takes_nothing() -> None:
+def test_a_refused_request_takes_nothing_from_the_bucket() -> None:
     bucket = Bucket(Rate(10.0, 2.0))
     for _ in range(100):
         bucket.take(0)
     assert bucket.take(NS_PER_S // 10)
 
 
-def test_a_bucket_is_full_again_when_all_its_units_are_back() -> None:
+def test_a_bucket_is_full_again_after_its_refill_time() -> None:
     bucket = Bucket(Rate(10.0, 3.0))
     assert bucket.full(0)
     for _ in range(3):
@@ -96,7 +96,7 @@ def test_a_bucket_is_full_again_when_all_its_units_are_back() -> None:
     assert bucket.full(3 * NS_PER_S // 10)
 
 
-def test_a_place_is_held_for_a_block_and_given_back_after_an_error() -> None:
+def test_a_place_is_held_for_a_block_and_released_after_an_error() -> None:
     places = Places(1, 1)
     with places.held() as first, places.held() as second:
         assert (first, second, places.taken) == (True, False, 1)

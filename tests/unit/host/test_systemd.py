@@ -98,12 +98,12 @@ def test_without_a_manager_nothing_happens() -> None:
 
 
 @pytest.mark.parametrize("address", ["/no/such/socket", "relative", "@acsard-nobody-here"])
-def test_an_address_where_nobody_listens_is_no_manager(address: str) -> None:
+def test_an_address_without_a_listener_raises_no_error(address: str) -> None:
     nobody = Systemd({"NOTIFY_SOCKET": address}, PID)
     nobody.ready()
 
 
-def test_an_abstract_address_is_understood() -> None:
+def test_an_abstract_socket_address_is_accepted() -> None:
     manager = Manager(f"@acsard-test-{os.getpid()}")
     try:
         systemd(manager).ready()
@@ -112,7 +112,7 @@ def test_an_abstract_address_is_understood() -> None:
         manager.close()
 
 
-def test_the_socket_is_not_handed_to_children(manager: Manager) -> None:
+def test_the_socket_is_not_inherited_by_children(manager: Manager) -> None:
     before = sockets()
     there = systemd(manager)
     (made,) = sockets() - before
@@ -136,17 +136,17 @@ def sockets() -> set[int]:
 # the life of a service
 
 
-def test_ready_is_said_in_one_datagram(manager: Manager) -> None:
+def test_ready_is_sent_in_one_datagram(manager: Manager) -> None:
     systemd(manager).ready()
     assert manager.heard() == [{"READY": "1"}]
 
 
-def test_stopping_is_reported_with_why(manager: Manager) -> None:
+def test_stopping_is_reported_with_a_status(manager: Manager) -> None:
     systemd(manager).stopping()
     assert manager.heard() == [{"STOPPING": "1", "STATUS": "ramping to zero"}]
 
 
-def test_waiting_asks_for_more_time_than_passes_until_it_is_reported_again(
+def test_waiting_extends_the_start_timeout_by_30_s(
     manager: Manager,
 ) -> None:
     systemd(manager).waiting("the daemon waits for the Zenoh router")
@@ -184,7 +184,7 @@ def test_the_first_step_feeds_the_watchdog(manager: Manager) -> None:
 
 
 @pytest.mark.parametrize("period_ms", [1, 10, 20, 33, 50, 100])
-def test_the_watchdog_is_fed_often_enough_and_not_each_step(
+def test_the_watchdog_is_fed_at_its_interval_and_not_in_each_step(
     manager: Manager, period_ms: int
 ) -> None:
     there = systemd(manager, WATCHDOG_USEC="200000")
@@ -192,8 +192,10 @@ def test_the_watchdog_is_fed_often_enough_and_not_each_step(
     gaps = [b - a for a, b in itertools.pairwise(fed)]
     least = 200 * MS // FEEDS_PER_WATCHDOG
     assert min(gaps) >= least
-    assert max(gaps) < least + period_ms * MS, "at the first step when it is due"
-    assert max(gaps) <= 100 * MS, "systemd's advice: at half the time"
+    assert max(gaps) < least + period_ms * MS, (
+        "the watchdog is fed at the first step when it is due"
+    )
+    assert max(gaps) <= 100 * MS, "systemd advises to feed the watchdog at half its time"
 
 
 @pytest.mark.parametrize(
@@ -213,12 +215,12 @@ def test_a_watchdog_that_is_off_broken_or_another_process_s_is_not_fed(
     assert feeds(manager, systemd(manager, **told), 10 * MS, 50) == []
 
 
-def test_a_watchdog_meant_for_us_by_pid_is_fed(manager: Manager) -> None:
+def test_a_watchdog_with_the_pid_of_this_process_is_fed(manager: Manager) -> None:
     there = systemd(manager, WATCHDOG_USEC="200000", WATCHDOG_PID=str(PID))
     assert feeds(manager, there, 10 * MS, 1)
 
 
-def test_nothing_but_a_step_feeds_it(manager: Manager) -> None:
+def test_only_a_step_feeds_the_watchdog(manager: Manager) -> None:
     there = systemd(manager, WATCHDOG_USEC="200000")
     there.ready()
     there.waiting("for the router")
@@ -244,7 +246,7 @@ def test_driving_is_shown_by_its_speed_and_source(
     assert statuses(manager) == [text]
 
 
-def test_anything_else_is_shown_by_its_mode_and_reason(manager: Manager) -> None:
+def test_any_other_mode_is_shown_by_its_name_and_reason(manager: Manager) -> None:
     systemd(manager).step(outputs(NS_PER_S, mode="waiting", reason="/dev/acsar is not there"))
     assert statuses(manager) == ["waiting: /dev/acsar is not there"]
 
@@ -256,7 +258,7 @@ def test_the_same_status_is_sent_once(manager: Manager) -> None:
     assert statuses(manager) == ["driving at 0.5 m/s, commanded by nav"]
 
 
-def test_a_change_of_mode_is_sent_at_once(manager: Manager) -> None:
+def test_a_change_of_mode_is_sent_immediately(manager: Manager) -> None:
     there = systemd(manager)
     there.step(outputs(NS_PER_S))
     there.step(outputs(NS_PER_S + 10 * MS, mode="stopped", reason="by teleop", changed=True))
@@ -281,19 +283,19 @@ def fill(there: Systemd) -> int:
     return step
 
 
-def test_a_full_queue_neither_blocks_nor_raises_and_feeding_goes_on_after_it(
+def test_a_full_queue_neither_blocks_nor_raises_and_the_watchdog_is_fed_after_it(
     manager: Manager,
 ) -> None:
     there = systemd(manager, WATCHDOG_USEC="200000")
     began = time.monotonic()
     steps = fill(there)
     assert time.monotonic() - began < 5.0
-    assert 0 < len(manager.heard()) < steps, "it was full"
+    assert 0 < len(manager.heard()) < steps, "the queue was not full"
     there.step(outputs(2000 * NS_PER_S))
     assert {"WATCHDOG": "1"} in manager.heard()
 
 
-def test_a_manager_that_goes_away_neither_blocks_nor_raises(manager: Manager) -> None:
+def test_a_manager_that_disappears_causes_no_error(manager: Manager) -> None:
     there = systemd(manager, WATCHDOG_USEC="200000")
     manager.close()
     os.unlink(manager.address)

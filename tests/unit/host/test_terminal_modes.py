@@ -36,14 +36,14 @@ def test_a_terminal_has_colours_and_a_file_has_none(terminal: tuple[int, TextIO]
 
 
 @pytest.mark.parametrize(("name", "value"), [("NO_COLOR", "1"), ("TERM", "dumb")])
-def test_who_wants_no_colours_gets_none(
+def test_the_environment_can_disable_colours(
     terminal: tuple[int, TextIO], monkeypatch: pytest.MonkeyPatch, name: str, value: str
 ) -> None:
     monkeypatch.setenv(name, value)
     assert not coloured(terminal[1])
 
 
-def test_an_empty_no_color_asks_for_nothing(
+def test_an_empty_no_color_variable_does_not_disable_colours(
     terminal: tuple[int, TextIO], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("NO_COLOR", "")
@@ -51,7 +51,7 @@ def test_an_empty_no_color_asks_for_nothing(
 
 
 @pytest.mark.parametrize("wanted", [True, False])
-def test_the_log_of_a_terminal_is_coloured_unless_nobody_wants_it(
+def test_the_log_of_a_terminal_is_coloured_unless_no_color_is_set(
     terminal: tuple[int, TextIO], monkeypatch: pytest.MonkeyPatch, wanted: bool
 ) -> None:
     if not wanted:
@@ -75,7 +75,7 @@ def test_the_console_s_log_in_a_file_has_no_colours() -> None:
 CTRL_S = b"\x13"
 
 
-def test_ctrl_s_is_a_key_and_holds_up_nothing_and_the_terminal_is_left_as_it_was(
+def test_ctrl_s_is_read_as_a_key_and_the_terminal_modes_are_restored_afterwards(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     master, slave = pty.openpty()

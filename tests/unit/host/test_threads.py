@@ -13,7 +13,7 @@ NO_ROOM = 1 << 46
 """Stack size that no machine can provide, so that a thread with it cannot start."""
 
 
-def test_where_no_thread_is_to_be_had_it_is_as_late_as_one_that_hangs() -> None:
+def test_a_thread_that_cannot_be_started_raises_a_timeout_error() -> None:
     usual = threading.stack_size(NO_ROOM)
     try:
         with pytest.raises(TimeoutError, match="cannot start another thread"):
@@ -24,7 +24,7 @@ def test_where_no_thread_is_to_be_had_it_is_as_late_as_one_that_hangs() -> None:
 
 
 @pytest.mark.parametrize("rounds", [0, 1, 2])
-def test_a_result_that_comes_with_the_end_of_its_caller_is_released(rounds: int) -> None:
+def test_a_result_that_arrives_while_its_caller_is_cancelled_is_released(rounds: int) -> None:
     released: list[int] = []
     is_released = threading.Event()
 

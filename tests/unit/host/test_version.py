@@ -31,7 +31,7 @@ def clone(tmp_path: Path) -> Path:
     return where
 
 
-def test_the_commit_is_that_of_git_in_each_layout_of_a_clone(clone: Path) -> None:
+def test_the_commit_equals_that_of_git_in_each_layout_of_a_clone(clone: Path) -> None:
     for words in (
         ["checkout", "-q", "-b", "a/b"],
         ["pack-refs", "--all"],
@@ -45,7 +45,7 @@ def test_the_commit_is_that_of_git_in_each_layout_of_a_clone(clone: Path) -> Non
     assert commit_of(tree) == git(tree, "rev-parse", "HEAD") != commit_of(clone)
 
 
-def test_without_a_clone_or_with_an_unreadable_one_there_is_no_commit(tmp_path: Path) -> None:
+def test_without_a_readable_clone_the_commit_is_empty(tmp_path: Path) -> None:
     assert commit_of(tmp_path) == ""
     (tmp_path / ".git").mkdir()
     (tmp_path / ".git" / "HEAD").write_bytes(b"\xff\xfe")

@@ -55,7 +55,7 @@ def test_sound_certificates_need_no_advice(fleet: Path) -> None:
     assert finding(fleet) == told
 
 
-def test_the_robots_own_certificate_is_renewed_as_printed(
+def test_the_advised_command_renews_the_robots_own_certificate(
     fleet: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     Authority.load(fleet, str).issue(fleet, "robot", ["localhost"], 9.9)
@@ -72,7 +72,7 @@ def test_without_the_authoritys_key_the_advice_asks_for_it(fleet: Path) -> None:
 
 
 @pytest.mark.parametrize("days", [9.9, -3.0])
-def test_a_robot_of_a_fleet_is_renewed_as_printed(
+def test_the_advised_commands_renew_the_certificate_of_a_robot_of_a_fleet(
     fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, days: float
 ) -> None:
     """The directory of robot4 on the robot has no key of the authority."""
@@ -107,7 +107,7 @@ def test_the_advice_about_a_router_names_its_certificate(fleet: Path) -> None:
     assert "init --force" in renewal(str(fleet), AUTHORITY)
 
 
-def test_the_end_of_each_router_that_answers_is_a_finding(
+def test_an_expiring_certificate_of_a_router_is_a_finding(
     fleet: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     end_ns = clock.now().wall_ns + 9 * DAY_NS
@@ -122,7 +122,7 @@ def test_the_end_of_each_router_that_answers_is_a_finding(
     assert "--name router.local" in told.mend
 
 
-def test_a_directory_without_files_gets_a_first_certificate_as_printed(
+def test_the_advised_command_makes_the_first_certificate_of_an_empty_directory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     directory = tmp_path / "tls"
@@ -133,7 +133,7 @@ def test_a_directory_without_files_gets_a_first_certificate_as_printed(
     assert finding(directory).level == "ok"
 
 
-def test_a_missing_key_beside_the_authoritys_key_is_made_as_printed(
+def test_the_advised_command_replaces_a_missing_key_beside_the_authoritys_key(
     fleet: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (fleet / "key.pem").unlink()
@@ -141,7 +141,7 @@ def test_a_missing_key_beside_the_authoritys_key_is_made_as_printed(
     assert finding(fleet).level == "ok"
 
 
-def test_a_missing_key_of_a_robot_of_a_fleet_does_not_lead_to_a_new_authority(fleet: Path) -> None:
+def test_for_a_missing_key_of_a_fleet_robot_no_new_authority_is_advised(fleet: Path) -> None:
     own = fleet / "clients" / "robot4"
     (own / "key.pem").unlink()
     for one in certificates(str(own)):
@@ -150,13 +150,13 @@ def test_a_missing_key_of_a_robot_of_a_fleet_does_not_lead_to_a_new_authority(fl
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_a_directory_of_root_needs_sudo_with_the_path_of_the_program(fleet: Path) -> None:
+def test_for_a_directory_of_root_sudo_with_the_program_path_is_advised(fleet: Path) -> None:
     Authority.load(fleet, str).issue(fleet, "robot", ["localhost"], 9.9)
     fleet.chmod(0o555)
     assert re.match(r"run `sudo /\S+acsard tls renew --directory ", finding(fleet).mend)
 
 
-def test_a_key_that_others_may_read_is_made_private(fleet: Path) -> None:
+def test_for_a_key_that_other_users_can_read_chmod_is_advised(fleet: Path) -> None:
     (fleet / "key.pem").chmod(0o644)
     (told, _) = certificates(str(fleet))
     assert told.mend == f"chmod 600 {fleet}/key.pem"

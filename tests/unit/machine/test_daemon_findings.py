@@ -60,13 +60,13 @@ def running(config: Config) -> Running:
     return Running(INFO, config, STATE, STATE, 0)
 
 
-def test_a_daemon_that_runs_with_the_file_has_it() -> None:
+def test_a_daemon_with_the_settings_of_the_file_is_ok() -> None:
     (finding,) = compared(running(FILE), FILE)
     assert finding.level == "ok"
     assert "pid 77" in finding.text
 
 
-def test_each_key_that_is_otherwise_is_reported_with_both_values() -> None:
+def test_each_key_that_differs_from_the_file_is_reported_with_both_values() -> None:
     runs = replace(FILE, mcu=McuConfig(port="/dev/pts/3", baud_rate=57600))
     assert [one.words(key) for key, one in differences(runs, FILE).items()] == [
         'mcu.port = "/dev/pts/3", not "sim"',
@@ -79,7 +79,7 @@ def test_each_key_that_is_otherwise_is_reported_with_both_values() -> None:
     assert "anew" not in finding.mend  # a restart would lead back to the simulator
 
 
-def test_what_run_was_told_by_an_option_is_offered_as_lines_of_the_file() -> None:
+def test_values_of_command_line_options_are_offered_as_lines_for_the_file() -> None:
     bus = BusConfig(listen=("tcp/127.0.0.1:1", "tcp/127.0.0.1:2"))
     runs = replace(FILE, mcu=McuConfig(port="/dev/pts/3"), bus=bus)
     (finding,) = compared(running(runs), FILE)
@@ -87,13 +87,13 @@ def test_what_run_was_told_by_an_option_is_offered_as_lines_of_the_file() -> Non
     assert parse("\n".join(re.split(r"; |(?<=]) (?=\w)", keep)).encode()) == runs
 
 
-def test_what_is_no_option_of_run_is_a_warning() -> None:
+def test_a_difference_in_a_key_without_an_option_is_a_warning() -> None:
     (finding,) = compared(running(replace(FILE, odometry=replace(FILE.odometry, gyro=True))), FILE)
     assert (finding.level, "odometry.gyro = true, not false" in finding.text) == ("warning", True)
     assert "if the daemon runs with another file, name that file with --config" in finding.mend
 
 
-def test_what_was_set_while_it_ran_is_told_apart_from_options() -> None:
+def test_settings_changed_at_run_time_are_reported_separately_from_options() -> None:
     sources = (replace(FILE.commands.sources[0], timeout=0.4), *FILE.commands.sources[1:])
     runs = replace(
         FILE,
@@ -117,7 +117,7 @@ def test_a_source_that_only_the_file_has_is_reported() -> None:
     assert f"commands.sources.{FILE.commands.sources[0].name}.priority" in differences(runs, FILE)
 
 
-def test_another_file_is_not_told_key_by_key() -> None:
+def test_for_a_different_file_only_the_first_differences_are_listed() -> None:
     runs = replace(
         FILE,
         robot=RobotConfig("other"),
@@ -142,21 +142,21 @@ def seen(apart: float, trip: float = 0.0, here: bool = False, **counters: int) -
 
 
 @pytest.mark.parametrize("apart", [0.0, 0.3, -0.3])
-def test_clocks_that_agree_are_no_finding(apart: float) -> None:
+def test_clocks_that_agree_cause_no_finding(apart: float) -> None:
     assert list(clocks(seen(apart, commands=7))) == []
 
 
 @pytest.mark.parametrize(
     ("apart", "words"), [(3600.0, "3600.0 s ahead of"), (-0.5, "0.5 s behind")]
 )
-def test_clocks_that_do_not_are_a_warning_with_its_mend(apart: float, words: str) -> None:
+def test_clocks_that_disagree_are_a_warning_with_a_remedy(apart: float, words: str) -> None:
     (finding,) = clocks(seen(apart))
     assert (finding.subject, finding.level) == ("clock", "warning")
     assert words in finding.text
     assert "timedatectl" in finding.mend
 
 
-def test_an_answer_that_was_late_is_no_clock_that_is_wrong() -> None:
+def test_a_late_answer_is_not_taken_for_a_wrong_clock() -> None:
     assert list(clocks(seen(-0.5, trip=1.0))) == list(clocks(seen(0.5, trip=1.0))) == []
     assert len(list(clocks(seen(-2.0, trip=1.0)))) == 1
 
@@ -170,7 +170,7 @@ def test_stamps_that_were_replaced_are_reported() -> None:
     assert "12 commands" in finding.text
 
 
-def test_periods_that_are_missed_now_are_told_after_months_without() -> None:
+def test_periods_missed_in_the_last_minute_are_a_warning_after_months() -> None:
     running = seen(0.0, lines_sent=345_600_000, missed_periods=600)
     assert not list(late(running))
     row = DiagnosticStatus(1, "acsard: control loop", "600 of 6000 periods missed", "acsar", [])
@@ -179,7 +179,7 @@ def test_periods_that_are_missed_now_are_told_after_months_without() -> None:
     assert "600 of 6000" in finding.text
 
 
-def test_a_gateway_is_told_where_it_listens() -> None:
+def test_an_open_gateway_is_reported_with_its_endpoint() -> None:
     with socket.create_server(("0.0.0.0", 0)) as gateway_of_ours:
         endpoint = f"tls/0.0.0.0:{gateway_of_ours.getsockname()[1]}"
         (finding,) = gateway(Config(bus=BusConfig(listen=("tcp/127.0.0.1:7448", endpoint))))
@@ -187,7 +187,7 @@ def test_a_gateway_is_told_where_it_listens() -> None:
 
 
 @pytest.mark.parametrize("does", ["off", "used", "waiting for rest"])
-def test_a_gyro_that_does_what_it_should_is_no_warning(does: str) -> None:
+def test_a_gyro_that_works_causes_no_warning(does: str) -> None:
     assert [one.level for one in gyro(does, {})] == ([] if does == "off" else ["ok"])
 
 
@@ -196,14 +196,14 @@ def test_each_state_of_the_gyro_has_its_own_remedy() -> None:
 
 
 @each("does", [*get_args(GyroDoes)[3:], "what a later one does"])
-def test_a_gyro_that_does_not_is_a_warning_with_its_mend(does: str) -> None:
+def test_a_gyro_that_does_not_work_is_a_warning_with_a_remedy(does: str) -> None:
     (finding,) = gyro(does, {})
     assert (finding.subject, finding.level) == ("gyro", "warning")
     assert finding.text
     assert finding.mend
 
 
-def test_samples_of_a_gyro_that_do_not_count_are_told_by_their_reasons() -> None:
+def test_rejected_samples_of_a_gyro_are_reported_with_their_reasons() -> None:
     counters = {"imu_out_of_range": 3, "imu_second_sender": 12, "imu_not_finite": 0, "lines": 9}
     _, finding = gyro("used", counters)
     assert finding.level == "warning"
@@ -211,7 +211,7 @@ def test_samples_of_a_gyro_that_do_not_count_are_told_by_their_reasons() -> None
     assert finding.mend
 
 
-def test_a_stop_that_would_be_lost_at_a_restart_is_a_warning_with_its_mend() -> None:
+def test_a_stop_that_a_restart_would_lose_is_a_warning_with_a_remedy() -> None:
     trouble = (
         "a stop would not survive a restart: the latch file (/x/a.latches.json) cannot be written: "
         "Read-only file system"
@@ -234,7 +234,7 @@ CONFIG = Config(mcu=McuConfig(port="/dev/ttyX"))
         (False, "`acsard doctor` on the daemon's machine"),
     ],
 )
-def test_a_certificate_in_use_that_ends_is_a_warning_with_its_mend(here: bool, mend: str) -> None:
+def test_an_expiring_certificate_in_use_is_a_warning_with_a_remedy(here: bool, mend: str) -> None:
     words = "expires in 9 days (certificate of the router tls/router.local:7447)"
     row = DiagnosticStatus(1, "acsard: certificate", words, "acsar", [])
     (told,) = certificate(row, here)
@@ -261,13 +261,13 @@ def found(before: dict[str, int], after: dict[str, int], **state: str) -> list[F
     return list(link(Running(INFO, CONFIG, one, two, 0)))
 
 
-def test_a_sound_link_is_one_ok() -> None:
+def test_a_sound_link_gives_one_ok_finding() -> None:
     (finding,) = found({"lines": 5, "lines_sent": 900}, {"lines": 104, "lines_sent": 1000})
     assert (finding.subject, finding.level) == ("link", "ok")
 
 
 @pytest.mark.parametrize("state", ["booting", "stale"])
-def test_no_link_is_a_failure_with_what_was_heard_and_the_check(state: str) -> None:
+def test_a_missing_link_is_a_failure_with_its_reason_and_the_check_command(state: str) -> None:
     (finding,) = found({}, {}, link=state, mode="waiting", reason="nothing was received")
     assert finding.level == "failure"
     assert "nothing was received" in finding.text
@@ -275,7 +275,7 @@ def test_no_link_is_a_failure_with_what_was_heard_and_the_check(state: str) -> N
     assert "kill 77" in finding.mend
 
 
-def test_a_port_that_is_closed_is_mended_at_the_port() -> None:
+def test_a_closed_port_is_reported_with_a_remedy_for_the_port() -> None:
     (finding,) = found({}, {}, link="down", mode="waiting", reason="no such device")
     assert "port above" in finding.mend
 
@@ -292,18 +292,20 @@ def test_lines_that_are_not_answered_are_a_warning() -> None:
     [(100, 100, 0.0, 0), (100, 98, 0.0, 0), (100, 97, 0.0, 0), (100, 96, 0.0, 1),
      (100, 130, 0.0, 0), (10, 0, 0.0, 0), (100, 10, 0.1, 0)],
 )  # fmt: skip
-def test_what_is_no_loss_is_not_told(sent: int, came: int, period: float, told: int) -> None:
+def test_unanswered_lines_are_reported_only_if_they_are_a_loss(
+    sent: int, came: int, period: float, told: int
+) -> None:
     config = Config(mcu=McuConfig(reply_period=period))
     assert len(list(lost({"lines_sent": sent, "lines": came}, config))) == told
 
 
-def test_lines_that_did_not_count_are_told_by_kind_above_one_in_fifty() -> None:
+def test_rejected_lines_are_reported_by_kind_above_one_in_fifty() -> None:
     assert not list(refused({"lines": 1000, "line_malformed": 20, "lines_sent": 9}))
     (text,) = refused({"lines": 1000, "line_malformed": 12, "line_crc_error": 30})
     assert "12 malformed, 30 crc error" in text
 
 
-def test_a_link_that_went_because_this_computer_was_late_is_not_blamed_on_the_board() -> None:
+def test_a_link_lost_because_the_computer_was_late_is_not_blamed_on_the_board() -> None:
     (late,) = found({}, {"link_lost": 3, "link_lost_host_stall": 3})
     assert "lost 3 times" in late.text
     assert "the daemon's computer" in late.text
@@ -321,7 +323,7 @@ def test_a_link_that_went_because_this_computer_was_late_is_not_blamed_on_the_bo
     assert "mcu check" not in finding.mend
 
 
-def test_a_wheel_that_is_left_out_is_reported() -> None:
+def test_a_wheel_fault_is_a_warning() -> None:
     *_, finding = found({}, {}, wheel_fault="rear left: its encoder stands")
     assert (finding.subject, finding.level) == ("wheels", "warning")
 
@@ -415,7 +417,7 @@ DAYS_40 = {"lines": 340_000_000, "lines_sent": 345_600_000}
 """Line counters after 40 days at 100 Hz."""
 
 
-def test_after_months_what_is_wrong_now_is_reported_and_no_old_accident() -> None:
+def test_after_months_only_present_problems_are_warnings() -> None:
     (finding,) = found(DAYS_40, DAYS_40 | {"link_lost": 40})
     assert finding.level == "ok"
     assert "lost 40 times" in finding.text
@@ -434,7 +436,7 @@ def test_a_lost_link_is_reported_with_the_number_of_losses() -> None:
     assert "lost 4 times" in finding.text
 
 
-def test_the_last_causes_of_lateness_are_shown_and_warn_only_if_periods_are_missed_now() -> None:
+def test_the_last_causes_of_lateness_are_warnings_only_if_periods_are_missed_now() -> None:
     texts = [
         "11 x missed: 11 in a row",
         *(f"late: by 0.1{n} s, because it is {n}" for n in range(5)),

@@ -21,7 +21,7 @@ WANTED = True
     [(False, 0, "warning"), (False, 9, "warning"), (False, 10, "ok"), (False, -1, "ok"),
      (True, 0, "ok")],
 )  # fmt: skip
-def test_root_without_the_capability_is_held_to_the_limit(
+def test_root_without_the_capability_needs_a_real_time_limit(
     capable: bool, limit: int, level: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "geteuid", lambda: 0)
@@ -36,7 +36,7 @@ def test_root_without_the_capability_is_held_to_the_limit(
     ("policy", "level"),
     [(os.SCHED_OTHER, "warning"), (os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, "ok")],
 )
-def test_of_a_daemon_that_runs_what_it_has_is_reported(
+def test_the_scheduling_policy_of_a_running_daemon_is_reported(
     policy: int, level: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "sched_getscheduler", lambda _: policy)
@@ -44,17 +44,17 @@ def test_of_a_daemon_that_runs_what_it_has_is_reported(
     assert (finding.level, "pid 77" in finding.text) == (level, True)
 
 
-def test_who_does_not_want_it_is_not_warned() -> None:
+def test_without_real_time_in_the_configuration_no_warning_is_given() -> None:
     (finding,) = scheduling(False, 77)
     assert finding.level == "ok"
 
 
-def test_a_computer_that_nothing_slows_is_ok(tmp_path: Path) -> None:
+def test_a_computer_without_causes_of_lateness_is_ok(tmp_path: Path) -> None:
     (finding,) = slowness(Kernel(write(tmp_path, QUIET)))
     assert (finding.subject, finding.level) == ("computer", "ok")
 
 
-def test_each_cause_of_lateness_that_is_present_is_a_warning_with_its_mend(tmp_path: Path) -> None:
+def test_each_present_cause_of_lateness_is_a_warning_with_a_remedy(tmp_path: Path) -> None:
     files = {HWMON + "in0_lcrit_alarm": "1\n", POLICY + "scaling_governor": "powersave\n"}
     findings = list(slowness(Kernel(write(tmp_path, QUIET | files))))
     assert [one.level for one in findings] == ["warning", "warning"]

@@ -54,13 +54,13 @@ PROGRAM = "/usr/bin/env"
         ("/rooted/venv", "/usr", True),
     ],
 )
-def test_a_service_cannot_live_in_a_home_nor_outside_a_venv(
+def test_a_service_is_refused_in_a_home_directory_and_outside_a_venv(
     prefix: str, base: str, good: bool
 ) -> None:
     assert (misplaced(prefix, base, PROGRAM) == "") is good
 
 
-def test_nor_can_it_borrow_the_python_of_a_home() -> None:
+def test_a_service_is_refused_with_a_python_in_a_home_directory() -> None:
     told = misplaced("/opt/acsard/venv", "/root/.pyenv/versions/3.11.7", PROGRAM)
     assert "/root/.pyenv/versions/3.11.7" in told
     assert "/usr/bin/python3 -m venv --clear /opt/acsard/venv" in told
@@ -75,7 +75,7 @@ def test_a_link_to_a_python_in_a_home_is_followed(tmp_path: Path) -> None:
     assert "/usr/bin" in there
 
 
-def test_a_directory_that_others_may_not_enter_is_named(tmp_path: Path) -> None:
+def test_a_directory_that_other_users_cannot_enter_is_reported(tmp_path: Path) -> None:
     venv = tmp_path / "venv"
     venv.mkdir()
     tmp_path.chmod(0o700)
@@ -84,7 +84,7 @@ def test_a_directory_that_others_may_not_enter_is_named(tmp_path: Path) -> None:
     assert "chmod o+rx" in told
 
 
-def test_a_system_without_what_the_units_name_is_told_so() -> None:
+def test_a_missing_group_or_program_of_the_units_is_reported_with_a_remedy() -> None:
     assert lacking(group="root", program=PROGRAM) == ""
     assert "groupadd --system nobodyhome" in lacking(group="nobodyhome", program=PROGRAM)
     assert "install the package util-linux" in lacking(program="/nowhere/setpriv")
@@ -120,7 +120,7 @@ def there(**other: bytes | None) -> Found:
 NOTHING: Found = {file.path: None for file in ALL}
 
 
-def test_all_files_are_written_where_there_is_none_then_the_commands_run() -> None:
+def test_a_first_installation_writes_all_files_and_then_runs_the_commands() -> None:
     assert installing(ALL, NOTHING, (), force=False) == [*map(Write, ALL), *INSTALLED]
 
 
@@ -131,7 +131,7 @@ def test_the_daemon_starts_before_the_page_whose_unit_mounts_its_directory() -> 
     assert steps.index(alone) < steps.index(everything)
 
 
-def test_what_is_as_installed_is_kept_and_the_commands_run_all_the_same() -> None:
+def test_unchanged_files_are_kept_and_the_commands_run_again() -> None:
     assert installing(ALL, there(), (), force=False) == [*(Keep(f.path) for f in ALL), *INSTALLED]
 
 
@@ -149,7 +149,9 @@ def test_a_file_with_a_wrong_mode_is_written_again_unless_its_content_differs() 
 @pytest.mark.parametrize(
     "spoil", [lambda path: path.chmod(0o644), lambda path: os.chown(path, 1, 1)]
 )
-def test_a_wrong_mode_or_owner_is_seen(tmp_path: Path, spoil: Callable[[Path], None]) -> None:
+def test_a_wrong_mode_or_owner_is_detected_and_corrected(
+    tmp_path: Path, spoil: Callable[[Path], None]
+) -> None:
     file = File(tmp_path / "stop", b"stop", 0o755)
     assert wrong_modes([file]) == set()
     Write(file).do()
@@ -165,7 +167,7 @@ def test_a_wrong_mode_or_owner_is_seen(tmp_path: Path, spoil: Callable[[Path], N
     assert wrong_modes([File(tmp_path / "elsewhere", b"stop", 0o755)])
 
 
-def test_somebody_else_s_file_is_overwritten_by_force_only() -> None:
+def test_a_file_with_other_content_is_overwritten_only_by_force() -> None:
     found = there(unit=b"mine", own=None)
     with pytest.raises(MendableError, match=f"this version of acsard installs: {UNIT_FILE.path};"):
         installing(ALL, found, (), force=False)
@@ -174,23 +176,23 @@ def test_somebody_else_s_file_is_overwritten_by_force_only() -> None:
 
 
 @pytest.mark.parametrize("force", [False, True])
-def test_a_configuration_that_was_written_is_never_replaced(force: bool) -> None:
+def test_an_edited_configuration_is_never_replaced(force: bool) -> None:
     assert Keep(OWN.path) in installing(ALL, there(own=b"mine"), (), force=force)
 
 
-def test_all_that_is_as_installed_is_removed() -> None:
+def test_all_unchanged_files_are_removed() -> None:
     removed = [Remove(file.path) for file in ALL]
     leaving = Run(("systemctl", "disable", "--now", PAGE, GATEWAY, UNIT))
     assert uninstalling(ALL, there(), (), force=False) == [leaving, *removed, *GONE]
 
 
-def test_a_unit_that_is_not_there_is_not_disabled() -> None:
+def test_a_missing_unit_is_not_disabled() -> None:
     """The machine was upgraded from a version without TLS gateway and page."""
     leaving, *_ = uninstalling(ALL, there(gateway=None, page=None), force=False)
     assert leaving == Run(("systemctl", "disable", "--now", UNIT))
 
 
-def test_where_nothing_is_nothing_is_stopped_or_removed() -> None:
+def test_without_installed_files_no_unit_is_stopped_and_no_file_is_removed() -> None:
     assert uninstalling(ALL, NOTHING, (), force=False) == [*GONE]
 
 
@@ -199,16 +201,16 @@ def kept(found: Found, *, force: bool) -> set[Path]:
     return {step.path for step in steps if isinstance(step, Keep)}
 
 
-def test_what_somebody_has_changed_stays_unless_forced() -> None:
+def test_a_changed_file_is_kept_unless_forced() -> None:
     assert kept(there(rules=b"mine"), force=False) == {RULES.path}
     assert kept(there(rules=b"mine"), force=True) == set()
 
 
-def test_a_changed_configuration_stays_whatever_is_said() -> None:
+def test_a_changed_configuration_is_kept_even_if_forced() -> None:
     assert kept(there(own=b"mine"), force=True) == {OWN.path}
 
 
-def test_a_unit_that_stays_keeps_what_sends_zeros_after_it() -> None:
+def test_a_unit_that_is_kept_also_keeps_its_stop_script() -> None:
     assert kept(there(unit=b"mine"), force=False) == {UNIT_FILE.path, STOP_FILE.path}
 
 
@@ -219,7 +221,7 @@ def test_the_files_are_those_of_deploy_with_the_port_of_a_real_robot() -> None:
     assert set(present([unit])) == {unit.path}
 
 
-def test_each_that_stays_says_why_and_what_removes_it() -> None:
+def test_each_kept_path_is_reported_with_its_reason_and_how_to_remove_it() -> None:
     tls, own = Path("/etc/acsard/tls"), ETC / "own.conf"
     found = there(unit=b"mine", own=b"mine")
     steps = uninstalling(ALL, found, [tls, own], force=False)
@@ -232,7 +234,7 @@ def test_each_that_stays_says_why_and_what_removes_it() -> None:
     }
 
 
-def test_a_purge_keeps_nothing() -> None:
+def test_a_forced_purge_keeps_no_file() -> None:
     tls, found = Path("/etc/acsard/tls"), there(unit=b"mine", own=b"mine")
     steps = uninstalling(ALL, found, [tls], force=True, purge=True)
     assert not [step for step in steps if isinstance(step, Keep)]
@@ -242,7 +244,7 @@ def test_a_purge_keeps_nothing() -> None:
     }
 
 
-def test_a_purge_installs_a_unit_for_systemd_to_find_the_state_that_an_uninstall_kept() -> None:
+def test_a_purge_reinstalls_a_unit_so_that_systemd_can_clean_its_state() -> None:
     steps = uninstalling(ALL, dict.fromkeys(there()), force=True, purge=True, stateful=[UNIT])
     clean = Run(("systemctl", "clean", "--what=state", UNIT))
     before, after = steps[: steps.index(clean)], steps[steps.index(clean) :]
@@ -251,7 +253,7 @@ def test_a_purge_installs_a_unit_for_systemd_to_find_the_state_that_an_uninstall
 
 
 @pytest.mark.parametrize("purge", [False, True])
-def test_recordings_and_invitations_stay_unless_purged(purge: bool) -> None:
+def test_recordings_and_invitations_are_kept_unless_purged(purge: bool) -> None:
     steps = uninstalling(ALL, there(), (), force=False, purge=purge, stateful=STATES)
     kept = {step.path for step in steps if isinstance(step, Keep)}
     cleans = {Run(("systemctl", "clean", "--what=state", unit)) for unit in (UNIT, PAGE)}
@@ -261,7 +263,7 @@ def test_recordings_and_invitations_stay_unless_purged(purge: bool) -> None:
         assert {*steps[1:3]} == cleans
 
 
-def test_what_else_lies_in_its_directories_is_seen(tmp_path: Path) -> None:
+def test_other_files_in_the_directories_of_the_service_are_found(tmp_path: Path) -> None:
     (tmp_path / "tls").mkdir()
     (tmp_path / "acsard.toml").touch()
     ours = File(tmp_path / "acsard.toml", b"", kept=True)
@@ -275,14 +277,14 @@ DROP_IN = File(
 )
 
 
-def test_a_drop_in_comes_with_the_place_of_the_certificates() -> None:
+def test_the_drop_in_of_the_gateway_has_the_directory_of_the_certificates() -> None:
     step = admitted(DROP_IN, None, Path("/srv/tls"))
     assert isinstance(step, Write)
     assert b"LoadCredential=key.pem:/srv/tls/key.pem\n" in step.file.content
     assert b"'cd \"/srv/tls\" && install key.pem %t/%N'\n" in step.file.content
 
 
-def test_networks_that_somebody_has_narrowed_stay() -> None:
+def test_networks_that_the_user_has_restricted_are_kept() -> None:
     own = b"IPAddressAllow=10.1.2.0/24\nLoadCredential=key.pem:/srv/tls/key.pem\n"
     assert isinstance(admitted(DROP_IN, own, Path("/srv/tls")), Keep)
     moved = admitted(DROP_IN, own, Path("/etc/tls"))
@@ -290,7 +292,7 @@ def test_networks_that_somebody_has_narrowed_stay() -> None:
     assert moved.file.content == own.replace(b"/srv/tls", b"/etc/tls")
 
 
-def test_written_and_removed_a_directory_is_as_it_was(tmp_path: Path) -> None:
+def test_after_a_write_and_a_removal_the_directory_is_unchanged(tmp_path: Path) -> None:
     (tmp_path / "elsewhere").write_text("untouched")
     file = File(tmp_path / "acsard" / "bin" / "tool", b"new", 0o755)
     Write(file).do()
@@ -318,7 +320,7 @@ def test_a_full_disk_leaves_no_part_of_a_file(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_a_directory_with_something_else_in_it_stays(tmp_path: Path) -> None:
+def test_a_directory_with_other_files_is_not_removed(tmp_path: Path) -> None:
     file = File(tmp_path / "bin" / "tool", b"new")
     Write(file).do()
     (tmp_path / "bin" / "other").touch()
@@ -326,7 +328,7 @@ def test_a_directory_with_something_else_in_it_stays(tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / "bin").iterdir()] == ["other"]
 
 
-def test_a_command_that_fails_ends_it_unless_it_may() -> None:
+def test_a_failing_command_ends_the_installation_unless_its_failure_is_permitted() -> None:
     words = ("sh", "-c", "echo no >&2; exit 1")
     with pytest.raises(MendableError, match="no"):
         Run(words).do()
@@ -335,7 +337,7 @@ def test_a_command_that_fails_ends_it_unless_it_may() -> None:
         Run(("no such program",)).do()
 
 
-def test_a_whole_directory_goes_and_those_of_ours_that_are_empty_then(tmp_path: Path) -> None:
+def test_removing_a_directory_also_removes_its_empty_parent_of_the_service(tmp_path: Path) -> None:
     place = tmp_path / "acsard" / "tls"
     (place / "clients").mkdir(parents=True)
     (place / "clients" / "key.pem").touch()
@@ -343,7 +345,7 @@ def test_a_whole_directory_goes_and_those_of_ours_that_are_empty_then(tmp_path: 
     assert not list(tmp_path.iterdir())
 
 
-def test_what_cannot_be_read_is_a_sentence(tmp_path: Path) -> None:
+def test_an_unreadable_file_is_reported_in_a_sentence(tmp_path: Path) -> None:
     place = File(tmp_path / "acsard.toml", b"")
     place.path.mkdir()
     assert place.condition() == "unreadable"

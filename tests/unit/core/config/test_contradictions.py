@@ -32,7 +32,7 @@ def problems(**tables: object) -> list[str]:
     return contradictions(Config(**tables))  # type: ignore[arg-type]
 
 
-def test_the_defaults_contradict_nothing_and_surprise_nobody() -> None:
+def test_the_defaults_have_no_contradictions_and_no_warnings() -> None:
     assert contradictions(Config()) == []
     assert warnings(Config()) == []
 
@@ -49,7 +49,7 @@ def test_a_tls_endpoint_needs_certificates(endpoint: str) -> None:
     assert problems(bus=BusConfig(connect=(endpoint,), tls="/etc/acsard/tls")) == []
 
 
-def test_the_gateway_needs_a_way_to_the_daemon() -> None:
+def test_the_gateway_needs_a_local_tcp_address_of_the_daemon() -> None:
     (line,) = problems(bus=BusConfig(listen=("tls/0.0.0.0:7449",), tls="/etc/acsard/tls"))
     assert line == (
         'bus.listen = ["tls/0.0.0.0:7449"]: the TLS gateway needs a tcp address of '
@@ -66,19 +66,19 @@ def test_a_plain_endpoint_stays_on_this_machine_even_with_certificates(endpoint:
 
 
 @each("endpoint", ["udp/127.0.0.1:1", "tls/:7449", "tls/host", "tls/host:0"])
-def test_anything_else_is_no_endpoint(endpoint: str) -> None:
+def test_any_other_text_is_not_an_endpoint(endpoint: str) -> None:
     (line,) = problems(bus=BusConfig(listen=(HERE, endpoint), tls="/etc/acsard/tls"))
     assert "not an endpoint" in line
 
 
-def test_a_client_needs_somewhere_to_connect_to() -> None:
+def test_client_mode_needs_an_address_to_connect_to() -> None:
     (line,) = problems(bus=BusConfig(mode="client"))
     assert 'bus.mode = "client"' in line
     assert problems(bus=BusConfig(mode="client", connect=("tcp/127.0.0.1:7447",))) == []
 
 
 @each("listen", [(), ("nonsense",), ("tcp/0.0.0.0:7448",), ("tls/1.2.3.4:5",)])
-def test_where_a_client_would_listen_is_neither_refused_nor_a_surprise(
+def test_listen_endpoints_are_ignored_without_a_warning_in_client_mode(
     listen: tuple[str, ...],
 ) -> None:
     here = ("tcp/127.0.0.1:7447",)
@@ -113,7 +113,7 @@ def test_the_check_refuses_the_addresses_that_the_page_refuses(
     assert (problems(bus=bus, web=web) != []) == refused
 
 
-def test_the_page_and_the_bus_listen_once_at_a_port() -> None:
+def test_a_second_address_with_the_same_host_and_port_is_refused() -> None:
     web = WebConfig(address=("http://127.0.0.1:8443", "https://127.0.0.1:8443"))
     (line,) = problems(bus=BusConfig(tls="/etc/acsard/tls"), web=web)
     assert line == (
@@ -130,14 +130,14 @@ def test_a_certificate_has_one_role() -> None:
     assert line.startswith('access.maintainers[0] = "b": access.viewers[1] already has this')
 
 
-def test_a_namespace_may_not_begin_like_the_native_keys() -> None:
+def test_a_namespace_may_not_start_with_the_prefix_of_the_native_keys() -> None:
     (line,) = problems(ros=RosConfig(namespace="acsard/acsar"))
     assert "ros.namespace" in line
     assert problems(ros=RosConfig(namespace="acsard", bridge=False)) == []
     assert problems(ros=RosConfig(namespace="acsard2")) == []
 
 
-def test_a_bus_that_leaves_the_machine_wants_an_id_and_a_namespace() -> None:
+def test_a_bus_on_the_network_without_robot_id_and_namespace_is_a_warning() -> None:
     text = b'[bus]\nlisten = ["tcp/127.0.0.1:7448", "tls/0.0.0.0:7449"]\ntls = "/etc/acsard/tls"\n'
     first, second = warnings(parse(text))
     assert "robot.id" in first
@@ -146,7 +146,7 @@ def test_a_bus_that_leaves_the_machine_wants_an_id_and_a_namespace() -> None:
     assert len(warnings(parse(text + b"[ros]\nbridge = false\nrmw = false\n"))) == 1
 
 
-def test_a_router_on_the_machine_wants_a_namespace_too() -> None:
+def test_a_router_on_the_robot_without_a_namespace_is_a_warning() -> None:
     text = b'[bus]\nconnect = ["tcp/127.0.0.1:7447"]\n'
     (line,) = warnings(parse(text))
     assert line.startswith('ros.namespace = "" on a bus with a router')
@@ -157,7 +157,7 @@ def test_a_router_on_the_machine_wants_a_namespace_too() -> None:
 # the checked link
 
 
-def test_checked_lines_take_more_of_the_wire() -> None:
+def test_checked_lines_reduce_the_highest_control_rate() -> None:
     mcu = McuConfig(baud_rate=9600, link_check="auto")
     (line,) = problems(mcu=mcu, control=ControlConfig(rate=25))
     assert line == (
@@ -169,7 +169,7 @@ def test_checked_lines_take_more_of_the_wire() -> None:
     assert Config(mcu=mcu, control=ControlConfig(rate="auto")).rate_hz == 18
 
 
-def test_the_sample_fields_take_more_still() -> None:
+def test_sample_fields_reduce_the_highest_control_rate_further() -> None:
     mcu = McuConfig(baud_rate=57600, link_check="require", encoder_counts=3200)
     (line,) = problems(mcu=mcu)
     assert line == (
@@ -193,7 +193,7 @@ def test_the_sample_fields_take_more_still() -> None:
     (96, 200, "off", True), (96, 100, "off", False), (200, 200, "off", False),
     (96, 200, "auto", False),
 ])  # fmt: skip
-def test_lines_that_repeat_counts_are_named(
+def test_a_rate_so_high_that_lines_repeat_counts_is_a_warning(
     counts: int, rate: float, check: Literal["off", "auto"], warned: bool
 ) -> None:
     mcu = McuConfig(encoder_counts=counts, link_check=check)
@@ -214,7 +214,9 @@ def test_lines_that_repeat_counts_are_named(
         (McuConfig(link_check="auto", encoder_counts=3200), 62),
     ],
 )
-def test_a_line_is_as_long_as_what_may_be_asked_for(mcu: McuConfig, count: int) -> None:
+def test_the_line_length_includes_all_fields_that_the_settings_may_request(
+    mcu: McuConfig, count: int
+) -> None:
     assert mcu.line_bytes == count
     at_9600 = McuConfig(
         baud_rate=9600,
@@ -226,18 +228,18 @@ def test_a_line_is_as_long_as_what_may_be_asked_for(mcu: McuConfig, count: int) 
     assert rate == int(0.8 * 9600 / (count * 10))
 
 
-def test_counts_without_the_check_are_as_they_should_be() -> None:
+def test_encoder_counts_without_the_check_cause_no_warning() -> None:
     assert warnings(Config(mcu=McuConfig(encoder_counts=3200))) == []
 
 
-def test_counts_that_are_not_the_simulators_are_a_surprise() -> None:
+def test_encoder_counts_that_differ_from_the_simulator_are_a_warning() -> None:
     mcu = McuConfig(link_check="auto", encoder_counts=1600)
     (warning,) = warnings(Config(mcu=mcu))
     assert "sim.encoder_counts = 3200: distances may be wrong; write the same number" in warning
     assert warnings(Config(mcu=mcu, sim=SimConfig(encoder_counts=1600))) == []
 
 
-def test_counts_that_wrap_within_two_periods_are_refused_with_the_most_that_do_not() -> None:
+def test_counts_that_wrap_within_two_periods_are_refused_with_the_largest_valid_value() -> None:
     control = ControlConfig(rate=10)
     (line,) = problems(mcu=McuConfig(encoder_counts=20_000), control=control)
     assert line.startswith(
@@ -251,7 +253,7 @@ def test_counts_that_wrap_within_two_periods_are_refused_with_the_most_that_do_n
     assert problems(mcu=McuConfig(encoder_counts=20_000), control=control, feedback=slower) == []
 
 
-def test_a_track_is_learned_only_where_there_is_a_gyro() -> None:
+def test_a_learned_track_needs_a_gyro() -> None:
     (line,) = problems(odometry=OdometryConfig(learned_track=True))
     assert line.startswith("odometry.learned_track = true needs a gyro")
     assert "odometry.gyro = true" in line
@@ -306,13 +308,11 @@ def test_motion_away_from_a_bumper_needs_its_place() -> None:
         ),
     ],
 )
-def test_thresholds_of_the_battery_are_in_order_and_can_end(
-    battery: BatteryConfig, problem: str
-) -> None:
+def test_contradicting_battery_thresholds_are_refused(battery: BatteryConfig, problem: str) -> None:
     assert contradictions(Config(battery=battery)) == [problem]
 
 
-def test_thresholds_in_order_are_no_problem() -> None:
+def test_battery_thresholds_in_order_are_accepted() -> None:
     for battery in (
         BatteryConfig(),
         BatteryConfig(warning_below=22.0, return_below=21.5, stop_below=21.0),
@@ -321,7 +321,7 @@ def test_thresholds_in_order_are_no_problem() -> None:
         assert contradictions(Config(battery=battery)) == []
 
 
-def test_a_required_emergency_stop_needs_room_on_a_slow_wire() -> None:
+def test_a_slow_wire_without_room_for_required_status_lines_is_a_warning() -> None:
     slow = McuConfig(baud_rate=9600)
     config = Config(mcu=slow, control=ControlConfig(rate="auto"))
     assert warnings(config) == []

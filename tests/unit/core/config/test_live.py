@@ -47,7 +47,7 @@ def by_file(wishes: dict[str, object]) -> Config | list[str]:
         return error.problems
 
 
-def test_every_row_is_a_key_and_every_source_has_its_own() -> None:
+def test_every_live_setting_is_a_key_and_every_source_has_a_live_timeout() -> None:
     found = {key for key in KEYS if live(key)}
     sources = {f"commands.sources.{one.name}.timeout" for one in CONFIG.commands.sources}
     assert found == {key for key in LIVE if "*" not in key} | sources
@@ -60,11 +60,11 @@ def test_every_row_is_a_key_and_every_source_has_its_own() -> None:
      "commands.sources.nav.priority", "bus.listen", "access.maintainers", "robot.id",
      "odometry.gyro", "odometry.distance_scale_std", "log.format", "commands.sources.nav"],
 )  # fmt: skip
-def test_what_shapes_the_wire_the_base_or_who_may_drive_takes_a_start(key: str) -> None:
+def test_settings_of_wire_base_and_permissions_need_a_restart(key: str) -> None:
     assert live(key) is None
 
 
-def test_what_is_set_is_in_the_configuration_and_nothing_else_is() -> None:
+def test_a_change_sets_exactly_the_given_keys() -> None:
     made, news = changed(CONFIG, {"limits.linear_speed": 0.8, "log.level": "debug"}, False)
     after = dict(flat(effective(made)))
     assert {key for key in KEYS if KEYS[key] != after[key]} == {"limits.linear_speed", "log.level"}
@@ -72,7 +72,7 @@ def test_what_is_set_is_in_the_configuration_and_nothing_else_is() -> None:
     assert news == 'limits.linear_speed = 0.8 (was 1.0), log.level = "debug" (was "info")'
 
 
-def test_a_source_is_set_by_its_name() -> None:
+def test_the_timeout_of_a_source_is_set_by_the_name_of_the_source() -> None:
     made, _ = changed(CONFIG, {"commands.sources.app.timeout": 0.5}, True)
     timeouts = {source.name: source.timeout for source in made.commands.sources}
     assert timeouts == {
@@ -84,7 +84,7 @@ def test_a_source_is_set_by_its_name() -> None:
     }
 
 
-def test_a_whole_number_is_a_number_and_a_list_is_one() -> None:
+def test_whole_numbers_are_accepted_as_floats_also_in_lists() -> None:
     made, _ = changed(
         CONFIG, {"rates.state": 5, "odometry.twist_covariance_diagonal": [1, 2, 3, 4, 5, 6]}, True
     )
@@ -101,7 +101,7 @@ def test_a_whole_number_is_a_number_and_a_list_is_one() -> None:
         {},
     ],
 )
-def test_what_is_so_already_is_no_change_whatever_it_is(wishes: dict[str, object]) -> None:
+def test_setting_a_key_to_its_present_value_changes_nothing(wishes: dict[str, object]) -> None:
     assert changed(CONFIG, wishes, False) == (CONFIG, "")
 
 
@@ -122,7 +122,7 @@ VALUES: dict[str, list[object]] = {
 @pytest.mark.slow
 @each(("key", "value"), [(key, value) for key, values in VALUES.items() for value in values])
 @each("beside", [{}, {"limits.angular_speed": 20.0, "limits.linear_speed": 4.5}])
-def test_a_change_is_judged_as_the_file_is(
+def test_a_change_is_validated_like_the_file(
     key: str, value: object, beside: dict[str, object]
 ) -> None:
     wishes = beside | {key: value}
@@ -133,19 +133,19 @@ def test_a_change_is_judged_as_the_file_is(
         assert problems(wishes) == judged
 
 
-def test_one_that_cannot_be_refuses_all() -> None:
+def test_one_invalid_value_refuses_the_whole_change() -> None:
     (line,) = problems({"limits.angular_speed": 2.0, "limits.linear_speed": 20.0})
     assert "limits.linear_speed = 20.0: expected a number from 0 to 10 m/s" in line
 
 
-def test_a_rule_between_keys_refuses_what_breaks_it_and_takes_both_together() -> None:
+def test_a_rule_between_keys_refuses_one_change_but_accepts_a_consistent_pair() -> None:
     softer: dict[str, object] = {"limits.linear_deceleration": 0.15}
     assert "would take 6.7 s, but at most" in problems(softer)[0]
     made, _ = changed(CONFIG, softer | {"limits.linear_speed": 0.5}, True)
     assert made.limits.linear_deceleration == 0.15
 
 
-def test_limits_beyond_what_feedback_may_say_are_refused() -> None:
+def test_limits_above_the_largest_feedback_speed_are_refused() -> None:
     (line,) = problems({"limits.wheel_speed": 79.0, "limits.linear_speed": 4.0})
     assert "feedback.wheel_speed = 80: the limits allow commands of 79.0 rad/s for a wheel" in line
 
@@ -173,7 +173,7 @@ def test_a_setting_that_cannot_be_set_is_reported_with_the_remedy(
     assert len(line) < 300
 
 
-def test_of_many_that_cannot_be_set_one_is_explained() -> None:
+def test_only_the_first_of_many_unsettable_keys_is_explained() -> None:
     first, more = problems({f"limits.no{n}": 1.0 for n in range(100)})
     assert "limits.no0" in first
     assert more == "and 99 more of these keys cannot be set"
@@ -185,7 +185,7 @@ SOFTER = [key for key, row in LIVE.items() if row.when == "raised"]
 
 
 @each("key", SOFTER)
-def test_braking_may_get_harder_while_it_drives_and_softer_at_rest(key: str) -> None:
+def test_braking_can_be_made_harder_while_driving_but_softer_only_at_rest(key: str) -> None:
     config = replace(CONFIG, limits=LimitsConfig(linear_speed=0.2, angular_speed=0.2))
     now = dict(flat(effective(config)))[key]
     assert isinstance(now, float)
@@ -201,14 +201,16 @@ def test_braking_may_get_harder_while_it_drives_and_softer_at_rest(key: str) -> 
     [("limits.wheel_speed", 39.0), ("limits.wheel_speed", 41.0), ("commands.neutral_pause", 2.0),
      ("commands.sources.nav.timeout", 0.5)],
 )  # fmt: skip
-def test_what_would_jump_or_forget_who_drives_waits_for_rest(key: str, value: float) -> None:
+def test_settings_that_would_jump_or_reset_the_arbiter_are_refused_while_driving(
+    key: str, value: float
+) -> None:
     (line,) = problems({key: value}, at_rest=False)
     assert "only while the robot stands" in line
     assert changed(CONFIG, {key: value}, at_rest=True)[1]
 
 
 @each("key", [key for key, row in LIVE.items() if row.when == "always"])
-def test_the_others_may_be_set_at_any_time(key: str) -> None:
+def test_all_other_live_settings_may_be_changed_while_driving(key: str) -> None:
     now = KEYS[key]
     other: object = {"model": "constant", "info": "debug"}.get(str(now))
     if isinstance(now, tuple | list):

@@ -32,7 +32,7 @@ def test_a_limit_below_that_of_the_file_is_kept(now: LimitsConfig, kept: dict[st
     assert lowered(FILE, now) == kept
 
 
-def test_a_first_limit_of_the_jerk_is_lower_than_none() -> None:
+def test_a_jerk_limit_is_lower_than_no_jerk_limit() -> None:
     limited = LimitsConfig(angular_jerk=20.0)
     assert lowered(LimitsConfig(), limited) == {"limits.angular_jerk": 20.0}
     config, events = with_lowered(Config(), {"limits.angular_jerk": 20.0})
@@ -40,7 +40,7 @@ def test_a_first_limit_of_the_jerk_is_lower_than_none() -> None:
     assert len(events) == 1
 
 
-def test_nothing_kept_is_the_same_configuration_without_an_event() -> None:
+def test_without_kept_limits_the_configuration_is_unchanged_without_an_event() -> None:
     config = Config()
     assert with_lowered(config, {}) == (config, [])
 
@@ -53,7 +53,7 @@ def test_nothing_kept_is_the_same_configuration_without_an_event() -> None:
         {"limits.linear_deceleration": 0.5},
     ],
 )
-def test_a_limit_that_lowers_nothing_now_is_left_out(kept: dict[str, float]) -> None:
+def test_a_kept_limit_that_lowers_nothing_now_is_left_out(kept: dict[str, float]) -> None:
     config = Config()
     assert with_lowered(config, kept) == (config, [])
 

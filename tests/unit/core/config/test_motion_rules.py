@@ -70,7 +70,7 @@ def mended(config: Config, line: str) -> Config:
     thousandths(0.0, LONGEST_REPLY_S),
     st.just(0.0) | thousandths(0.01, 3.0),
 )
-def test_what_each_line_says_to_write_is_enough(
+def test_following_the_advice_of_each_problem_leads_to_a_valid_configuration(
     drive: DriveConfig, limit: LimitsConfig, wheel_speed: float, period: float, fault_s: float
 ) -> None:
     config = Config(
@@ -107,7 +107,7 @@ SOFT = LimitsConfig(
 
 @given(drives, limits, st.booleans(), st.sampled_from([(1, 0), (0, 1), (1, 1), (-1, 1)]))
 @example(LOPSIDED, SOFT, False, (1, 1))
-def test_whatever_is_accepted_comes_to_rest_in_time_from_any_speed_it_can_reach(
+def test_every_accepted_robot_comes_to_rest_in_time_from_any_reachable_speed(
     drive: DriveConfig, limit: LimitsConfig, stop: bool, way: tuple[int, int]
 ) -> None:
     config = Config(drive=drive, limits=replace(limit, linear_acceleration=100.0))
@@ -123,7 +123,7 @@ def test_whatever_is_accepted_comes_to_rest_in_time_from_any_speed_it_can_reach(
     assert limiter.twist == REST
 
 
-def test_a_stop_of_exactly_the_longest_is_accepted_and_a_softer_one_is_not() -> None:
+def test_a_stop_of_exactly_the_longest_duration_is_accepted_and_a_longer_one_is_not() -> None:
     def stops_by(stop: float) -> list[str]:
         soft = LimitsConfig(linear_deceleration=0.2, linear_stop_deceleration=stop)
         return problems(Config(limits=soft))
@@ -139,20 +139,22 @@ def test_a_stop_that_is_both_too_soft_and_softer_than_the_ramp_is_reported_once(
     assert line.endswith("write 0.5 or more")
 
 
-def test_what_the_wheels_cannot_reach_needs_no_braking() -> None:
+def test_a_speed_that_the_wheels_cannot_reach_does_not_count_for_braking() -> None:
     # 10 rad/s on a radius of 0.05 m are 0.5 m/s.
     slow = LimitsConfig(linear_speed=10.0, wheel_speed=10.0, linear_deceleration=0.1)
     assert problems(Config(limits=slow)) == []
 
 
 @pytest.mark.parametrize(("wheel_speed", "good"), [(35.2, True), (35.1, False), (20.0, False)])
-def test_feedback_must_leave_room_for_what_the_limits_ask(wheel_speed: float, good: bool) -> None:
+def test_the_largest_feedback_speed_must_exceed_the_commanded_speed_by_a_tenth(
+    wheel_speed: float, good: bool
+) -> None:
     # The limits ask for (1.0 m/s + 4.0 rad/s x 0.15 m) / 0.05 m = 32 rad/s, and a tenth is added.
     found = problems(Config(feedback=FeedbackConfig(wheel_speed=wheel_speed)))
     assert (found == []) is good
 
 
-def test_the_largest_speed_of_a_line_is_enough_for_any_limit() -> None:
+def test_the_largest_speed_of_a_line_is_sufficient_for_any_limit() -> None:
     fast = LimitsConfig(linear_speed=10.0, wheel_speed=99.99, linear_deceleration=3.0)
     top = FeedbackConfig(wheel_speed=99.99)
     assert problems(Config(limits=fast, feedback=top)) == []
@@ -169,7 +171,7 @@ def test_a_smaller_wheel_has_to_turn_faster() -> None:
     [(0.25, 0.5, None), (0.25, 0.49, 0.245), (0.25, 0.0, None), (0.25, 10.0, None),
      (0.0, 0.01, None)],
 )  # fmt: skip
-def test_a_fault_rests_on_two_lines_and_a_lost_line_is_no_new_start(
+def test_a_reply_period_that_is_too_long_for_the_fault_time_is_refused(
     period: float, fault_s: float, most: float | None
 ) -> None:
     found = problems(

@@ -66,7 +66,7 @@ REFUSED = [
     ("text", "words"),
     [*REFUSED, ("", "not a known fault"), ("reset=0", "above 0"), ("reset=-1", "above")],
 )
-def test_what_is_no_fault_is_refused_in_words(text: str, words: str) -> None:
+def test_an_invalid_fault_is_refused_with_the_reason(text: str, words: str) -> None:
     with pytest.raises(ValueError, match=re.escape(words)):
         named(text)
 
@@ -85,7 +85,7 @@ def problems(faults: str) -> list[str]:
     return caught.value.problems
 
 
-def test_a_file_may_have_any_of_them() -> None:
+def test_the_configuration_accepts_several_simulator_faults() -> None:
     config = parse(b'[sim]\nfaults = ["ftdi", "stalls=5:0.15", "stuck_encoder=b"]')
     assert config.sim.faults == ("ftdi", "stalls=5:0.15", "stuck_encoder=b")
 
@@ -104,7 +104,7 @@ def test_every_mistake_is_reported() -> None:
     assert [line.partition(" ")[0] for line in told] == ["sim.faults[0]", "sim.faults[2]"]
 
 
-def test_what_needs_a_timer_is_told_where_it_goes() -> None:
+def test_a_fault_that_needs_a_timer_is_refused_with_the_command_that_accepts_it() -> None:
     assert problems('["reset=5"]') == [
         'sim.faults[0] = "reset=5": works only as `acsard sim --fault reset=5`; '
         "remove it from sim.faults"
@@ -112,13 +112,15 @@ def test_what_needs_a_timer_is_told_where_it_goes() -> None:
 
 
 @each("faults", ['"ftdi"', "[1]", '[""]', r'["mute\n"]', f'["{"x" * 65}"]'])
-def test_what_is_no_list_of_short_texts_is_told_as_of_any_key(faults: str) -> None:
+def test_a_value_that_is_not_a_list_of_short_texts_is_refused_with_the_expected_type(
+    faults: str,
+) -> None:
     (told,) = problems(faults)
     assert told.startswith("sim.faults = ")
     assert "expected a list, each a fault that `acsard sim --fault` accepts, in quotes" in told
 
 
-def test_a_simulator_with_faults_is_a_surprise_and_a_device_has_none() -> None:
+def test_faults_of_the_simulator_are_a_warning_but_not_for_a_real_device() -> None:
     sim = SimConfig(faults=("ftdi",))
     (warning,) = warnings(Config(sim=sim))
     assert (

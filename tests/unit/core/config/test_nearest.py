@@ -15,13 +15,13 @@ KNOWN = ["odom", "state", "tf_static", "limits.linear_speed"]
     ("word", "meant"),
     [("oddom", "odom"), ("tf-static", "tf_static"), ("linear_speed", "limits.linear_speed")],
 )
-def test_a_slip_is_asked_about(word: str, meant: str) -> None:
+def test_a_misspelt_word_gets_a_suggestion(word: str, meant: str) -> None:
     assert nearest(word, KNOWN) == [meant]
     assert hint(word, KNOWN, "look there") == f"did you mean {meant}?"
 
 
 @pytest.mark.parametrize("word", ["nonsense", "", "x" * 1000])
-def test_what_is_like_nothing_gets_the_other_help(word: str) -> None:
+def test_a_word_without_a_similar_one_gets_the_general_hint(word: str) -> None:
     assert nearest(word, KNOWN) == []
     assert hint(word, KNOWN, "look there") == "look there"
 

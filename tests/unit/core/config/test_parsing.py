@@ -40,7 +40,7 @@ def accepted(text: str) -> Config:
 # the file as a whole
 
 
-def test_an_empty_file_is_the_defaults() -> None:
+def test_an_empty_file_gives_the_defaults() -> None:
     assert parse(b"") == Config()
 
 
@@ -77,13 +77,13 @@ def test_the_reference_file_explains_each_table_in_a_comment() -> None:
     assert silent == []
 
 
-def test_what_is_in_force_reads_back_as_the_same_configuration() -> None:
+def test_the_effective_configuration_reads_back_as_the_same_configuration() -> None:
     config = accepted('[robot]\nid = "x"\n[control]\nrate = "auto"\n[commands]\nsources = []')
     assert from_builtins(effective(config)) == config
     assert from_builtins(msgspec.json.decode(msgspec.json.encode(effective(config)))) == config
 
 
-def test_every_value_of_a_file_is_taken_over() -> None:
+def test_every_value_of_a_file_is_in_the_configuration() -> None:
     config = accepted(
         """
         [mcu]
@@ -112,7 +112,7 @@ def test_every_value_of_a_file_is_taken_over() -> None:
 # the command line
 
 
-def test_the_command_line_wins_over_the_file() -> None:
+def test_the_command_line_overrides_the_file() -> None:
     config = parse(b'[mcu]\nport = "/dev/a"\nbaud_rate = 9600\n[control]\nrate = 20', {
         "mcu": {"port": "/dev/b"}, "robot": {"id": "r2"},
     })  # fmt: skip
@@ -126,7 +126,7 @@ def test_a_mistake_on_the_command_line_is_reported_like_one_in_the_file() -> Non
     assert line.startswith("mcu.baud_rate = 1200: expected one of 9600, 19200")
 
 
-def test_the_command_line_cannot_repair_a_table_that_is_none() -> None:
+def test_the_command_line_does_not_hide_that_the_file_has_a_value_instead_of_a_table() -> None:
     (line,) = problems_of(b"mcu = 5", {"mcu": {"port": "/dev/b"}})
     assert line.startswith("mcu = 5: expected a table")
 
@@ -348,7 +348,7 @@ PLANTED = [
 
 
 @each(("text", "key", "value", "mend"), PLANTED)
-def test_a_mistake_gives_exactly_one_line_with_key_value_and_mend(
+def test_a_mistake_gives_exactly_one_line_with_key_value_and_remedy(
     text: str, key: str, value: str, mend: str
 ) -> None:
     (line,) = problems_of(text)
@@ -357,7 +357,7 @@ def test_a_mistake_gives_exactly_one_line_with_key_value_and_mend(
     assert "\n" not in line
 
 
-def test_many_mistakes_at_once_give_a_line_each() -> None:
+def test_each_of_many_mistakes_gives_one_line() -> None:
     found = problems_of(
         """
         colour = 1
@@ -381,7 +381,7 @@ def test_many_mistakes_at_once_give_a_line_each() -> None:
     assert all(sum(line.startswith(start) for line in found) == 1 for start in starts)
 
 
-def test_all_contradictions_are_reported_at_once() -> None:
+def test_all_contradictions_are_reported_together() -> None:
     found = problems_of(
         """
         [mcu]
@@ -398,7 +398,7 @@ def test_all_contradictions_are_reported_at_once() -> None:
     assert len(found) == 6
 
 
-def test_rules_between_keys_are_reported_with_the_mistakes_of_other_keys() -> None:
+def test_broken_rules_between_keys_are_reported_with_the_mistakes_of_other_keys() -> None:
     found = problems_of(
         """
         colour = 1
@@ -428,7 +428,7 @@ def test_rules_between_keys_are_reported_with_the_mistakes_of_other_keys() -> No
     assert sorted(line.split(" = ")[0] for line in found) == sorted(starts)
 
 
-def test_a_rule_says_nothing_of_a_key_whose_value_is_not_known() -> None:
+def test_a_rule_is_not_applied_to_a_key_with_an_unknown_value() -> None:
     """The rules must not complain about keys whose values are unknown.
 
     These are 100 Hz at the default baud rate, and endpoints whose `insecure` was misspelt.
@@ -445,7 +445,7 @@ def test_a_rule_says_nothing_of_a_key_whose_value_is_not_known() -> None:
     assert [line.split(" = ")[0] for line in problems_of(text)] == ["mcu.baudrate", "bus.insecur"]
 
 
-def test_the_error_says_all_its_problems() -> None:
+def test_the_error_message_lists_all_problems() -> None:
     with pytest.raises(ConfigError) as caught:
         parse(b"a = 1\nb = 2")
     assert str(caught.value) == "\n".join(caught.value.problems)
@@ -475,7 +475,7 @@ def test_a_number_that_is_not_finite_is_refused_at_every_key(key: Key, text: str
     ["[mcu", "mcu", "[mcu]\nport = /dev/ttyUSB0", "a = 1\na = 2", "[a]\n[a]", "a = 1 = 2", "\x00",
      "a = True", 'a = "\\q"', "a = 2020-13-01", '"', "a.b = 1\na = 2", "[[a]]\n[a]\n[a]"],
 )  # fmt: skip
-def test_what_is_not_toml_gives_one_line_with_the_place(text: str) -> None:
+def test_text_that_is_not_toml_gives_one_line_with_the_position(text: str) -> None:
     (line,) = problems_of(text)
     assert line.startswith("not TOML: ")
     assert "line" in line or "end of document" in line
@@ -483,7 +483,7 @@ def test_what_is_not_toml_gives_one_line_with_the_place(text: str) -> None:
 
 
 @each("text", [b"\xff", "[robot]".encode("utf-16"), b'id = "\xe9"', b"\x80" * 99])
-def test_what_is_not_utf8_gives_one_line(text: bytes) -> None:
+def test_bytes_that_are_not_utf8_give_one_line(text: bytes) -> None:
     (line,) = problems_of(text)
     assert line.startswith("not UTF-8 text: ")
     assert line.endswith("; save the file as UTF-8")
@@ -503,7 +503,7 @@ def wire(baud: int, rate: object, comma: bool = False) -> str:
     [(9600, 23, False), (9600, 22, True), (19200, 46, False), (38400, 93, False),
      (57600, 139, False), (115200, 279, False), (115200, 271, True)],
 )  # fmt: skip
-def test_up_to_eighty_percent_of_the_wire_passes_without_a_word(
+def test_a_rate_up_to_80_percent_of_the_wire_passes_without_a_warning(
     baud: int, rate: int, comma: bool
 ) -> None:
     assert warnings(accepted(wire(baud, rate, comma))) == []
@@ -514,7 +514,7 @@ def test_up_to_eighty_percent_of_the_wire_passes_without_a_word(
     [(9600, 24, False, 23), (9600, 29, False, 23), (9600, 23, True, 22), (38400, 94, False, 93),
      (38400, 116, False, 93), (115200, 280, False, 279), (115200, 349, False, 279)],
 )  # fmt: skip
-def test_up_to_the_whole_wire_passes_with_a_warning(
+def test_a_rate_between_80_and_100_percent_of_the_wire_passes_with_a_warning(
     baud: int, rate: int, comma: bool, comfortable: int
 ) -> None:
     (text,) = warnings(accepted(wire(baud, rate, comma)))
@@ -534,7 +534,7 @@ def test_up_to_the_whole_wire_passes_with_a_warning(
         (115200, 350, False, ("33 B at 115200 baud takes 2.9 ms", 349, 279), None),
     ],
 )  # fmt: skip
-def test_more_than_the_wire_is_refused_with_the_numbers_and_both_ways_out(
+def test_a_rate_above_the_wire_capacity_is_refused_with_the_numbers_and_both_remedies(
     baud: int, rate: int, comma: bool, numbers: tuple[str, int, int], faster: int | None
 ) -> None:
     (line,) = problems_of(wire(baud, rate, comma))
@@ -554,7 +554,7 @@ def test_more_than_the_wire_is_refused_with_the_numbers_and_both_ways_out(
 
 @each("baud", [9600, 19200, 38400, 57600, 115200])
 @each("comma", [False, True])
-def test_an_automatic_rate_is_always_comfortable(baud: int, comma: bool) -> None:
+def test_an_automatic_rate_never_causes_a_warning(baud: int, comma: bool) -> None:
     config = accepted(wire(baud, '"auto"', comma))
     assert warnings(config) == []
     assert config.rate_hz * (34 if comma else 33) * 10 <= 0.8 * baud
@@ -565,7 +565,7 @@ def test_an_automatic_rate_is_always_comfortable(baud: int, comma: bool) -> None
 
 @each("key", ["listen", "connect"])
 @each("host", ["127.0.0.1", "127.8.9.1", "[::1]", "localhost"])
-def test_this_machine_may_be_named(key: str, host: str) -> None:
+def test_an_endpoint_may_name_this_machine(key: str, host: str) -> None:
     config = accepted(f'[bus]\n{key} = ["tcp/{host}:7448"]')
     assert getattr(config.bus, key) == (f"tcp/{host}:7448",)
 
@@ -575,7 +575,7 @@ def test_this_machine_may_be_named(key: str, host: str) -> None:
     "host", ["0.0.0.0", "[::]", "192.168.1.2", "[fe80::1]", "robot.local", "*", "128.0.0.1",
              "localhost.evil.org", "127.0.0.1.evil.org", "1"],
 )  # fmt: skip
-def test_what_leaves_this_machine_is_refused_unless_insecure_is_said(key: str, host: str) -> None:
+def test_an_endpoint_on_the_network_is_refused_unless_insecure_is_set(key: str, host: str) -> None:
     text = f'[bus]\n{key} = ["tcp/{host}:7448"]\n'
     (line,) = problems_of(text)
     assert line.startswith(f'bus.{key} = "tcp/{host}:7448": this endpoint is on the network')
@@ -590,7 +590,7 @@ def test_what_leaves_this_machine_is_refused_unless_insecure_is_said(key: str, h
      "tcp/127.0.0.1:-1", "tcp/127.0.0.1:x", "udp/127.0.0.1:7448", "127.0.0.1:7448",
      "tcp/127.0.0.1:7448#iface=eth0", "tcp/127.0.0.1:٧", " tcp/127.0.0.1:7448"],
 )  # fmt: skip
-def test_what_is_not_an_endpoint_is_refused_even_when_insecure(endpoint: str) -> None:
+def test_an_invalid_endpoint_is_refused_even_when_insecure(endpoint: str) -> None:
     (line,) = problems_of(f'[bus]\nlisten = ["{endpoint}"]\ninsecure = true')
     assert line.startswith("bus.listen = ")
     assert "tcp/127.0.0.1:7448" in line
@@ -611,7 +611,7 @@ def test_what_is_not_an_endpoint_is_refused_even_when_insecure(endpoint: str) ->
         '[control]\nstate_directory = "~/states"',
     ],
 )
-def test_what_is_at_a_limit_passes(text: str) -> None:
+def test_a_value_at_a_limit_passes(text: str) -> None:
     accepted(text)
 
 
@@ -670,7 +670,7 @@ def is_config_or_lines(found: Config | list[str]) -> bool:
 @pytest.mark.slow
 @given(st.lists(LINES, max_size=12).map("\n".join))
 @settings(max_examples=400)
-def test_any_toml_like_text_is_a_configuration_or_a_list_of_lines(text: str) -> None:
+def test_any_toml_like_text_gives_a_configuration_or_a_list_of_problems(text: str) -> None:
     assert is_config_or_lines(outcome(text.encode()))
 
 
@@ -678,14 +678,14 @@ def test_any_toml_like_text_is_a_configuration_or_a_list_of_lines(text: str) -> 
 @given(st.binary(max_size=60) | st.text(max_size=60).map(lambda text: text.encode("utf-8")))
 @settings(max_examples=300)
 @example(b"\xef\xbb\xbf[robot]")
-def test_any_bytes_are_a_configuration_or_a_list_of_lines(data: bytes) -> None:
+def test_any_bytes_give_a_configuration_or_a_list_of_problems(data: bytes) -> None:
     assert is_config_or_lines(outcome(data))
 
 
 @pytest.mark.slow
 @given(data=st.data())
 @settings(max_examples=150)
-def test_the_reference_file_with_a_piece_changed_is_a_configuration_or_a_list_of_lines(
+def test_a_damaged_reference_file_gives_a_configuration_or_a_list_of_problems(
     data: st.DataObject,
 ) -> None:
     good = REFERENCE.read_bytes()
@@ -703,7 +703,7 @@ def test_the_reference_file_with_a_piece_changed_is_a_configuration_or_a_list_of
         '"\\u001b[2J" = 1',
     ],
 )
-def test_a_key_with_control_characters_is_still_one_printable_line(text: str) -> None:
+def test_a_key_with_control_characters_is_reported_in_one_printable_line(text: str) -> None:
     (line,) = problems_of(text)
     assert line.isprintable()
 
@@ -719,7 +719,7 @@ def test_a_key_with_control_characters_is_still_one_printable_line(text: str) ->
         b"a" + b".a" * 3000 + b" = 1",
     ],
 )
-def test_no_number_is_too_long_and_no_nesting_too_deep_to_be_a_line(text: bytes) -> None:
+def test_a_very_long_number_or_very_deep_nesting_gives_one_problem(text: bytes) -> None:
     assert len(problems_of(text)) == 1
 
 
@@ -732,7 +732,9 @@ def test_a_certificate_may_have_any_name_that_fits_into_a_key(name: str) -> None
 
 
 @each("name", ["", "a/b", "a*", "a$b", "a#b", "a?b", "@a", "a[b]", "two\\nlines", "x" * 65])
-def test_a_certificate_whose_name_fits_into_no_key_is_refused_with_what_would(name: str) -> None:
+def test_a_certificate_name_that_fits_into_no_key_is_refused_with_the_valid_characters(
+    name: str,
+) -> None:
     (problem,) = problems_of(f'[access]\noperators = ["{name}"]')
     assert problem.startswith("access.operators = ")
     assert "letters, digits" in problem

@@ -8,7 +8,7 @@ from acsard.core.config.partial import InvalidKeyError, mistakes, view_without
 from acsard.core.config.settings import Config
 
 
-def test_what_is_not_spoilt_reads_as_ever() -> None:
+def test_valid_keys_are_readable_beside_invalid_ones() -> None:
     seen = view_without(Config(), {"mcu.wheels.front_left", "limits"})
     assert seen.mcu.baud_rate == 115200
     assert seen.mcu.wheels.front_right == "+a"
@@ -23,13 +23,13 @@ def test_what_is_not_spoilt_reads_as_ever() -> None:
         lambda config: config.limits.linear_speed,
     ],
 )
-def test_what_is_spoilt_or_rests_on_it_cannot_be_read(read: object) -> None:
+def test_invalid_keys_and_values_derived_from_them_cannot_be_read(read: object) -> None:
     seen = view_without(Config(), {"mcu.baud_rate", "mcu.link_check", "limits"})
     assert callable(read)
     with pytest.raises(InvalidKeyError):
         read(seen)
 
 
-def test_rules_that_can_be_asked_are() -> None:
+def test_rules_that_need_no_invalid_key_are_applied() -> None:
     rules = (lambda c: [str(c.mcu.line_bytes)], lambda c: [c.robot.id], lambda c: [c.log.level])
     assert mistakes(rules, view_without(Config(), {"mcu.link_check"})) == ["acsar", "info"]

@@ -75,7 +75,7 @@ def test_the_bus_is_loopback_only_and_not_on_the_port_of_routers() -> None:
     assert not bus.insecure
 
 
-def test_wheels_and_joints_have_the_four_wheels_in_their_order() -> None:
+def test_the_wheel_map_and_the_joints_have_the_four_wheels_in_the_standard_order() -> None:
     assert WheelMap.__struct_fields__ == WHEELS
     assert JointsConfig.__struct_fields__ == WHEELS
     assert JointsConfig().as_tuple() == tuple(f"{wheel}_wheel_joint" for wheel in WHEELS)
@@ -88,7 +88,7 @@ def test_every_table_is_frozen() -> None:
 
 
 @each("key", NUMBERS)
-def test_every_number_has_a_range_and_takes_its_ends(key: Key) -> None:
+def test_every_number_has_a_range_that_includes_its_bounds(key: Key) -> None:
     (kind, *_) = key.numbers()
     assert kind.ge is not None
     assert kind.le is not None
@@ -97,7 +97,7 @@ def test_every_number_has_a_range_and_takes_its_ends(key: Key) -> None:
 
 
 @each("key", NUMBERS)
-def test_no_number_beyond_its_range_is_taken(key: Key) -> None:
+def test_no_number_beyond_its_range_is_accepted(key: Key) -> None:
     (kind, *_) = key.numbers()
     assert kind.ge is not None
     assert kind.le is not None
@@ -117,7 +117,7 @@ def test_the_ranges_themselves_are_finite(key: Key) -> None:
 
 
 @each("key", KEYS)
-def test_every_default_is_a_value_the_key_takes(key: Key) -> None:
+def test_every_default_is_a_valid_value_of_its_key(key: Key) -> None:
     if not key.field.required:
         assert msgspec.convert(key.field.default, key.field.type, strict=True) == key.field.default
 
@@ -128,12 +128,12 @@ def test_a_name_is_letters_digits_underscore_and_minus(name: str) -> None:
 
 
 @each("name", ["", "x" * 33, "a b", "a/b", "*", "**", "$*", "é", "a.b", "#", "?"])
-def test_a_name_that_would_mean_something_in_a_key_is_refused(name: str) -> None:
+def test_a_name_with_characters_that_are_special_in_keys_is_refused(name: str) -> None:
     assert build(Source, {"name": name, "priority": 1}, "t", []) is None
 
 
 @each("frame", ["", "/odom", "a b", "x" * 65, "é", "a-b"])
-def test_a_frame_name_that_tf2_would_not_take_is_refused(frame: str) -> None:
+def test_a_frame_name_that_tf2_would_refuse_is_refused(frame: str) -> None:
     assert build(JointsConfig, {"front_left": frame}, "t", []) is None
 
 
@@ -142,11 +142,11 @@ def test_a_frame_name_may_have_a_prefix() -> None:
 
 
 @each("baud", [300, 14400, 230400, 0, -9600])
-def test_only_the_baud_rates_of_the_board_are_taken(baud: int) -> None:
+def test_a_baud_rate_that_the_board_does_not_support_is_refused(baud: int) -> None:
     assert build(McuConfig, {"baud_rate": baud}, "t", []) is None
 
 
-def test_a_control_rate_is_taken_as_it_is_written() -> None:
+def test_a_numeric_control_rate_is_used_unchanged() -> None:
     assert Config(control=ControlConfig(rate=50)).rate_hz == 50.0
 
 
@@ -162,7 +162,7 @@ def test_a_control_rate_is_taken_as_it_is_written() -> None:
         (115200, False, 100.0),
     ],
 )
-def test_an_automatic_rate_takes_at_most_eighty_percent_of_the_wire(
+def test_an_automatic_rate_uses_at_most_80_percent_of_the_wire(
     baud: Any, trailing_comma: bool, rate: float
 ) -> None:
     mcu = McuConfig(baud_rate=baud, trailing_comma=trailing_comma)

@@ -32,7 +32,7 @@ KEYS: dict[str, object] = {
         "[bus]\nmode = 'peer'\n[mcu]\n\n[drive]\nwheel_radius = 0.1\n",
     ],
 )
-def test_keys_are_set_however_the_file_is_written(text: str) -> None:
+def test_keys_are_set_in_any_style_of_toml_file(text: str) -> None:
     after = edited(text, KEYS)
     config = parse(after.encode())
     assert (config.mcu.baud_rate, config.mcu.trailing_comma) == (57600, True)
@@ -51,7 +51,7 @@ def test_keys_are_set_however_the_file_is_written(text: str) -> None:
         ("[mcu]\nbaud = 3\n", {"mcu.baud_rate": 57600}),
     ],
 )
-def test_what_would_not_check_is_not_written(text: str, keys: dict[str, object]) -> None:
+def test_an_edit_that_makes_the_file_invalid_is_refused(text: str, keys: dict[str, object]) -> None:
     with pytest.raises((ConfigError, ValueError)):
         edited(text, keys)
 
@@ -79,13 +79,13 @@ operators = [
 
 
 @each("text", ["", "[bus]\n", "bus.tls = ''\n", '[bus]\nlisten = [\n  "tcp/[::1]:1",  # here\n]\n'])
-def test_a_list_is_set_as_any_other_value(text: str) -> None:
+def test_a_list_is_set_like_any_other_value(text: str) -> None:
     endpoints = ["tcp/127.0.0.1:7448", "tls/0.0.0.0:7449"]
     after = edited(text, {"bus.listen": endpoints, "bus.tls": "/etc/acsard/tls"})
     assert parse(after.encode()).bus.listen == tuple(endpoints)
 
 
-def test_windows_line_ends_stay() -> None:
+def test_windows_line_ends_are_kept() -> None:
     before = "# mine\r\n[mcu]\r\nport = 'sim' # here\r\n"
     after = edited(before, KEYS)
     assert after.startswith(before)
@@ -93,7 +93,7 @@ def test_windows_line_ends_stay() -> None:
     assert "\r\r" not in after
 
 
-def test_what_the_library_cannot_do_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_of_the_toml_library_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(text: str) -> None:
         raise NonExistentKey("mcu")
 

@@ -30,13 +30,13 @@ def printed(config: Config) -> str:
 
 
 @each("text", CONFIGS)
-def test_what_is_printed_means_the_same_configuration(text: bytes) -> None:
+def test_a_printed_configuration_reads_back_as_the_same_configuration(text: bytes) -> None:
     config = parse(text)
     assert from_builtins(tomllib.loads(printed(config))) == config
     assert parse(printed(config).encode()) == config
 
 
-def test_a_printed_configuration_is_printed_the_same_again() -> None:
+def test_printing_a_printed_configuration_gives_the_same_text() -> None:
     text = printed(parse(CONFIGS[4]))
     assert printed(parse(text.encode())) == text
 
@@ -66,7 +66,7 @@ def test_a_delete_character_survives_printing() -> None:
     assert parse("\n".join(document(effective(config))).encode()) == config
 
 
-def test_some_keys_are_toml_by_table() -> None:
+def test_an_excerpt_of_keys_is_toml_grouped_by_table() -> None:
     keys = {"mcu.wheels.rear_left": "-c", "mcu.baud_rate": 57600, "control.rate": "auto"}
     text = "\n".join(excerpt(keys))
     assert tomllib.loads(text) == {

@@ -48,11 +48,11 @@ def made(table: object) -> Table:
     return result
 
 
-def test_an_empty_table_is_all_defaults() -> None:
+def test_an_empty_table_gives_all_defaults() -> None:
     assert made({}) == Table()
 
 
-def test_every_kind_of_value_is_taken_over() -> None:
+def test_every_kind_of_value_is_accepted() -> None:
     table = {
         "toes": 5,
         "wood": "ash",
@@ -75,7 +75,7 @@ def test_every_kind_of_value_is_taken_over() -> None:
     )
 
 
-def test_a_whole_number_stands_for_a_float() -> None:
+def test_a_whole_number_is_accepted_as_a_float() -> None:
     assert made({"speed": 3}).speed == 3.0
 
 
@@ -108,19 +108,19 @@ def test_a_whole_number_stands_for_a_float() -> None:
         ({"qqq": 4}, "qqq = 4: unknown key; known here: toes, wood, heavy, pair, marks, speed, "),
     ],
 )
-def test_a_mistake_gives_one_line_with_key_value_and_mend(table: object, line: str) -> None:
+def test_a_mistake_gives_one_line_with_key_value_and_remedy(table: object, line: str) -> None:
     (problem,) = problems_of(table)
     assert problem.startswith(line)
 
 
 @pytest.mark.parametrize("bad", [math.inf, -math.inf, math.nan])
-def test_a_number_that_is_not_finite_is_refused_wherever_it_stands(bad: float) -> None:
+def test_a_number_that_is_not_finite_is_refused_also_in_lists_and_tables(bad: float) -> None:
     assert len(problems_of({"speed": bad})) == 1
     assert len(problems_of({"pair": [1.0, bad]})) == 1
     assert len(problems_of({"first": {"name": "x", "length": bad}})) == 1
 
 
-def test_every_mistake_is_reported_at_once() -> None:
+def test_all_mistakes_are_reported_together() -> None:
     found = problems_of({"toes": 9, "wood": "elm", "legs": [{}, {"nam": 1}], "x": 0})
     starts = (
         "x = 0",
@@ -134,7 +134,7 @@ def test_every_mistake_is_reported_at_once() -> None:
     assert all(any(line.startswith(start) for line in found) for start in starts)
 
 
-def test_a_long_value_is_shown_cut_to_eighty_characters() -> None:
+def test_a_long_value_is_shown_truncated_to_80_characters() -> None:
     assert show("x" * 500) == '"' + "x" * 76 + "..."
 
 

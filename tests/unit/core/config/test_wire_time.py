@@ -28,7 +28,7 @@ bauds = st.sampled_from([9600, 19200, 38400, 57600, 115200])
 
 
 @each(("baud", "count", "ms", "most"), TABLE)
-def test_a_line_takes_as_long_as_the_table_says(
+def test_the_duration_of_a_line_is_that_of_the_table(
     baud: int, count: int, ms: float, most: int
 ) -> None:
     assert wire_ns(count, baud) / MS == pytest.approx(ms, rel=0.005)
@@ -41,12 +41,12 @@ def test_the_highest_rate_is_the_one_in_the_table(
     assert highest_rate(baud, count) == most
 
 
-def test_a_command_is_as_long_as_the_seed_line_in_either_dialect() -> None:
+def test_a_command_has_the_length_of_the_seed_line_in_both_dialects() -> None:
     assert line_bytes(trailing_comma=False) == len(SEED_LINE + b"\r\n") == 33
     assert line_bytes(trailing_comma=True) == len(SEED_LINE + b",\r\n") == 34
 
 
-def test_the_longest_line_of_either_direction_is_what_counts() -> None:
+def test_the_line_length_is_that_of_the_longer_direction() -> None:
     assert line_bytes(False, check=True) == 41
     assert line_bytes(True, check=True) == 42
     # the reply is longer; the command has 42
@@ -60,7 +60,7 @@ def test_100_hz_take_29_percent_of_115200_baud_and_more_than_all_of_9600() -> No
     assert wire_use(100.0, 9600, 33) == 3.4375
 
 
-def test_23_hz_are_comfortable_at_9600_baud() -> None:
+def test_23_hz_is_the_highest_comfortable_rate_at_9600_baud() -> None:
     assert highest_rate(9600, 33, COMFORTABLE_USE) == 23  # 0.8 x 9600 / 330 = 23.27
 
 

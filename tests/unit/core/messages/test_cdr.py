@@ -179,7 +179,7 @@ def odometry(frame: str, child: str) -> Odometry:
         ),
     ],
 )  # fmt: skip
-def test_a_message_is_exactly_these_bytes(message: Struct, golden: str) -> None:
+def test_a_message_has_the_expected_bytes(message: Struct, golden: str) -> None:
     assert encoded(message) == LITTLE + bytes.fromhex(golden)
     assert Cdr(type(message)).decode(LITTLE + bytes.fromhex(golden)) == message
 
@@ -196,13 +196,13 @@ def test_a_message_is_exactly_these_bytes(message: Struct, golden: str) -> None:
         (Empty(), 5),
     ],
 )
-def test_a_message_has_this_size(message: Struct, size: int) -> None:
+def test_a_message_has_the_expected_size(message: Struct, size: int) -> None:
     assert len(encoded(message)) == size
 
 
 @each("frame", range(10))
 @each("child", range(10))
-def test_the_size_of_odometry_follows_from_its_two_names(frame: int, child: int) -> None:
+def test_the_size_of_odometry_follows_from_its_two_frame_names(frame: int, child: int) -> None:
     names = -(-(8 + 4 + frame + 1) // 4) * 4 + 4 + child + 1
     size = 4 + -(-names // 8) * 8 + 680
     assert len(encoded(odometry("f" * frame, "c" * child))) == size
@@ -261,7 +261,7 @@ many = pytest.mark.parametrize("cls", MESSAGES, ids=lambda cls: cls.__name__)
 
 @many
 @given(st.data())
-def test_what_we_write_is_byte_for_byte_what_ros_writes(
+def test_an_encoded_message_is_byte_for_byte_that_of_ros(
     cls: type[Message], data: st.DataObject
 ) -> None:
     message = data.draw(MESSAGES[cls])
@@ -270,7 +270,7 @@ def test_what_we_write_is_byte_for_byte_what_ros_writes(
 
 @many
 @given(st.data())
-def test_ros_reads_what_we_write(cls: type[Message], data: st.DataObject) -> None:
+def test_ros_decodes_every_encoded_message(cls: type[Message], data: st.DataObject) -> None:
     message = data.draw(MESSAGES[cls])
     assert oracle_value(encoded(message), cls) == message
 
@@ -278,31 +278,31 @@ def test_ros_reads_what_we_write(cls: type[Message], data: st.DataObject) -> Non
 @many
 @pytest.mark.parametrize("little", [True, False])
 @given(st.data())
-def test_we_read_what_ros_writes_in_either_byte_order(
+def test_messages_encoded_by_ros_are_decoded_in_both_byte_orders(
     cls: type[Message], little: bool, data: st.DataObject
 ) -> None:
     message = data.draw(MESSAGES[cls])
     assert Cdr(cls).decode(oracle_bytes(message, little)) == message
 
 
-def test_a_request_without_fields_is_one_byte_as_ros_writes_it() -> None:
+def test_a_request_without_fields_is_encoded_as_one_byte_like_in_ros() -> None:
     request = STORE.types["std_srvs/msg/Request"](nothing=0)
     assert bytes(STORE.serialize_cdr(request, "std_srvs/msg/Request")) == encoded(Empty())
 
 
 @pytest.mark.parametrize("size", [4, 5, 8])
-def test_a_request_without_fields_is_read_whatever_it_has_for_a_body(size: int) -> None:
+def test_a_request_without_fields_is_decoded_with_any_body_length(size: int) -> None:
     assert Cdr(Empty).decode((LITTLE + bytes(4))[:size]) == Empty()
 
 
 @each("size", range(4))
-def test_a_request_without_fields_needs_its_whole_header_all_the_same(size: int) -> None:
+def test_a_request_without_fields_needs_a_complete_header(size: int) -> None:
     with pytest.raises(CdrError):
         Cdr(Empty).decode(LITTLE[:size])
 
 
 @each("count", [0, 1, 100, 1000])
-def test_long_lists_are_what_ros_writes_too(count: int) -> None:
+def test_long_lists_are_encoded_like_in_ros(count: int) -> None:
     moved = Transform(Vector3(1.0), Quaternion())
     transforms = [
         TransformStamped(Header(Time(i), "f" * (i % 9)), "c", moved) for i in range(count)
@@ -322,21 +322,21 @@ def test_a_level_is_one_unsigned_byte(level: int) -> None:
 
 
 @pytest.mark.parametrize("length", [70_000, 1_000_000])
-def test_a_very_long_text_is_what_ros_writes_too(length: int) -> None:
+def test_a_very_long_text_is_encoded_like_in_ros(length: int) -> None:
     message = ServiceReply(True, "ä" * length)
     assert encoded(message) == oracle_bytes(message)
     assert Cdr(ServiceReply).decode(encoded(message)) == message
 
 
 @each("value", [math.inf, -math.inf, -0.0, 5e-324, 1.7976931348623157e308])
-def test_odd_numbers_come_through_bit_for_bit(value: float) -> None:
+def test_special_floats_are_decoded_and_encoded_bit_for_bit(value: float) -> None:
     message = Twist(Vector3(value), Vector3(z=value))
     got = Cdr(Twist).decode(oracle_bytes(message))
     assert struct.pack("<d", got.linear.x) == struct.pack("<d", value)
     assert encoded(got) == oracle_bytes(message)
 
 
-def test_nan_comes_through_as_nan_for_those_above_to_refuse() -> None:
+def test_nan_is_decoded_as_nan_and_not_refused_by_the_decoder() -> None:
     payload = LITTLE + struct.pack("<6d", math.nan, 0, 0, 0, 0, 0)
     assert math.isnan(Cdr(Twist).decode(payload).linear.x)
 
@@ -357,7 +357,7 @@ class TextThenNumbers(Struct, frozen=True):
 
 @each("length", range(10))
 @each("head", [LITTLE, BIG])
-def test_a_number_after_a_text_of_any_length_stands_at_a_multiple_of_its_size(
+def test_a_number_after_a_text_of_any_length_is_aligned_to_its_size(
     length: int, head: bytes
 ) -> None:
     order = "<" if head == LITTLE else ">"
@@ -401,7 +401,7 @@ def test_padding_is_never_read(frame: int) -> None:
 
 
 @each("surplus", [1, 3, 4, 7, 1000])
-def test_bytes_after_the_message_are_padding(surplus: int) -> None:
+def test_bytes_after_the_message_are_ignored(surplus: int) -> None:
     for payload, message in valid():
         assert Cdr(type(message)).decode(payload + b"\xff" * surplus) == message
 
@@ -417,7 +417,7 @@ def test_the_options_of_the_header_do_not_matter(options: bytes) -> None:
     [b"", b"\0", b"\0\1", b"\0\1\0", b"\0\2\0\0", b"\0\3\0\0", b"\0\6\0\0", b"\0\7\0\0",
      b"\1\0\0\0", b"\1\1\0\0", b"\xff" * 4, b"{}\0\0"],
 )  # fmt: skip
-def test_no_other_header_is_read(head: bytes) -> None:
+def test_an_unknown_header_is_refused(head: bytes) -> None:
     with pytest.raises(CdrError, match="header"):
         Cdr(Twist).decode(head + bytes(48) if len(head) == 4 else head)
 
@@ -469,7 +469,7 @@ def test_a_run_of_numbers_is_aligned_field_by_field() -> None:
 
 
 @each("length", range(9))
-def test_a_run_is_aligned_wherever_it_begins(length: int) -> None:
+def test_a_run_of_numbers_is_aligned_at_any_start_position(length: int) -> None:
     class After(Struct, frozen=True):
         text: str
         mixed: Mixed
@@ -482,12 +482,12 @@ def test_a_run_is_aligned_wherever_it_begins(length: int) -> None:
     assert Cdr(After).decode(LITTLE + body) == message
 
 
-def test_sequences_arrays_and_structs_in_them_come_back() -> None:
+def test_sequences_and_arrays_of_structs_are_decoded_as_they_were_encoded() -> None:
     assert Cdr(Outer).decode(encoded(OUTER)) == OUTER
 
 
 def test_sequences_arrays_and_structs_are_written_item_by_item_in_order() -> None:
-    """Reads the payload value by value with only the struct module."""
+    """Read the payload value by value with only the struct module."""
     payload = encoded(OUTER)
     at = 4
 
@@ -521,7 +521,7 @@ def test_sequences_arrays_and_structs_are_written_item_by_item_in_order() -> Non
 
 
 @pytest.mark.parametrize("count", [0, 1, 3])
-def test_an_array_of_another_length_than_its_own_cannot_be_written(count: int) -> None:
+def test_an_array_of_the_wrong_length_cannot_be_encoded(count: int) -> None:
     with pytest.raises(ValueError, match=f"{count} items in an array of 2"):
         encoded(Outer([], [], [], [], [0.0] * count, ["", ""], MIXED, True))
 
@@ -547,7 +547,7 @@ class Flags(Struct, frozen=True):
     flags: list[Flag]
 
 
-def test_a_sequence_of_structs_of_one_byte_comes_back() -> None:
+def test_a_sequence_of_one_byte_structs_is_decoded_as_it_was_encoded() -> None:
     for count in range(9):
         message = Flags([Flag(i % 2 == 0) for i in range(count)])
         assert Cdr(Flags).decode(encoded(message)) == message
@@ -561,7 +561,7 @@ class Rows(Struct, frozen=True):
     rows: list[Row]
 
 
-def test_sequences_within_a_sequence_come_back() -> None:
+def test_nested_sequences_are_decoded_as_they_were_encoded() -> None:
     rows = [Rows.Row([0.5] * n, ["n"] * (3 - n)) for n in range(4)]
     assert Cdr(Rows).decode(encoded(Rows(rows))) == Rows(rows)
 
@@ -611,7 +611,7 @@ class ListOfWholes(Struct):
     [MaybeText, NumberOrText, Map, Raw, Whole, Moment, Anything, ListOfMaps, ListOfLists,
      ListOfWholes, RobotState, int, dict, str, list[float]],
 )  # fmt: skip
-def test_a_type_that_cdr_cannot_tell_is_a_type_error(cls: Any) -> None:
+def test_a_type_without_a_cdr_form_is_a_type_error(cls: Any) -> None:
     with pytest.raises(TypeError):
         Cdr(cls)
 
@@ -623,7 +623,7 @@ def stamp(nanosec: int, order: str = "<") -> bytes:
     return (LITTLE if order == "<" else BIG) + struct.pack(f"{order}iI", 0, nanosec)
 
 
-def test_a_second_has_no_more_nanoseconds_than_there_are() -> None:
+def test_a_time_with_a_billion_or_more_nanoseconds_is_refused() -> None:
     for order in "<>":
         assert Cdr(Time).decode(stamp(999_999_999, order)) == Time(0, 999_999_999)
         for bad in (1_000_000_000, 2**31, 2**32 - 1):
@@ -632,7 +632,7 @@ def test_a_second_has_no_more_nanoseconds_than_there_are() -> None:
 
 
 @each("value", range(256))
-def test_a_boolean_is_zero_or_one(value: int) -> None:
+def test_a_boolean_other_than_zero_or_one_is_refused(value: int) -> None:
     payload = LITTLE + bytes([value, 0, 0, 0]) + struct.pack("<I1s", 1, b"\0")
     if value < 2:
         assert Cdr(ServiceReply).decode(payload) == ServiceReply(bool(value), "")
@@ -642,7 +642,7 @@ def test_a_boolean_is_zero_or_one(value: int) -> None:
 
 
 @pytest.mark.parametrize("value", [2, 0xFF])
-def test_a_boolean_in_a_sequence_is_zero_or_one_too(value: int) -> None:
+def test_a_boolean_other_than_zero_or_one_is_refused_in_a_sequence(value: int) -> None:
     payload = bytearray(encoded(OUTER))
     payload[9] = value
     with pytest.raises(CdrError):
@@ -668,17 +668,17 @@ def reply_saying(length: int, raw: bytes) -> bytes:
         (3, b"\xc0\x80\0"),
     ],
 )
-def test_a_string_without_its_end_or_not_utf8_is_refused(length: int, raw: bytes) -> None:
+def test_a_string_without_terminator_or_not_utf8_is_refused(length: int, raw: bytes) -> None:
     with pytest.raises(CdrError):
         Cdr(ServiceReply).decode(reply_saying(length, raw))
 
 
-def test_a_string_of_no_bytes_at_all_is_empty() -> None:
+def test_a_string_of_length_zero_is_empty() -> None:
     assert Cdr(ServiceReply).decode(reply_saying(0, b"")) == ServiceReply(True, "")
 
 
 @each("length", [2**32 - 1, 2**31, 2**31 - 1, 10**6, 4])
-def test_a_string_longer_than_what_there_is_is_refused(length: int) -> None:
+def test_a_string_longer_than_the_payload_is_refused(length: int) -> None:
     with pytest.raises(CdrError, match=str(length)):
         Cdr(ServiceReply).decode(reply_saying(length, b"ok\0"))
 
@@ -694,7 +694,7 @@ NO_ITEMS: list[tuple[Message, int]] = [
 @each(("empty", "at"), NO_ITEMS)
 @each("length", [2**32 - 1, 2**31, 2**29, 2**20, 1])
 @each("surplus", [0, 3])
-def test_a_sequence_longer_than_what_there_is_is_refused_before_it_is_made(
+def test_a_sequence_longer_than_the_payload_is_refused_before_it_is_allocated(
     empty: Message, at: int, length: int, surplus: int
 ) -> None:
     payload = encoded(empty)[: 4 + at] + struct.pack("<I", length) + bytes(surplus)
@@ -714,7 +714,7 @@ class Numbers(Struct, frozen=True):
     items: list[float] = []
 
 
-def test_one_item_more_than_there_are_is_refused() -> None:
+def test_a_sequence_length_of_one_item_too_many_is_refused() -> None:
     message = JointState(Header(), ["a", "b"], [1.0, 2.0], [3.0], [])
     payload = encoded(message)
     at = payload.index(struct.pack("<d", 3.0)) - 8  # four bytes of padding lie in between
@@ -743,7 +743,7 @@ class Bounded(Struct, frozen=True):
 
 @each("count", range(6))
 @each("name", ["numbers", "texts", "nodes"])
-def test_a_bounded_sequence_holds_as_many_items_as_it_may_and_no_more(
+def test_a_bounded_sequence_with_more_items_than_its_bound_is_refused(
     name: str, count: int
 ) -> None:
     item: dict[str, Any] = {"numbers": 0.5, "texts": "a", "nodes": Node("b")}
@@ -767,7 +767,7 @@ def test_a_bounded_sequence_holds_as_many_items_as_it_may_and_no_more(
         (SetRequest, b"", 128),
     ],
 )
-def test_too_many_items_are_refused_before_one_of_them_is_decoded(
+def test_too_many_items_are_refused_before_any_item_is_decoded(
     cls: type[Struct], before: bytes, most: int, order: str
 ) -> None:
     if order == ">" and before:
@@ -782,7 +782,7 @@ def test_too_many_items_are_refused_before_one_of_them_is_decoded(
 
 
 @pytest.mark.parametrize(("cls", "most"), [(JointState, 64), (Names, 128), (ListRequest, 128)])
-def test_as_many_names_as_there_may_be_are_read(cls: type[Struct], most: int) -> None:
+def test_the_largest_permitted_number_of_names_is_decoded(cls: type[Struct], most: int) -> None:
     made: dict[type[Struct], Struct] = {
         JointState: JointState(Header(), ["j"] * most, [0.5] * most, [0.5] * most, [0.5] * most),
         Names: Names(["n"] * most),
@@ -800,7 +800,7 @@ def test_each_list_of_a_joint_state_is_bounded(field: str) -> None:
 
 
 @pytest.mark.slow
-def test_no_memory_is_kept_for_each_length_that_a_stranger_may_send() -> None:
+def test_decoding_many_sequence_lengths_keeps_no_memory_per_length() -> None:
     codec = Cdr(Numbers)
     payloads = [
         # This project's decoder would prepare `codec`.
@@ -852,7 +852,7 @@ def valid() -> list[tuple[bytes, Message]]:
     ]
 
 
-def test_a_payload_that_is_cut_anywhere_is_refused() -> None:
+def test_a_payload_that_is_truncated_at_any_position_is_refused() -> None:
     for payload, message in valid():
         codec = Cdr(type(message))
         for size in range(len(payload)):
@@ -908,7 +908,7 @@ def damaged(payload: bytes, dice: random.Random) -> bytes:
     "count",
     [20_000, pytest.param(1_000_000, marks=[pytest.mark.soak, pytest.mark.timeout(1800)])],
 )
-def test_damaged_payloads_raise_nothing_but_cdr_errors_and_yield_no_more_than_they_hold(
+def test_damaged_payloads_raise_only_cdr_errors_and_decode_to_no_more_than_their_size(
     count: int,
 ) -> None:
     dice, began, seen = random.Random(8), time.perf_counter(), Counter[str]()
@@ -936,7 +936,7 @@ def test_damaged_payloads_raise_nothing_but_cdr_errors_and_yield_no_more_than_th
 @pytest.mark.slow
 @given(st.binary(max_size=200), st.sampled_from([LITTLE, BIG, b""]), st.sampled_from(samples()))
 @settings(max_examples=300)
-def test_any_bytes_are_a_message_or_a_cdr_error(body: bytes, head: bytes, like: Message) -> None:
+def test_any_bytes_give_a_message_or_a_cdr_error(body: bytes, head: bytes, like: Message) -> None:
     try:
         got = Cdr(type(like)).decode(head + body)
     except CdrError:

@@ -44,7 +44,7 @@ def test_a_builder_makes_the_struct_of_its_leaves() -> None:
 
 
 @each("kind", [dict, list[int], float, int])
-def test_what_is_no_struct_is_a_type_error(kind: object) -> None:
+def test_a_type_that_is_not_a_struct_is_a_type_error(kind: object) -> None:
     with pytest.raises(TypeError, match="not a struct"):
         struct_info(kind)
 
@@ -81,7 +81,7 @@ def test_an_int_without_a_width_is_a_type_error(kind: object) -> None:
         (Meta(ge=-3, le=3), (-3, 3)),
     ],
 )
-def test_the_bounds_of_an_int_are_the_least_and_the_greatest_it_may_be(
+def test_the_bounds_of_an_int_are_its_smallest_and_largest_permitted_value(
     meta: Meta, bounds: tuple[float, float] | None
 ) -> None:
     assert limit(field(Annotated[int, meta])) == bounds
@@ -91,6 +91,6 @@ def test_only_an_int_has_bounds() -> None:
     assert limit(field(Annotated[float, Meta(ge=0.0)])) is None
 
 
-def test_metadata_is_looked_through() -> None:
+def test_the_plain_type_is_found_behind_its_metadata() -> None:
     assert isinstance(plain(field(Annotated[int, Meta(extra={"cdr": "I"})])), inspect.IntType)
     assert isinstance(plain(field(str)), inspect.StrType)

@@ -18,13 +18,13 @@ NOW_NS = 1_700_000_000_000_000_000
         (-2, 2, "expired 2 days ago: TLS refuses every client"),
     ],
 )
-def test_it_is_a_warning_a_month_before_and_an_error_after(
+def test_expiry_is_a_warning_for_a_month_before_the_end_and_an_error_after_it(
     days: int, level: int, words: str
 ) -> None:
     assert expiry({"": NOW_NS + days * DAY_NS}, NOW_NS) == (level, words)
 
 
-def test_the_certificate_that_ends_first_is_named_unless_it_is_the_robot_s_own() -> None:
+def test_the_certificate_that_expires_first_is_named_unless_it_is_the_robot_s_own() -> None:
     ends = {"": NOW_NS + 10 * DAY_NS, "the authority": NOW_NS + 400 * DAY_NS}
     assert expiry(ends, NOW_NS)[1] == "expires in 10 days"
     ends["the router tls/router.local:7447"] = NOW_NS - 3 * DAY_NS
@@ -35,13 +35,13 @@ def test_the_certificate_that_ends_first_is_named_unless_it_is_the_robot_s_own()
     assert expiry(ends, NOW_NS) == (2, told)
 
 
-def test_an_authority_that_ends_with_the_certificates_of_a_gateway_is_named() -> None:
+def test_an_authority_that_expires_together_with_its_gateway_certificate_is_named() -> None:
     """The gateway reports the earlier end of its own certificate and of its authority's."""
     ends = {"": NOW_NS + 10 * DAY_NS, "the authority": NOW_NS + 10 * DAY_NS}
     assert expiry(ends, NOW_NS) == (1, "expires in 10 days (certificate of the authority)")
 
 
-def test_an_end_that_nobody_can_read_is_a_warning_with_its_mend() -> None:
+def test_an_unreadable_certificate_is_a_warning_with_the_remedy() -> None:
     level, words = expiry({}, NOW_NS)
     assert level == 1
     assert "`acsard doctor`" in words

@@ -25,18 +25,18 @@ def diagonal(cells: list[float]) -> tuple[float, ...]:
     return tuple(cells[::7])
 
 
-def test_by_model_the_twist_has_the_reports_variances() -> None:
+def test_with_the_model_covariance_the_twist_has_the_estimated_variances() -> None:
     assert diagonal(covariances().of_twist(OF_TWIST)) == (0.01, 0.02, 0.3, 0.4, 0.5, 0.06)
 
 
-def test_constant_is_what_is_configured() -> None:
+def test_with_the_constant_covariance_pose_and_twist_have_the_configured_variances() -> None:
     constant = covariances(covariance="constant")
     assert diagonal(constant.of_pose(OF_POSE)) == POSE
     assert diagonal(constant.of_twist(OF_TWIST)) == TWIST
 
 
 @pytest.mark.parametrize(("configured", "published"), [(0.0, 1e-6), (1e9, 1e6), (2.0, 2.0)])
-def test_what_wheels_cannot_measure_is_in_a_range_that_others_can_take(
+def test_variances_of_unmeasured_axes_are_limited_to_a_usable_range(
     configured: float, published: float
 ) -> None:
     rows = (0.1, 0.1, configured, configured, configured, 0.1)

@@ -64,7 +64,7 @@ def values(one: DiagnosticStatus) -> dict[str, str]:
 # names, by which rqt_robot_monitor identifies its rows
 
 
-def test_every_status_names_the_robot_it_is_of() -> None:
+def test_every_status_names_its_robot() -> None:
     found = rows()
     assert {one.hardware_id for one in found} == {"r7"}
     assert len({one.name for one in found}) == len(found)
@@ -72,7 +72,7 @@ def test_every_status_names_the_robot_it_is_of() -> None:
 
 @each("mode", ["inactive", "waiting", "stopped", "fault", "shutdown"])
 @each("link", ["up", "stale", "booting", "down"])
-def test_no_row_comes_or_goes_while_the_robot_lives(mode: str, link: str) -> None:
+def test_no_row_appears_or_disappears_in_any_state_of_the_robot(mode: str, link: str) -> None:
     outputs = replace(OUTPUTS, mode=mode, link=link, source="", reason="words")
     snapshot = seen(figures={}, counters={}, sources=(), refused_age_s=0.0, missed_last_minute=9)
     names = [(one.name, one.hardware_id) for one in rows()]
@@ -80,7 +80,7 @@ def test_no_row_comes_or_goes_while_the_robot_lives(mode: str, link: str) -> Non
 
 
 @each("does", ["waiting for rest", "used", "silent", "dead", "not believed"])
-def test_a_gyro_once_configured_has_its_row_whatever_it_does(does: Any) -> None:
+def test_a_configured_gyro_has_a_row_in_each_of_its_states(does: Any) -> None:
     assert [one.name for one in rows(snapshot=seen(gyro=GyroStatus(does)))] == [
         *(one.name for one in rows()),
         "acsard: gyro",
@@ -105,7 +105,7 @@ def test_a_board_that_sends_status_lines_has_a_row(estop: Any, level: int, messa
     }  # fmt: skip
 
 
-def test_a_required_input_has_its_row_before_the_board_reports_it() -> None:
+def test_a_required_emergency_stop_has_a_row_before_the_board_reports_it() -> None:
     config = replace(CONFIG, safety=SafetyConfig(estop="required"))
     one = row("board", config)
     assert (one.level, one.message) == (ERROR, MISSING)
@@ -121,7 +121,7 @@ def test_a_required_input_has_its_row_before_the_board_reports_it() -> None:
         ((True, True), SILENT_BUMPERS, ERROR, SILENT_BUMPERS),
     ],
 )
-def test_the_row_of_the_board_has_its_bumpers(
+def test_the_row_of_the_board_shows_the_state_of_its_bumpers(
     bumpers: Any, why: str, level: int, message: str
 ) -> None:
     counters = {"bumper_presses": 1, "lines": 9}
@@ -131,7 +131,7 @@ def test_the_row_of_the_board_has_its_bumpers(
     assert values(one) == {"bumper_presses": "1"}
 
 
-def test_bumpers_that_are_ignored_need_no_row() -> None:
+def test_ignored_bumpers_need_no_row() -> None:
     off = replace(BUMPERS, safety=replace(BUMPERS.safety, bumper="off"))
     assert "acsard: board" not in [one.name for one in rows(off)]
 
@@ -188,7 +188,7 @@ def test_a_battery_has_a_row_once_it_is_reported_or_has_thresholds() -> None:
     assert values(one) == {"level": "ok", "volts": "24.00"}
 
 
-def test_a_router_has_its_row_before_anybody_has_looked_whether_it_is_there() -> None:
+def test_a_router_has_a_row_before_the_first_check_of_its_connection() -> None:
     """The row must be there before the first look at the routers.
 
     That look takes half a second, and the monitor would otherwise see a row appear.
@@ -223,7 +223,7 @@ def test_a_lost_router_is_named_although_another_one_was_never_connected() -> No
         ("fault", ERROR),
     ],
 )
-def test_what_is_latched_is_no_ok_and_its_reason_the_message(mode: str, level: int) -> None:
+def test_a_latched_mode_is_not_ok_and_its_reason_is_the_message(mode: str, level: int) -> None:
     one = row("mode", outputs=replace(OUTPUTS, mode=mode, reason="words"))
     assert (one.level, one.message) == (level, "words")
     assert values(one) == {"mode": mode, "source": "app"}
@@ -239,7 +239,7 @@ def test_a_link_that_is_not_up_is_an_error(link: str, level: int) -> None:
 
 
 @pytest.mark.parametrize(("link", "level"), [("up", WARN), ("down", ERROR)])
-def test_the_simulator_is_never_taken_for_a_robot(link: str, level: int) -> None:
+def test_the_row_of_the_link_says_that_the_robot_is_simulated(link: str, level: int) -> None:
     one = row("serial link", Config(), replace(OUTPUTS, link=link))
     assert (one.level, one.message) == (
         level,
@@ -279,7 +279,7 @@ def test_more_than_one_period_in_a_hundred_missed_in_the_last_minute_is_a_warnin
     }
 
 
-def test_what_was_missed_an_hour_ago_is_reported_and_no_warning_any_more() -> None:
+def test_periods_missed_an_hour_ago_are_counted_but_cause_no_warning() -> None:
     one = row("control loop", snapshot=seen(counters={"missed_periods": 100_000}))
     assert (one.level, values(one)["missed_periods"]) == (OK, "100000")
 
@@ -315,7 +315,7 @@ def test_the_commands_name_the_speed_limit_that_slows_the_robot() -> None:
     assert (one.level, one.message) == (OK, "commanded by app; speed limit: 0.3 m/s, set by x")
 
 
-def test_two_programs_on_one_source_are_a_warning_that_names_the_source() -> None:
+def test_two_senders_of_one_source_are_a_warning_that_names_the_source() -> None:
     two = SourceStatus("nav", 10, 0.1, Wait("senders", senders=1))
     alone = SourceStatus("app", 50, 0.1, Wait("nothing"))
     one = row("commands", snapshot=seen(sources=(alone, two)))
@@ -331,7 +331,7 @@ def test_two_programs_on_one_source_are_a_warning_that_names_the_source() -> Non
     assert row("commands", snapshot=seen(sources=(alone,))).level == OK
 
 
-def test_commands_are_a_warning_while_a_source_is_refused_and_say_why() -> None:
+def test_a_refused_source_makes_the_commands_a_warning_with_the_reason() -> None:
     one = row("commands", snapshot=seen(refused_age_s=REFUSED_S / 2))
     assert (one.level, one.message) == (WARN, "commanded by app; refused: source nav: held up")
     later = row("commands", snapshot=seen(refused_age_s=REFUSED_S))

@@ -45,15 +45,15 @@ def test_an_encoding_names_the_format_the_type_and_its_version() -> None:
     assert encoding_name("cdr") == "application/cdr"
 
 
-def test_json_is_the_maps_of_the_ros_message() -> None:
+def test_json_has_the_fields_of_the_ros_message_as_maps() -> None:
     assert encode(TWIST, "json") == AS_JSON
 
 
-def test_msgpack_is_the_same_maps() -> None:
+def test_msgpack_has_the_same_maps_as_json() -> None:
     assert msgspec.msgpack.decode(encode(TWIST, "msgpack")) == msgspec.json.decode(AS_JSON)
 
 
-def test_cdr_is_the_fields_alone_behind_four_bytes() -> None:
+def test_cdr_is_a_header_of_four_bytes_and_the_fields() -> None:
     assert encode(TWIST, "cdr") == AS_CDR
 
 
@@ -68,7 +68,7 @@ def test_cdr_is_the_fields_alone_behind_four_bytes() -> None:
         RobotState(Time(), "", "", 0, 0, 0, 0, 0, [], "", "", [], "", {}),
     ],
 )
-def test_what_is_no_ros_message_has_no_cdr_form(value: object) -> None:
+def test_a_value_that_is_not_a_ros_message_cannot_be_encoded_as_cdr(value: object) -> None:
     with pytest.raises(DecodeError, match=f"{type(value).__name__} is not a ROS message") as caught:
         encode(value, "cdr")
     assert caught.value.reason == "unknown_format"
@@ -86,7 +86,9 @@ def test_a_type_that_is_not_a_ros_message_is_not_decoded_from_cdr(
 
 @each("form", FORMATS)
 @each("named", [True, False])
-def test_a_message_comes_back_with_and_without_its_encoding(form: Format, named: bool) -> None:
+def test_a_message_is_decoded_with_and_without_the_name_of_its_encoding(
+    form: Format, named: bool
+) -> None:
     encoding = encoding_name(form, "Twist") if named else ""
     assert twists.decode(encoding, encode(TWIST, form)) == TWIST
 
@@ -105,7 +107,7 @@ def test_a_message_comes_back_with_and_without_its_encoding(form: Format, named:
     ],
 )
 @each("payload", [AS_JSON, encode(TWIST, "msgpack"), AS_CDR, b"", b"\xff"])
-def test_an_encoding_that_says_so_is_believed(encoding: str, form: str, payload: bytes) -> None:
+def test_a_named_encoding_determines_the_format(encoding: str, form: str, payload: bytes) -> None:
     assert detect(encoding, payload) == form
 
 
@@ -127,7 +129,9 @@ def test_an_encoding_that_says_so_is_believed(encoding: str, form: str, payload:
         (b"\x00\x01\xff\xff{}", "cdr"),
     ],
 )
-def test_without_one_the_first_bytes_decide(encoding: str, payload: bytes, form: str) -> None:
+def test_without_a_named_encoding_the_first_bytes_determine_the_format(
+    encoding: str, payload: bytes, form: str
+) -> None:
     assert detect(encoding, payload) == form
 
 
@@ -138,7 +142,7 @@ def test_without_one_the_first_bytes_decide(encoding: str, payload: bytes, form:
      b"\x00\x03\x00\x00", b"\x01\x00\x00\x00", b"\x00\x07\x00\x00", b"\n\x00\x01",
      b"\xef\xbb\xbf{}"],
 )  # fmt: skip
-def test_what_is_no_json_object_no_msgpack_map_and_no_cdr_is_not_guessed(payload: bytes) -> None:
+def test_bytes_that_match_no_format_are_refused_as_unknown_encoding(payload: bytes) -> None:
     assert refusal("", payload) == "unknown_encoding"
 
 
@@ -160,7 +164,9 @@ def test_what_is_no_json_object_no_msgpack_map_and_no_cdr_is_not_guessed(payload
         (b"{", "malformed"),
     ],
 )
-def test_json_that_is_not_the_message_is_refused_by_reason(payload: bytes, reason: str) -> None:
+def test_json_that_is_not_the_message_is_refused_with_the_reason(
+    payload: bytes, reason: str
+) -> None:
     assert refusal("", payload) == reason
 
 
@@ -180,7 +186,9 @@ def test_json_that_is_not_the_message_is_refused_by_reason(payload: bytes, reaso
         (b"\xc1", "malformed"),
     ],
 )
-def test_msgpack_that_is_not_the_message_is_refused_by_reason(payload: bytes, reason: str) -> None:
+def test_msgpack_that_is_not_the_message_is_refused_with_the_reason(
+    payload: bytes, reason: str
+) -> None:
     assert refusal("application/msgpack", payload) == reason
 
 
@@ -203,17 +211,17 @@ def test_cdr_that_is_not_the_message_is_refused_as_malformed(payload: bytes) -> 
 
 
 @each("surplus", [1, 3, 4, 7, 100])
-def test_surplus_bytes_after_cdr_are_padding(surplus: int) -> None:
+def test_surplus_bytes_after_a_cdr_message_are_ignored(surplus: int) -> None:
     assert twists.decode("", AS_CDR + b"\xff" * surplus) == TWIST
 
 
-def test_cdr_in_the_other_byte_order_is_read_too() -> None:
+def test_big_endian_cdr_is_decoded() -> None:
     swapped = b"\x00\x00\x00\x00" + struct.pack(">6d", 0.5, 0, 0, 0, 0, 0.2)
     assert twists.decode("", swapped) == TWIST
     assert twists.decode("application/cdr", swapped) == TWIST
 
 
-def test_a_payload_of_the_other_format_than_it_says_is_refused() -> None:
+def test_a_payload_in_another_format_than_its_named_encoding_is_refused() -> None:
     assert refusal("application/cdr", AS_JSON) == "malformed"
     assert refusal("application/cdr", encode(TWIST, "msgpack")) == "malformed"
     assert refusal("application/json", AS_CDR) == "malformed"
@@ -242,7 +250,7 @@ def test_deep_nesting_is_refused(start: bytes, nested: bytes, depth: int) -> Non
 
 
 @pytest.mark.parametrize("form", ["json", "msgpack"])
-def test_deep_nesting_is_refused_also_where_any_value_is_welcome(form: Format) -> None:
+def test_deep_nesting_is_refused_even_if_any_value_is_accepted(form: Format) -> None:
     anything = Decoder(dict[str, object])
     deep = b'{"x":' * 50_000 if form == "json" else b"\x81\xa1x" * 50_000
     with pytest.raises(DecodeError) as caught:
@@ -261,7 +269,7 @@ headed = st.builds(
     st.sampled_from(["", "application/json", "application/msgpack", "application/cdr"]),
 )
 @settings(max_examples=400)
-def test_any_bytes_are_a_message_or_a_decode_error(payload: bytes, encoding: str) -> None:
+def test_any_bytes_give_a_message_or_a_decode_error(payload: bytes, encoding: str) -> None:
     try:
         got = twists.decode(encoding, payload)
     except DecodeError:
@@ -274,7 +282,9 @@ vector = st.builds(Vector3, axis, axis, axis)
 
 
 @given(st.builds(Twist, vector, vector), st.sampled_from(FORMATS))
-def test_every_finite_twist_comes_back_bit_for_bit(twist: Twist, form: Format) -> None:
+def test_every_finite_twist_is_decoded_exactly_as_it_was_encoded(
+    twist: Twist, form: Format
+) -> None:
     assert twists.decode("", encode(twist, form)) == twist
 
 

@@ -53,7 +53,7 @@ def as_json(message: Message) -> Any:
 
 @pytest.mark.slow
 @each("name", SCHEMAS)
-def test_each_is_a_schema_of_the_dialect_it_names_and_has_an_id_of_its_own(name: str) -> None:
+def test_each_schema_is_valid_in_its_dialect_and_has_a_unique_id(name: str) -> None:
     schema = SCHEMAS[name]
     assert schema["$schema"] == Draft202012Validator.META_SCHEMA["$id"]
     assert (schema["$id"], schema["title"]) == (f"urn:acsard:{name}.v1", name)
@@ -61,7 +61,7 @@ def test_each_is_a_schema_of_the_dialect_it_names_and_has_an_id_of_its_own(name:
 
 
 @each("name", sorted(OUTGOING))
-def test_what_goes_out_has_all_its_fields_and_may_get_more(name: str) -> None:
+def test_outgoing_messages_require_all_fields_and_permit_additional_ones(name: str) -> None:
     assert parts(name)
     for part in parts(name):
         assert part["required"] == list(part["properties"])
@@ -69,7 +69,7 @@ def test_what_goes_out_has_all_its_fields_and_may_get_more(name: str) -> None:
 
 
 @each("name", sorted(INCOMING))
-def test_what_comes_in_may_leave_out_what_has_a_default_and_add_nothing(name: str) -> None:
+def test_incoming_messages_may_omit_defaults_but_not_add_fields(name: str) -> None:
     assert parts(name)
     for part in parts(name):
         assert part["additionalProperties"] is False
@@ -77,7 +77,7 @@ def test_what_comes_in_may_leave_out_what_has_a_default_and_add_nothing(name: st
         assert all(field not in part["required"] for field in missing)
 
 
-def test_the_table_says_what_comes_in_and_what_goes_out() -> None:
+def test_the_incoming_and_outgoing_schemas_are_those_of_the_topic_table() -> None:
     """Types appear by name, with `In` added if the same name is also published."""
     said = {topic.direction: set[str]() for topic in TOPICS}
     for topic in TOPICS:
@@ -103,13 +103,15 @@ def test_the_table_says_what_comes_in_and_what_goes_out() -> None:
         ("Config", "LogConfig", "level", {"debug", "info", "warning", "error"}),
     ],
 )  # fmt: skip
-def test_a_closed_set_is_an_enum(name: str, part: str, field: str, values: set[object]) -> None:
+def test_a_closed_set_of_values_is_an_enum(
+    name: str, part: str, field: str, values: set[object]
+) -> None:
     schema = SCHEMAS[name]
     fields = (schema["$defs"][part] if part else schema)["properties"]
     assert set(fields[field]["enum"]) == values
 
 
-def test_a_pattern_is_one_of_ecmascript() -> None:
+def test_patterns_are_ecmascript_regular_expressions() -> None:
     assert SCHEMAS["Config"]["$defs"]["RobotConfig"]["properties"]["id"]["pattern"].endswith("}$")
     assert "\\\\Z" not in msgspec.json.encode(SCHEMAS["Config"]).decode()
 
@@ -118,7 +120,7 @@ def test_a_pattern_is_one_of_ecmascript() -> None:
 
 
 @each("topic", [t for t in PUBLISHED if not (t.simulated or t.urdf)])
-def test_what_is_published_is_as_its_schema_says_and_nothing_may_be_missing(topic: Any) -> None:
+def test_a_published_message_is_valid_and_invalid_without_any_of_its_fields(topic: Any) -> None:
     report = Report(Config(), START)
     list(report.due(OUTPUTS, {topic.key}, lambda: SNAPSHOT))
     message = report.current(topic.key, lambda: SNAPSHOT)
@@ -131,7 +133,7 @@ def test_what_is_published_is_as_its_schema_says_and_nothing_may_be_missing(topi
 
 
 @each("mode", [*Mode])
-def test_each_mode_may_be_said_and_no_other(mode: str) -> None:
+def test_the_schema_of_the_state_accepts_each_mode_and_no_other(mode: str) -> None:
     report = Report(Config(), START)
     list(report.due(replace(OUTPUTS, mode=mode), {"state"}, lambda: SNAPSHOT))
     message = report.current("state", lambda: SNAPSHOT)
@@ -141,7 +143,7 @@ def test_each_mode_may_be_said_and_no_other(mode: str) -> None:
     assert refused("RobotState", state | {"mode": "idle"})
 
 
-def test_answers_are_as_their_schemas_say() -> None:
+def test_answers_are_valid_by_their_schemas() -> None:
     told = {
         "Interfaces": interfaces(Config(), OUTPUTS),
         "Topics": topic_table(Config()),
@@ -157,7 +159,7 @@ def test_answers_are_as_their_schemas_say() -> None:
     "config",
     [Config(), Config(mcu=McuConfig(port="/dev/ttyACM0"), odometry=OdometryConfig(gyro=True))],
 )
-def test_the_configuration_in_force_is_as_its_schema_says(config: Config) -> None:
+def test_the_effective_configuration_is_valid_by_its_schema(config: Config) -> None:
     value = msgspec.json.decode(msgspec.json.encode(effective(config)))
     assert refused("Config", value) == []
     assert refused("Config", value | {"mcu": value["mcu"] | {"baud_rate": 300}})
@@ -228,5 +230,7 @@ def _decodes(call: Any) -> bool:
         ("Release", {"number": 5}, False),
     ],
 )  # fmt: skip
-def test_the_schema_takes_what_the_daemon_takes(name: str, value: object, good: bool) -> None:
+def test_the_schema_accepts_a_value_exactly_if_the_daemon_accepts_it(
+    name: str, value: object, good: bool
+) -> None:
     assert (refused(name, value) == [], taken(name, value)) == (good, good)

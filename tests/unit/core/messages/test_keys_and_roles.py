@@ -62,26 +62,26 @@ PROMISED = [
 """Keys of DESIGN section 3, and the key on which the TLS gateway reports to the daemon."""
 
 
-def test_the_table_is_the_one_of_the_design() -> None:
+def test_the_topic_table_is_that_of_the_design() -> None:
     assert sorted((t.key, t.direction, t.type) for t in TOPICS) == sorted(PROMISED)
 
 
-def test_no_key_is_there_twice() -> None:
+def test_no_key_appears_twice() -> None:
     assert len({topic.key for topic in TOPICS}) == len(TOPICS)
 
 
-def test_every_row_says_what_it_is_for() -> None:
+def test_every_row_has_a_description() -> None:
     assert all(topic.note for topic in TOPICS)
 
 
-def test_published_is_every_way_out_but_the_token_and_the_same_in_json() -> None:
+def test_the_published_topics_are_all_outgoing_ones_except_token_and_json_copies() -> None:
     apart = ("alive", "json/<key>")
     names = [key for key, direction, _ in PROMISED if direction == "out" and key not in apart]
     assert [topic.key for topic in PUBLISHED] == names
     assert all(topic.type in MESSAGES for topic in PUBLISHED)
 
 
-def test_only_the_static_transforms_and_the_urdf_wait_for_late_joiners() -> None:
+def test_only_the_static_transforms_and_the_urdf_are_latched() -> None:
     assert [topic.key for topic in TOPICS if topic.latched] == ["tf_static", "robot_description"]
 
 
@@ -89,29 +89,29 @@ GYRO = OdometryConfig(gyro=True)
 REAL = Config(mcu=McuConfig(port="/dev/ttyACM0"))
 
 
-def test_the_truth_is_offered_where_the_robot_is_simulated_and_nowhere_else() -> None:
+def test_the_true_pose_is_offered_only_by_a_simulated_robot() -> None:
     simulated = {topic.key for topic in offered(Config())}
     assert simulated - {topic.key for topic in offered(REAL)} == {"sim/pose"}
 
 
-def test_a_description_is_offered_only_with_a_file() -> None:
+def test_the_robot_description_is_offered_only_with_a_urdf_file() -> None:
     described = replace(REAL, ros=RosConfig(urdf="/etc/acsard/robot.urdf"))
     more = {topic.key for topic in offered(described)} - {topic.key for topic in offered(REAL)}
     assert more == {"robot_description"}
 
 
 @pytest.mark.parametrize("config", [Config(), REAL, replace(REAL, odometry=GYRO)])
-def test_published_is_what_goes_out_of_what_is_offered(config: Config) -> None:
+def test_the_published_topics_are_the_offered_outgoing_topics(config: Config) -> None:
     assert published(config) == tuple(row for row in offered(config) if row in PUBLISHED)
 
 
 @pytest.mark.parametrize("config", [Config(), REAL])
-def test_a_gyro_is_listened_to_only_where_it_is_wanted(config: Config) -> None:
+def test_the_imu_topic_is_offered_only_if_the_gyro_is_enabled(config: Config) -> None:
     wanted = {topic.key for topic in offered(replace(config, odometry=GYRO))}
     assert wanted - {topic.key for topic in offered(config)} == {"imu"}
 
 
-def test_the_simulator_publishes_what_its_gyro_says() -> None:
+def test_the_simulator_publishes_its_gyro() -> None:
     said = {topic.key for topic in published(Config(odometry=GYRO))}
     assert said - {topic.key for topic in PUBLISHED} == {"imu"}
 
@@ -124,7 +124,7 @@ def test_every_service_has_a_row(service: str) -> None:
     assert VERBS[row.key] == service
 
 
-def test_a_full_key_has_the_robot_in_it() -> None:
+def test_a_full_key_contains_the_robot_id() -> None:
     assert full_key("r7", "cmd/teleop") == "acsard/r7/cmd/teleop"
 
 
@@ -151,7 +151,7 @@ def test_a_source_commands_by_twist_or_by_wheels() -> None:
     ]
 
 
-def test_a_published_key_is_in_the_json_tree_by_its_whole_name() -> None:
+def test_a_published_key_is_in_the_json_tree_under_its_full_name() -> None:
     assert json_key("sim/pose") == "json/sim/pose"
 
 
@@ -160,7 +160,7 @@ def test_a_key_that_is_not_in_the_table_does_not_exist() -> None:
     assert by_key("cmd/teleop") is None
 
 
-def test_every_key_belongs_to_its_row_and_no_other_key_to_one() -> None:
+def test_every_key_of_the_table_has_its_row_and_an_unknown_key_has_no_row() -> None:
     for topic in TOPICS:
         filled = (
             topic.key.replace("<source>", "app")

@@ -16,13 +16,13 @@ from tests.each import each
 
 
 @pytest.mark.parametrize("role", ["", *ROLES])
-def test_a_role_has_its_own_permissions_and_those_below_it(role: str) -> None:
+def test_a_role_has_its_own_permissions_and_those_of_lower_roles(role: str) -> None:
     assert [least for least in ROLES if has(role, least)] == list(
         ROLES[: ROLES.index(role) + 1] if role in ROLES else ()
     )
 
 
-def test_each_row_names_a_role_for_the_uses_of_its_direction_and_no_other() -> None:
+def test_each_row_has_a_role_for_exactly_the_uses_of_its_direction() -> None:
     for row in TOPICS:
         if row in FOLLOWED or row.key in ("json/<key>", "alive"):
             assert row.subscribe == "viewer"
@@ -39,7 +39,7 @@ def test_a_key_of_the_robot_s_own_machine_is_granted_to_no_role() -> None:
     assert not any(key.startswith(("cmd/", "wheel_cmd/")) for key in granted)
 
 
-def test_a_published_key_is_granted_with_its_twin_in_json() -> None:
+def test_a_published_key_is_granted_together_with_its_json_key() -> None:
     assert set(keys_for("viewer", "subscribe", PUBLISHED)) == {
         key for topic in PUBLISHED for key in (topic.key, f"json/{topic.key}")
     }
@@ -61,5 +61,5 @@ def test_a_published_key_is_granted_with_its_twin_in_json() -> None:
         ("no/such/key", "viewer"),
     ],
 )
-def test_the_least_role_of_a_key(key: str, role: Role) -> None:
+def test_a_key_has_the_expected_least_role(key: str, role: Role) -> None:
     assert least_role(key) == role

@@ -24,11 +24,11 @@ def names(happened: RecentEvents) -> list[str]:
     return [one.name for one in told(happened).events]
 
 
-def test_nothing_is_nothing() -> None:
+def test_without_events_there_is_no_message() -> None:
     assert RecentEvents().told() is None
 
 
-def test_a_fault_is_still_there_after_an_hour_of_missed_periods() -> None:
+def test_a_fault_is_still_listed_after_an_hour_of_missed_periods() -> None:
     happened = RecentEvents()
     happened.add([FAULT], at(0))
     for second in range(1, 3600):
@@ -41,14 +41,14 @@ def test_a_fault_is_still_there_after_an_hour_of_missed_periods() -> None:
     assert told(happened).total == 3600
 
 
-def test_after_a_minute_s_rest_it_is_a_row_of_its_own() -> None:
+def test_a_repeated_event_gets_a_new_row_after_a_minute_without_it() -> None:
     happened = RecentEvents()
     for second in (0, 60, 121):
         happened.add([missed(1)], at(second))
     assert [one.count for one in told(happened).events] == [2, 1]
 
 
-def test_what_goes_on_is_behind_what_was_news_meanwhile() -> None:
+def test_a_repeated_event_moves_after_newer_events() -> None:
     happened = RecentEvents()
     happened.add([missed(1)], at(0))
     happened.add([FAULT], at(1))
@@ -57,7 +57,7 @@ def test_what_goes_on_is_behind_what_was_news_meanwhile() -> None:
     assert names(happened) == ["fault", "missed_periods"]
 
 
-def test_news_is_never_put_together() -> None:
+def test_events_that_are_news_are_never_combined() -> None:
     happened = RecentEvents()
     stop, clear = Event("stop", "stopped", by="ann"), Event("clear", "cleared", by="ann")
     for second in range(3):
@@ -66,7 +66,7 @@ def test_news_is_never_put_together() -> None:
     assert names(happened) == ["stop", "clear"] * 3 + ["stop"]
 
 
-def test_more_than_are_kept_push_the_oldest_out() -> None:
+def test_the_oldest_events_are_dropped_when_the_list_is_full() -> None:
     happened = RecentEvents()
     for second in range(LAST + 5):
         happened.add([Event("commander", f"{second}")], at(second))

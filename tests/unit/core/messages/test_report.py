@@ -119,7 +119,7 @@ def test_all_messages_of_a_sample_carry_the_samples_own_stamp() -> None:
     assert [t.header.stamp for t in found["tf"].transforms] == [stamp]
 
 
-def test_what_is_decided_now_carries_the_time_of_the_step() -> None:
+def test_commands_state_and_diagnostics_carry_the_time_of_the_step() -> None:
     found = published()
     stamp = Time(1_700_000_003, 254_000_002)
     assert found["cmd_vel_out"].header.stamp == stamp
@@ -136,7 +136,7 @@ def test_the_frames_are_the_configured_ones() -> None:
     assert found["cmd_vel_out"].header.frame_id == "r7/base"
 
 
-def test_each_message_is_of_the_type_its_topic_says() -> None:
+def test_each_message_has_the_type_of_its_topic() -> None:
     report = Report(CONFIG, START)
     list(report.due(OUTPUTS, set(), never))
     for topic in PUBLISHED:
@@ -155,7 +155,7 @@ def test_odom_has_the_pose_and_the_twist_of_the_sample() -> None:
     assert odom.twist.twist.angular == Vector3(0.0, 0.0, -0.75)
 
 
-def test_the_pose_covariance_has_each_figure_in_its_cell() -> None:
+def test_the_pose_covariance_has_each_value_in_its_cell() -> None:
     odom: Odometry = published()["odom"]
     # fmt: off
     assert odom.pose.covariance == [
@@ -169,21 +169,21 @@ def test_the_pose_covariance_has_each_figure_in_its_cell() -> None:
     # fmt: on
 
 
-def test_the_twist_covariance_is_the_samples_and_of_other_axes_the_configured() -> None:
+def test_the_twist_covariance_has_measured_axes_of_the_sample_and_configured_other_axes() -> None:
     covariance = published()["odom"].twist.covariance
     rows = [covariance[6 * i : 6 * i + 6] for i in range(6)]
     assert [rows[i][i] for i in range(6)] == [0.01, 0.02, 0.3, 0.4, 0.5, 0.06]
     assert all(rows[i][j] == 0.0 for i in range(6) for j in range(6) if i != j)
 
 
-def test_tf_says_the_same_place_as_odom() -> None:
+def test_tf_has_the_same_pose_as_odom() -> None:
     found = published()
     (transform,) = found["tf"].transforms
     assert transform.transform.translation == found["odom"].pose.pose.position
     assert transform.transform.rotation == found["odom"].pose.pose.orientation
 
 
-def test_without_publish_tf_there_is_no_tf_but_odom_goes_on() -> None:
+def test_without_publish_tf_only_odom_is_published() -> None:
     config = replace(CONFIG, odometry=replace(FRAMES, publish_tf=False))
     report = Report(config, START)
     keys = [key for key, _ in report.due(OUTPUTS, ALL, look)]
@@ -242,13 +242,13 @@ def close(q: Quaternion, r: Quaternion) -> bool:
 
 
 @each(("yaw", "turn"), YAWS)
-def test_a_yaw_is_its_quaternion(yaw: float, turn: Quaternion) -> None:
+def test_a_yaw_is_converted_to_the_right_quaternion(yaw: float, turn: Quaternion) -> None:
     assert close(from_yaw(yaw), turn)
     assert close(from_rpy(0.0, 0.0, yaw), turn)
 
 
 @each(("quarters", "turn"), RPYS)
-def test_quarter_turns_about_fixed_axes_are_their_quaternion(
+def test_quarter_turns_about_fixed_axes_give_the_right_quaternion(
     quarters: tuple[int, int, int], turn: Quaternion
 ) -> None:
     roll, pitch, yaw = (n * math.pi / 2 for n in quarters)
@@ -273,7 +273,7 @@ def rotated(q: Quaternion, v: tuple[float, float, float]) -> tuple[float, float,
 
 
 @given(angle, angle, angle)
-def test_a_quaternion_turns_a_vector_as_the_three_turns_one_after_the_other(
+def test_a_quaternion_rotates_a_vector_like_roll_pitch_and_yaw_in_sequence(
     roll: float, pitch: float, yaw: float
 ) -> None:
     x, y, z = 1.0, 2.0, 3.0
@@ -301,7 +301,7 @@ def static(lidar: LidarConfig, footprint: FootprintConfig) -> TFMessage:
     return Report(replace(CONFIG, lidar=lidar, footprint=footprint), START).tf_static()
 
 
-def test_the_static_transforms_say_where_lidar_and_floor_are_on_the_base() -> None:
+def test_the_static_transforms_have_the_poses_of_lidar_and_footprint() -> None:
     lidar, floor = static(LIDAR, FOOTPRINT).transforms
     assert (lidar.header.frame_id, lidar.child_frame_id) == ("r7/base", "eye")
     assert lidar.transform.translation == Vector3(0.1, -0.2, 0.3)
@@ -324,7 +324,7 @@ def test_each_static_transform_has_its_own_switch(lidar: bool, footprint: bool) 
     assert names == ["eye"] * lidar + ["floor"] * footprint
 
 
-def test_by_default_only_the_lidar_is_published() -> None:
+def test_by_default_only_the_lidar_transform_is_published() -> None:
     names = [t.child_frame_id for t in Report(Config(), START).tf_static().transforms]
     assert names == ["lidar_link"]
 
@@ -361,7 +361,7 @@ def values(one: DiagnosticStatus) -> dict[str, str]:
     return {pair.key: pair.value for pair in one.values}
 
 
-def test_the_counts_that_the_lines_show_are_in_state_and_on_the_links_row() -> None:
+def test_estimated_encoder_counts_are_in_the_state_and_in_the_row_of_the_link() -> None:
     report = Report(CONFIG, START)
     list(report.due(OUTPUTS, set(), never))
 
@@ -406,7 +406,7 @@ def test_a_router_that_is_missing_is_a_warning(
     assert (row.level, row.message, values(row)) == (level, message, shown)
 
 
-def test_who_connects_to_nobody_has_no_row_of_routers() -> None:
+def test_a_daemon_without_routers_has_no_router_row() -> None:
     assert "acsard: router" not in {one.name for one in published()["diagnostics"].status}
 
 
@@ -414,28 +414,28 @@ def test_who_connects_to_nobody_has_no_row_of_routers() -> None:
 
 
 @each("wanted", [set(), *({key} for key in ALL), {"odom", "state"}, ALL])
-def test_only_what_is_wanted_is_published(wanted: set[str]) -> None:
+def test_only_topics_with_subscribers_are_published(wanted: set[str]) -> None:
     found = Report(CONFIG, START).due(OUTPUTS, wanted, look)
     assert sorted(key for key, _ in found) == sorted(wanted - {"tf_static"})
 
 
-def test_feedback_is_out_before_the_summary_is_built() -> None:
+def test_feedback_is_published_before_the_summary_is_built() -> None:
     due = Report(CONFIG, START).due(OUTPUTS, ALL, never)
     assert [next(due)[0] for _ in range(3)] == ["odom", "tf", "wheel_states"]
 
 
-def test_nobody_looks_at_the_robot_for_a_summary_that_nobody_wants() -> None:
+def test_no_snapshot_is_taken_for_a_summary_without_subscribers() -> None:
     wanted = ALL - {"state", "diagnostics", "battery"}
     assert len(list(Report(CONFIG, START).due(OUTPUTS, wanted, never))) == 5
 
 
-def test_nobody_looks_at_the_robot_for_a_summary_that_is_not_due() -> None:
+def test_no_snapshot_is_taken_for_a_summary_that_is_not_due() -> None:
     report = Report(CONFIG, START)
     list(report.due(at(later(0)), ALL, look))
     assert not list(report.due(at(later(0.01), estimates=()), {"state", "diagnostics"}, never))
 
 
-def test_events_are_kept_whoever_listens_and_told_with_those_before_them() -> None:
+def test_events_are_kept_without_subscribers_and_published_with_earlier_events() -> None:
     report = Report(CONFIG, START)
     assert report.current("events", look) is None
     many = tuple(Event("commander", f"the {n}. takes over", by="app", count=2) for n in range(25))
@@ -453,7 +453,7 @@ def test_events_are_kept_whoever_listens_and_told_with_those_before_them() -> No
     assert report.current("events", never) == told
 
 
-def test_a_fault_is_not_pushed_out_by_what_goes_on_and_on() -> None:
+def test_a_fault_stays_in_the_list_during_a_repeated_event() -> None:
     report, fault = Report(CONFIG, START), Event("fault", "a wheel is dead", "error")
     for second, event in enumerate([fault, *[missed(3)] * 100]):
         list(report.due(replace(OUTPUTS, events=(event,), now=later(second)), set(), look))
@@ -474,7 +474,7 @@ def test_a_step_without_feedback_publishes_no_odometry() -> None:
     assert set(published(replace(OUTPUTS, estimates=()))) == left
 
 
-def test_a_step_woken_by_feedback_alone_says_nothing_of_commands() -> None:
+def test_a_step_without_a_tick_publishes_no_cmd_vel_out() -> None:
     assert "cmd_vel_out" not in published(replace(OUTPUTS, due=False))
 
 
@@ -482,7 +482,7 @@ def test_a_step_woken_by_feedback_alone_says_nothing_of_commands() -> None:
 
 
 @each("key", ["odom", "tf", "wheel_states", "cmd_vel_out"])
-def test_a_rate_of_zero_is_every_sample(key: str) -> None:
+def test_a_rate_of_zero_publishes_every_sample(key: str) -> None:
     assert times_of(key, CONFIG) == list(range(1000))
 
 
@@ -504,7 +504,9 @@ def test_steps_a_little_early_or_late_do_not_change_the_average(hz: float) -> No
 
 
 @pytest.mark.parametrize(("hz", "steps"), [(20.0, 5), (25.0, 4), (50.0, 2)])
-def test_steps_a_little_early_or_late_do_not_make_the_gaps_uneven(hz: float, steps: int) -> None:
+def test_steps_a_little_early_or_late_do_not_make_the_intervals_uneven(
+    hz: float, steps: int
+) -> None:
     report, found = Report(rates(odom=hz), START), []
     for step in range(1000):
         late = (5 - step * 7 % 11) * 1e-5  # the first step is the latest of all
@@ -513,24 +515,24 @@ def test_steps_a_little_early_or_late_do_not_make_the_gaps_uneven(hz: float, ste
     assert {b - a for a, b in pairwise(found)} == {steps}
 
 
-def test_a_rate_above_that_of_the_samples_is_every_sample() -> None:
+def test_a_rate_above_the_sample_rate_publishes_every_sample() -> None:
     assert times_of("odom", rates(odom=1000.0)) == list(range(1000))
 
 
-def test_odom_and_tf_go_together_at_a_limited_rate() -> None:
+def test_odom_and_tf_are_published_together_at_a_limited_rate() -> None:
     report = Report(rates(odom=10.0), START)
     for step in range(300):
         keys = [key for key, _ in report.due(at(later(step / 100)), {"odom", "tf"}, look)]
         assert keys in ([], ["odom", "tf"])
 
 
-def test_state_comes_at_ten_and_diagnostics_at_one_hertz_by_default() -> None:
+def test_state_has_10_hz_and_diagnostics_have_1_hz_by_default() -> None:
     assert abs(len(times_of("state", CONFIG)) - 100) <= 1
     assert abs(len(times_of("diagnostics", CONFIG)) - 10) <= 1
 
 
 @pytest.mark.parametrize("key", ["state", "diagnostics", "battery"])
-def test_a_change_is_published_at_once(key: str) -> None:
+def test_a_change_of_the_status_is_published_immediately(key: str) -> None:
     report = Report(CONFIG, START)
     list(report.due(at(later(0)), {key}, look))
     for step in (1, 2, 3):
@@ -550,7 +552,7 @@ def test_after_a_change_the_next_state_comes_a_period_later() -> None:
     assert 9 <= after[0] - 25 <= 10
 
 
-def test_a_pause_is_not_made_up_for_by_a_burst() -> None:
+def test_no_burst_of_messages_follows_a_pause() -> None:
     report = Report(CONFIG, START)
     list(report.due(at(later(0)), {"state"}, look))
     found = [s for s in range(500, 520) if list(report.due(at(later(s / 100)), {"state"}, look))]
@@ -562,16 +564,16 @@ def test_a_pause_is_not_made_up_for_by_a_burst() -> None:
 
 
 @each("key", sorted(ALL - {"tf_static"}))
-def test_there_is_no_present_value_before_the_first_step(key: str) -> None:
+def test_a_topic_has_no_current_value_before_the_first_step(key: str) -> None:
     assert Report(CONFIG, START).current(key, never) is None
 
 
-def test_the_static_transforms_are_there_from_the_start() -> None:
+def test_the_static_transforms_are_available_before_the_first_step() -> None:
     report = Report(CONFIG, START)
     assert report.current("tf_static", never) == report.tf_static()
 
 
-def test_the_urdf_is_there_from_the_start_if_the_robot_has_one() -> None:
+def test_the_urdf_is_available_before_the_first_step_if_the_robot_has_one() -> None:
     report = Report(CONFIG, START)
     assert report.current("robot_description", never) is None
     report.description = '<robot name="r7"/>'
@@ -580,13 +582,13 @@ def test_the_urdf_is_there_from_the_start_if_the_robot_has_one() -> None:
 
 
 @each("key", sorted(ALL - {"tf_static"}))
-def test_the_present_value_is_what_was_or_would_have_been_published(key: str) -> None:
+def test_the_current_value_equals_the_published_message_even_without_subscribers(key: str) -> None:
     report = Report(CONFIG, START)
     list(report.due(OUTPUTS, set(), never))
     assert report.current(key, look) == published()[key]
 
 
-def test_the_last_sample_stays_the_present_value_while_none_comes() -> None:
+def test_the_last_sample_stays_the_current_value_without_new_feedback() -> None:
     report = Report(CONFIG, START)
     list(report.due(OUTPUTS, set(), never))
     report.due(at(later(9), estimates=()), set(), never)
@@ -595,13 +597,13 @@ def test_the_last_sample_stays_the_present_value_while_none_comes() -> None:
 
 
 @each("key", ["", "alive", "cmd/app", "info", "nonsense"])
-def test_what_is_not_published_has_no_present_value(key: str) -> None:
+def test_a_topic_that_is_not_published_has_no_current_value(key: str) -> None:
     report = Report(CONFIG, START)
     report.due(OUTPUTS, ALL, look)
     assert report.current(key, never) is None
 
 
-def test_at_ten_hertz_the_gaps_are_even_too() -> None:
+def test_state_at_10_hz_has_even_intervals_despite_jitter() -> None:
     report, rnd = Report(Config(), START), random.Random(1)
     found: list[int] = []
     for step in range(3000):
@@ -618,7 +620,7 @@ def with_battery(battery: BatteryStatus | None) -> dict[str, Any]:
     return dict(Report(CONFIG, START).due(OUTPUTS, ALL, lambda: replace(SNAPSHOT, battery=battery)))
 
 
-def test_the_battery_has_the_time_of_its_report_and_null_for_what_is_not_measured() -> None:
+def test_the_battery_message_has_the_time_and_values_of_the_boards_report() -> None:
     messages = published()
     assert messages["battery"] == Battery(
         Header(Time.from_ns(OUTPUTS.now.wall_ns - 104_000_000)),
@@ -636,7 +638,7 @@ def test_the_current_shows_whether_the_battery_is_charged(amps: float | None, st
     assert battery.power_supply_status == status
 
 
-def test_a_board_that_fell_silent_has_no_battery_any_more() -> None:
+def test_a_battery_that_is_no_longer_reported_is_not_present() -> None:
     messages = with_battery(BatteryStatus("unknown"))
     assert messages["battery"] == Battery(Header(Time.from_ns(OUTPUTS.now.wall_ns)))
     assert messages["state"].battery == BatterySummary(None, None, None, "unknown")
@@ -648,7 +650,7 @@ def test_a_board_that_never_reported_a_battery_has_no_message_and_null_in_state(
     assert messages["state"].battery is None
 
 
-def test_the_battery_comes_once_a_second() -> None:
+def test_the_battery_is_published_once_per_second() -> None:
     assert abs(len(times_of("battery", CONFIG)) - 10) <= 1
 
 
@@ -668,7 +670,7 @@ def with_gyro(status: GyroStatus) -> tuple[RobotState, list[DiagnosticStatus]]:
     return state, [one for one in array.status if one.name == "acsard: gyro"]
 
 
-def test_without_a_gyro_there_is_nothing_to_say_of_it() -> None:
+def test_without_a_gyro_the_state_is_off_and_diagnostics_have_no_row() -> None:
     state, rows = with_gyro(GyroStatus())
     assert (state.gyro, rows) == ("off", [])
 
@@ -686,13 +688,13 @@ def test_without_a_gyro_there_is_nothing_to_say_of_it() -> None:
         ("not believed", 1),
     ],
 )
-def test_what_the_gyro_does_is_reported_and_how_bad_that_is(does: GyroDoes, level: int) -> None:
+def test_the_state_of_the_gyro_is_reported_with_its_level(does: GyroDoes, level: int) -> None:
     state, (row,) = with_gyro(GyroStatus(does))
     assert (state.gyro, row.level, row.message) == (does, level, WORDS[does])
     assert {pair.key for pair in row.values} == {"delay_s"}
 
 
-def test_the_track_that_the_gyro_implies_stands_beside_the_configured_one() -> None:
+def test_the_learned_track_is_shown_beside_the_configured_one() -> None:
     learned = GyroStatus("used", bias=-0.0123, delay=0.02, track=1.2, track_deviation=0.05)
     state, (row,) = with_gyro(learned)
     shown = {
@@ -716,7 +718,7 @@ def test_the_track_that_the_gyro_implies_stands_beside_the_configured_one() -> N
 # suspect wheels
 
 
-def test_what_front_and_rear_say_of_each_other_is_shown() -> None:
+def test_the_comparison_of_front_and_rear_wheels_is_reported() -> None:
     slow = ("front_right 60%",)
     doubt = WheelsStatus("rear_left is left out", ("rear_left",), ("right",), (0.01, -0.02), slow)
     for said, level in ((WheelsStatus(), 0), (WheelsStatus(slow=slow), 1), (doubt, 1)):
@@ -757,7 +759,7 @@ DAY_NS = 86400 * 10**9
         (-2, 2, "expired 2 days ago"),
     ],
 )
-def test_a_certificate_that_ends_is_reported_in_time(days: int, level: int, words: str) -> None:
+def test_a_certificate_that_expires_soon_is_reported(days: int, level: int, words: str) -> None:
     config = replace(CONFIG, bus=BusConfig(tls="/etc/acsard/tls"))
     made = Report(config, START, {"": OUTPUTS.now.wall_ns + days * DAY_NS})
     made.due(OUTPUTS, set(), lambda: SNAPSHOT)
@@ -771,7 +773,7 @@ def test_a_certificate_that_ends_is_reported_in_time(days: int, level: int, word
     assert (status.level, status.message) == (level, state.certificate_expiry)
 
 
-def test_a_certificate_that_nobody_can_read_is_a_warning() -> None:
+def test_an_unreadable_certificate_is_reported_with_the_remedy() -> None:
     made = Report(replace(CONFIG, bus=BusConfig(tls="/etc/acsard/tls")), START)
     made.due(OUTPUTS, set(), lambda: SNAPSHOT)
     state = made.current("state", lambda: SNAPSHOT)
@@ -780,7 +782,7 @@ def test_a_certificate_that_nobody_can_read_is_a_warning() -> None:
     assert state.certificate_days is None
 
 
-def test_without_tls_there_is_no_certificate_to_speak_of() -> None:
+def test_without_tls_the_state_has_no_certificate_fields() -> None:
     made = Report(CONFIG, START, {"": 0})
     made.due(OUTPUTS, set(), lambda: SNAPSHOT)
     state = made.current("state", lambda: SNAPSHOT)

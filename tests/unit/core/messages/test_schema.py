@@ -48,7 +48,7 @@ ROS_FIELDS: dict[str, tuple[str, ...]] = {
 
 
 @each(("name", "names"), ROS_FIELDS.items())
-def test_a_message_has_the_fields_of_its_ros_message_in_their_order(
+def test_a_message_has_the_fields_of_its_ros_message_in_the_same_order(
     name: str, names: tuple[str, ...]
 ) -> None:
     assert getattr(schema, name).__struct_fields__ == names
@@ -60,7 +60,7 @@ def test_every_message_is_frozen_and_refuses_unknown_fields(cls: type[Message]) 
     assert cls.__struct_config__.forbid_unknown_fields
 
 
-def test_every_message_that_crosses_the_bus_is_found_by_its_name() -> None:
+def test_every_message_of_the_bus_is_registered_under_its_name() -> None:
     assert all(cls.__name__ == name for name, cls in MESSAGES.items())
     parts = {"Time", "Header", "Vector3", "Quaternion", "Pose", "PoseWithCovariance"}
     parts |= {"TwistWithCovariance", "Transform", "TransformStamped", "SourceState", "KeyValue"}
@@ -78,18 +78,18 @@ def test_a_time_is_whole_seconds_and_the_nanoseconds_of_the_rest(wall_ns: int) -
 
 
 @pytest.mark.parametrize(("wall_s", "sec"), [(2**31, 2**31 - 1), (-(2**31) - 1, -(2**31))])
-def test_a_clock_beyond_what_ros_can_tell_is_held_at_its_end(wall_s: int, sec: int) -> None:
+def test_a_time_outside_the_range_of_ros_is_clamped(wall_s: int, sec: int) -> None:
     time = Time.from_ns(wall_s * 10**9)
     assert time.sec == sec
     assert Cdr(Time).decode(Cdr(Time).encode(time)) == time
 
 
-def test_a_time_worked_by_hand() -> None:
+def test_a_time_is_converted_to_and_from_nanoseconds() -> None:
     assert Time.from_ns(1_700_000_003_250_000_001) == Time(1_700_000_003, 250_000_001)
     assert Time(3, 5).to_ns() == 3_000_000_005
 
 
-def test_a_quaternion_without_fields_is_no_rotation() -> None:
+def test_the_default_quaternion_is_no_rotation() -> None:
     assert Quaternion() == Quaternion(0.0, 0.0, 0.0, 1.0)
 
 
@@ -99,7 +99,7 @@ def test_two_joint_states_do_not_share_their_lists() -> None:
 
 
 @each("text", [b'{"x": 1, "w": 0}', b'{"x": "1"}', b'{"x": null}', b'{"x": true}'])
-def test_a_vector_is_strict_about_its_fields(text: bytes) -> None:
+def test_a_vector_with_invalid_fields_is_refused(text: bytes) -> None:
     with pytest.raises(msgspec.ValidationError):
         msgspec.json.decode(text, type=Vector3)
 

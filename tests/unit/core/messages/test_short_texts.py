@@ -49,7 +49,7 @@ def figures(line: str) -> list[float]:
     return [float(text) for text in re.findall(r"[+-]\d+(?:\.\d+)?(?:e[+-]\d+)?", line)]
 
 
-def test_odometry_is_where_it_is_and_how_fast_each_with_its_unit() -> None:
+def test_odometry_is_shown_as_pose_and_speeds_with_units() -> None:
     line = short(odometry(1.25, -0.5, math.radians(90.0), 0.5, -0.2))
     told = "x +1.250 m y -0.500 m yaw +90.0° forward +0.50 m/s turn -0.20 rad/s"
     assert " ".join(line.split()) == told
@@ -62,18 +62,18 @@ def test_the_heading_is_within_half_a_turn(yaw: float) -> None:
     assert math.remainder(told - math.degrees(yaw), 360.0) == pytest.approx(0.0, abs=0.051)
 
 
-def test_a_stamped_twist_is_its_two_speeds() -> None:
+def test_a_stamped_twist_is_shown_as_its_two_speeds() -> None:
     line = short(TwistStamped(HEADER, Twist(Vector3(0.333), Vector3(z=1.0))))
     assert figures(line) == [0.33, 1.0]
 
 
-def test_lines_of_a_robot_that_drives_stand_below_each_other() -> None:
+def test_lines_of_odometry_have_the_same_width() -> None:
     far = [odometry(x, 0.0, 0.0, v, 0.0) for x, v in ((0.0, 0.5), (999.9, -0.5), (-99.0, 0.0))]
     assert len({len(short(one)) for one in far}) == 1
 
 
 @each("value", [1e300, -1e12, math.inf, math.nan])
-def test_no_figure_breaks_the_line(value: float) -> None:
+def test_no_number_makes_the_line_longer_than_80_characters(value: float) -> None:
     assert len("".join(place(value, value, 0.0) + speeds(value, value))) < 80
 
 
@@ -90,9 +90,9 @@ def test_the_line_of_a_state_ends_with_its_warnings() -> None:
     assert short(full).endswith("  ready: waiting for a command  battery 87 %")
 
 
-def test_a_battery_is_its_voltage_current_and_charge() -> None:
+def test_a_battery_is_shown_as_voltage_current_and_charge() -> None:
     assert short(Battery(HEADER, voltage=24.5, percentage=0.87)) == "24.50 V  - A  87 %"
 
 
-def test_each_type_that_has_one_is_a_line() -> None:
+def test_common_message_types_have_a_short_text() -> None:
     assert {kind.__name__ for kind in SHORT} >= {"Odometry", "RobotState", "PoseStamped"}

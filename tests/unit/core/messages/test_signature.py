@@ -15,14 +15,14 @@ from tests.each import each
 WHOLE = {"sender": "joystick-7", "stamp": 1_795_154_884_365_624_370, "sequence": 12}
 
 
-def test_what_is_packed_is_read() -> None:
+def test_a_packed_signature_is_unpacked_unchanged() -> None:
     signature = Signature("laptop/12/ab", 5, 1)
     assert unpack(signature.pack()) == signature
 
 
 @each("form", [lambda told: json.dumps(told).encode(), msgspec.msgpack.encode])
 @each("left_out", [(), ("stamp",), ("sequence",), ("stamp", "sequence")])
-def test_a_map_in_json_or_msgpack_is_a_signature_and_only_the_sender_must_be_there(
+def test_a_map_in_json_or_msgpack_with_a_sender_is_a_signature(
     form: object, left_out: tuple[str, ...]
 ) -> None:
     assert callable(form)
@@ -47,12 +47,12 @@ def test_a_map_in_json_or_msgpack_is_a_signature_and_only_the_sender_must_be_the
         msgspec.msgpack.encode([1, 2, 3]),
     ],
 )
-def test_anything_else_is_somebody_else_s(attachment: bytes) -> None:
+def test_any_other_attachment_is_not_a_signature(attachment: bytes) -> None:
     assert unpack(attachment) is None
 
 
 @given(st.binary(max_size=80))
-def test_no_bytes_raise_anything(attachment: bytes) -> None:
+def test_unpacking_any_bytes_raises_no_error(attachment: bytes) -> None:
     unpack(attachment)
     unpack(b"{" + attachment)
 
@@ -68,7 +68,7 @@ def test_no_bytes_raise_anything(attachment: bytes) -> None:
         ("x" * 50 + "/s3cret", "x" * MAX_NAME),
     ],
 )
-def test_a_public_name_is_the_name_before_the_secret_and_a_hash_of_both(
+def test_a_public_name_is_the_name_without_the_secret_and_a_hash_of_both(
     sender: str, name: str
 ) -> None:
     digits = hashlib.sha256(sender.encode()).hexdigest()[:16]
@@ -76,7 +76,7 @@ def test_a_public_name_is_the_name_before_the_secret_and_a_hash_of_both(
 
 
 @each("sender", ["s3cret", "/s3cret", " /s3cret", "1f2e" * 8])
-def test_a_sender_id_without_a_name_has_a_hash_alone(sender: str) -> None:
+def test_the_public_name_of_a_sender_id_without_a_name_is_only_a_hash(sender: str) -> None:
     assert public_name(sender) == hashlib.sha256(sender.encode()).hexdigest()[:16]
 
 
