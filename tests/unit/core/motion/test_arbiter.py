@@ -15,7 +15,7 @@ from tests.unit.core.motion.commanders import BACK, GO, HIGH, LEFT, LOW, MS, RIG
 # one source
 
 
-def test_nobody_drives_when_nobody_commands() -> None:
+def test_no_source_is_followed_without_a_command() -> None:
     choice = Bench(HIGH, LOW).choice()
     assert (choice.source, choice.twist, choice.arrived_ns) == ("", None, None)
     assert choice.wait == Wait("command")
@@ -44,7 +44,7 @@ def test_a_command_counts_until_the_timeout_of_its_source(source: Source) -> Non
     assert bench.driver() == ""
 
 
-def test_each_command_begins_the_timeout_again() -> None:
+def test_each_command_restarts_the_timeout() -> None:
     bench = Bench(HIGH)
     for _ in range(10):
         bench.send(HIGH)
@@ -63,7 +63,7 @@ def test_each_command_begins_the_timeout_again() -> None:
         Twist(0.0, -math.inf),
     ],
 )
-def test_what_is_not_finite_is_refused(twist: Twist) -> None:
+def test_a_twist_that_is_not_finite_is_refused(twist: Twist) -> None:
     bench = Bench(HIGH)
     assert bench.send(HIGH, twist) == "not_finite"
     assert bench.driver() == ""
@@ -99,7 +99,7 @@ def test_a_refused_command_changes_no_twist_and_refreshes_no_timeout() -> None:
 # several sources
 
 
-def test_the_higher_priority_takes_over_at_once() -> None:
+def test_a_source_of_higher_priority_takes_over_immediately() -> None:
     bench = Bench(HIGH, LOW)
     bench.send(LOW)
     assert bench.driver() == "low"
@@ -115,7 +115,7 @@ def test_when_the_higher_priority_falls_silent_the_lower_takes_over_with_its_own
     assert bench.wait(51).choice().twist == BACK
 
 
-def test_when_the_higher_priority_falls_silent_an_old_lower_command_stays_dead() -> None:
+def test_an_expired_lower_command_does_not_count_when_the_higher_source_falls_silent() -> None:
     bench = Bench(SLOW, LOW)
     bench.send(SLOW)
     bench.send(LOW)
@@ -133,7 +133,7 @@ def test_the_order_of_configuration_does_not_matter() -> None:
 
 
 @pytest.mark.parametrize("sources", [(LEFT, RIGHT), (RIGHT, LEFT)])
-def test_among_equals_the_second_takes_over_when_the_first_is_silent_and_keeps_it(
+def test_the_second_equal_source_takes_over_from_a_silent_first_and_keeps_the_robot(
     sources: tuple[Source, ...],
 ) -> None:
     bench = Bench(*sources)
@@ -146,7 +146,7 @@ def test_among_equals_the_second_takes_over_when_the_first_is_silent_and_keeps_i
 
 
 @pytest.mark.parametrize("sources", [(LEFT, RIGHT, HIGH), (RIGHT, LEFT, HIGH)])
-def test_among_equals_the_first_to_come_has_the_robot_back_after_a_higher_one(
+def test_the_first_equal_source_drives_again_after_a_source_of_higher_priority(
     sources: tuple[Source, ...],
 ) -> None:
     bench = Bench(*sources)
@@ -165,7 +165,7 @@ def test_among_equals_the_first_to_come_has_the_robot_back_after_a_higher_one(
 # the senders of one source
 
 
-def test_the_zero_of_one_sender_arms_no_other_of_its_source() -> None:
+def test_a_zero_of_one_sender_does_not_arm_another_sender_of_its_source() -> None:
     bench = Bench(HIGH, armed=False)
     for step in range(40):
         bench.send(HIGH, GO, "a")
@@ -175,7 +175,7 @@ def test_the_zero_of_one_sender_arms_no_other_of_its_source() -> None:
         bench.wait(50)
 
 
-def test_the_sender_that_was_neutral_drives_while_another_of_its_source_was_not() -> None:
+def test_an_armed_sender_drives_although_another_sender_of_its_source_is_not_armed() -> None:
     bench = Bench(HIGH, armed=False)
     bench.send(HIGH, GO, "a")
     assert bench.driver() == ""
@@ -186,7 +186,7 @@ def test_the_sender_that_was_neutral_drives_while_another_of_its_source_was_not(
         assert bench.choice().twist == BACK
 
 
-def test_of_two_senders_of_a_source_the_first_is_followed_alone_and_the_other_is_reported() -> None:
+def test_only_the_first_of_two_senders_of_a_source_is_followed_and_the_other_is_reported() -> None:
     bench = Bench(HIGH, armed=False)
     for sender in ("a", "b"):
         bench.send(HIGH, REST, sender)
@@ -200,7 +200,7 @@ def test_of_two_senders_of_a_source_the_first_is_followed_alone_and_the_other_is
         bench.wait(20)
 
 
-def test_the_second_sender_of_a_source_has_it_once_the_first_is_silent_and_keeps_it() -> None:
+def test_the_second_sender_of_a_source_takes_over_from_a_silent_first_and_keeps_the_robot() -> None:
     bench = Bench(HIGH, armed=False)
     for sender in ("a", "b"):
         bench.send(HIGH, REST, sender)
@@ -228,7 +228,7 @@ def test_a_sender_that_came_first_and_is_armed_later_waits_until_the_other_is_si
 
 
 @pytest.mark.parametrize("sources", [(LEFT, RIGHT), (RIGHT, LEFT)])
-def test_among_equal_sources_the_sender_who_came_first_counts(sources: tuple[Source, ...]) -> None:
+def test_the_first_sender_among_equal_sources_is_followed(sources: tuple[Source, ...]) -> None:
     bench = Bench(*sources)
     bench.send(RIGHT, REST, "r")
     bench.wait(10).send(LEFT, REST, "l")
@@ -237,7 +237,7 @@ def test_among_equal_sources_the_sender_who_came_first_counts(sources: tuple[Sou
     assert bench.choice().twist == GO
 
 
-def test_each_sender_must_be_neutral_again_once_that_is_required() -> None:
+def test_each_sender_must_send_a_zero_again_after_neutral_is_required() -> None:
     bench = Bench(HIGH, armed=False)
     for sender in ("a", "b"):
         bench.send(HIGH, REST, sender)
@@ -248,7 +248,7 @@ def test_each_sender_must_be_neutral_again_once_that_is_required() -> None:
 
 
 @pytest.mark.parametrize("before", [REST, GO])
-def test_what_arrived_before_neutral_was_asked_for_makes_no_sender_neutral_nor_heard(
+def test_a_command_that_arrived_before_neutral_was_required_arms_no_sender(
     before: Twist,
 ) -> None:
     bench = Bench(HIGH, armed=False)
@@ -258,7 +258,7 @@ def test_what_arrived_before_neutral_was_asked_for_makes_no_sender_neutral_nor_h
     assert bench.driver() == ""
 
 
-def test_an_older_demand_for_a_zero_takes_nothing_from_a_newer_one() -> None:
+def test_a_requirement_of_a_zero_with_an_earlier_time_does_not_replace_a_later_one() -> None:
     """As if the board restarts, and a clear from before the restart is obeyed in the same step."""
     bench = Bench(HIGH, armed=False)
     bench.arbiter.require_neutral(bench.now_ns + 100 * MS)
@@ -303,7 +303,7 @@ def test_a_source_whose_stamps_are_in_doubt_keeps_its_priority_for_four_seconds(
         assert bench.status(LOW).waits_for == Wait("higher", "high")
 
 
-def test_a_source_that_fell_silent_gets_no_priority_by_late_commands() -> None:
+def test_late_commands_do_not_restore_the_priority_of_a_silent_source() -> None:
     bench = Bench(HIGH, LOW).known(HIGH, "clock", "a")
     bench.wait(300)
     for _ in range(20):
@@ -313,7 +313,7 @@ def test_a_source_that_fell_silent_gets_no_priority_by_late_commands() -> None:
 
 
 @each("other", [HIGH, SLOW])
-def test_the_sender_that_the_robot_follows_keeps_it_while_its_stamps_are_in_doubt(
+def test_the_followed_sender_keeps_the_robot_while_its_stamps_are_in_doubt(
     other: Source,
 ) -> None:
     bench = Bench(HIGH, SLOW, armed=False)
@@ -331,7 +331,7 @@ def test_the_sender_that_the_robot_follows_keeps_it_while_its_stamps_are_in_doub
 
 
 @each("other", [HIGH, LEFT, RIGHT])
-def test_a_sender_in_doubt_that_waits_does_not_keep_the_robot_from_another(other: Source) -> None:
+def test_a_waiting_sender_with_stamps_in_doubt_does_not_block_another_sender(other: Source) -> None:
     """The senders c, a and b came in this order, and c falls silent."""
     own = LEFT if other is RIGHT else other
     bench = Bench(HIGH, LEFT, RIGHT, armed=False).known(own, "clock", "a")
@@ -346,7 +346,7 @@ def test_a_sender_in_doubt_that_waits_does_not_keep_the_robot_from_another(other
         assert bench.choice().sender == ("c" if at < 15 else "b")
 
 
-def test_behind_a_bridge_doubt_about_one_clock_disarms_no_program_with_another_clock() -> None:
+def test_doubt_about_one_clock_of_a_bridge_does_not_disarm_a_program_with_another_clock() -> None:
     bench = Bench(HIGH, LOW, armed=False).known(HIGH, "one", "bridge")
     for _ in range(60):
         bench.wait(50).stamped(LOW, 0.0, "two", REST, "bridge")
@@ -418,7 +418,7 @@ def test_a_sender_whose_clock_is_set_again_and_again_keeps_the_robot_once_only()
 
 
 @each("other", [LEFT, RIGHT])
-def test_a_stall_of_the_daemon_takes_the_robot_from_no_sender(other: Source) -> None:
+def test_a_stall_of_the_daemon_does_not_change_the_followed_sender(other: Source) -> None:
     bench = Bench(LEFT, RIGHT, armed=False)
     for at in range(100):
         bench.arbiter.begin(bench.now_ns)
@@ -436,7 +436,7 @@ def test_a_stall_of_the_daemon_takes_the_robot_from_no_sender(other: Source) -> 
 
 
 @each(("most_ms", "heals"), [(400.0, True), (1100.0, False)])
-def test_a_delay_that_rose_heals_although_another_source_of_the_clock_has_a_longer_timeout(
+def test_a_risen_delay_is_forgiven_within_the_budget_despite_a_longer_timeout_elsewhere(
     most_ms: float, heals: bool
 ) -> None:
     """A rise by 1.1 s exceeds the budget, so only the source with the long timeout goes on."""
@@ -453,7 +453,7 @@ def test_a_delay_that_rose_heals_although_another_source_of_the_clock_has_a_long
     assert bench.choice().source == ("high" if heals else "long")
 
 
-def test_a_late_sender_that_is_not_armed_is_told_that_it_is_late() -> None:
+def test_a_late_sender_that_is_not_armed_is_reported_as_late() -> None:
     bench = Bench(HIGH, armed=False).known(HIGH, "clock", "a")
     bench.arbiter.require_neutral(bench.now_ns + 1)
     for at in range(10):
@@ -481,7 +481,7 @@ def drives(bench: Bench, sender: str) -> bool:
     return allowed
 
 
-def test_a_seventeenth_sender_takes_the_place_of_the_one_silent_for_longest() -> None:
+def test_a_seventeenth_sender_replaces_the_sender_that_was_silent_longest() -> None:
     bench = Bench(HIGH, armed=False)
     senders = [f"sender {number}" for number in range(16)]
     armed_in_turn(bench, senders)
@@ -493,7 +493,7 @@ def test_a_seventeenth_sender_takes_the_place_of_the_one_silent_for_longest() ->
     assert [drives(bench, sender) for sender in asked] == [True, True, True, False]
 
 
-def test_sixteen_live_senders_let_in_no_other_and_keep_the_one_that_came_first() -> None:
+def test_a_seventeenth_sender_is_refused_while_sixteen_are_live_and_the_first_drives_on() -> None:
     bench = Bench(HIGH, armed=False)
     bench.send(HIGH, REST, "holder")
     bench.wait(20).send(HIGH, GO, "holder")
@@ -504,7 +504,7 @@ def test_sixteen_live_senders_let_in_no_other_and_keep_the_one_that_came_first()
     assert bench.choice().twist == GO
 
 
-def test_a_refused_sample_of_a_new_sender_makes_nobody_forgotten() -> None:
+def test_a_refused_command_of_a_new_sender_displaces_no_known_sender() -> None:
     bench = Bench(HIGH, armed=False)
     senders = [f"sender {number}" for number in range(16)]
     armed_in_turn(bench, senders)
@@ -513,7 +513,7 @@ def test_a_refused_sample_of_a_new_sender_makes_nobody_forgotten() -> None:
     assert all(drives(bench, sender) for sender in senders)
 
 
-def test_of_more_than_sixteen_senders_those_that_may_not_drive_are_forgotten_first() -> None:
+def test_senders_that_are_not_armed_are_forgotten_first_if_there_are_more_than_sixteen() -> None:
     bench = Bench(HIGH, armed=False)
     senders = [f"sender {number}" for number in range(15)]
     armed_in_turn(bench, senders)
@@ -522,7 +522,7 @@ def test_of_more_than_sixteen_senders_those_that_may_not_drive_are_forgotten_fir
     assert all(drives(bench, sender) for sender in senders)
 
 
-def test_a_crowd_that_sends_zeros_takes_the_robot_from_nobody_who_is_heard_as_often() -> None:
+def test_many_new_senders_of_zeros_do_not_displace_the_driving_sender() -> None:
     bench = Bench(HIGH, armed=False)
     bench.send(HIGH, REST, "a")
     for number in range(200):
@@ -533,7 +533,7 @@ def test_a_crowd_that_sends_zeros_takes_the_robot_from_nobody_who_is_heard_as_of
     assert bench.status(HIGH).waits_for == Wait("senders", senders=15)
 
 
-def test_a_crowd_that_sends_what_cannot_be_read_makes_nobody_forgotten() -> None:
+def test_many_senders_of_unreadable_messages_do_not_displace_an_armed_sender() -> None:
     bench = Bench(HIGH, armed=False)
     bench.send(HIGH, REST, "a")
     for number in range(100):
@@ -542,7 +542,7 @@ def test_a_crowd_that_sends_what_cannot_be_read_makes_nobody_forgotten() -> None
     assert bench.driver() == "high"
 
 
-def test_the_crowd_of_one_source_is_none_of_another() -> None:
+def test_many_senders_of_one_source_do_not_displace_a_sender_of_another_source() -> None:
     bench = Bench(HIGH, LOW, armed=False)
     bench.send(LOW, REST, "a")
     for number in range(100):
@@ -561,7 +561,7 @@ def held(bench: Bench, source: Source, seconds: float, twist: Twist = REST) -> W
     return bench.choice().wait
 
 
-def test_zeros_alone_hold_the_robot_and_that_is_said_after_a_while() -> None:
+def test_a_sender_of_only_zeros_holds_the_robot_and_is_reported_after_three_seconds() -> None:
     bench = Bench(HIGH)
     assert held(bench, HIGH, 3.0) == Wait("nothing")
     assert held(bench, HIGH, 0.2) == Wait("zeros", "high", lasts=3.0)
@@ -570,7 +570,7 @@ def test_zeros_alone_hold_the_robot_and_that_is_said_after_a_while() -> None:
     assert bench.status(HIGH).waits_for == Wait("nothing")
 
 
-def test_a_speed_among_the_zeros_or_silence_begins_anew() -> None:
+def test_a_speed_or_a_silence_restarts_the_time_of_only_zeros() -> None:
     bench = Bench(HIGH)
     held(bench, HIGH, 5.0)
     bench.wait(100).send(HIGH, GO)
@@ -581,7 +581,7 @@ def test_a_speed_among_the_zeros_or_silence_begins_anew() -> None:
     assert held(bench, HIGH, 0.3).what == "zeros"
 
 
-def test_wheels_that_cancel_out_are_no_zeros() -> None:
+def test_wheel_speeds_that_cancel_out_do_not_count_as_zeros() -> None:
     bench = Bench(HIGH)
     for _ in range(40):
         command = Command("high", REST, bench.wait(100).now_ns, cancelled=True)
@@ -589,7 +589,7 @@ def test_wheels_that_cancel_out_are_no_zeros() -> None:
     assert bench.choice().wait == Wait("nothing")
 
 
-def test_zeros_keep_a_lower_source_waiting_for_ever_and_say_whom() -> None:
+def test_the_report_of_only_zeros_names_the_lower_source_that_must_wait() -> None:
     bench = Bench(HIGH, LOW)
     for _ in range(100):
         bench.wait(100).send(HIGH, REST)
@@ -598,7 +598,7 @@ def test_zeros_keep_a_lower_source_waiting_for_ever_and_say_whom() -> None:
     assert bench.choice().wait == Wait("zeros", "high", lasts=3.0, kept="low")
 
 
-def test_zeros_keep_another_sender_of_the_same_source_waiting_and_say_so() -> None:
+def test_the_report_of_only_zeros_names_another_sender_of_the_source_that_must_wait() -> None:
     bench = Bench(HIGH)
     for _ in range(50):
         bench.wait(100).send(HIGH, REST, "a")
@@ -606,7 +606,7 @@ def test_zeros_keep_another_sender_of_the_same_source_waiting_and_say_so() -> No
     assert bench.choice().wait.kept == "another sender of high"
 
 
-def test_who_must_be_neutral_and_sends_on_is_told_that_it_lasts() -> None:
+def test_an_unarmed_sender_that_keeps_sending_speeds_is_reported_after_three_seconds() -> None:
     bench = Bench(HIGH, armed=False)
     assert held(bench, HIGH, 3.0, GO) == Wait("neutral", "high", 1.0)
     assert held(bench, HIGH, 0.2, GO) == Wait("neutral", "high", 1.0, lasts=3.0)
@@ -620,7 +620,7 @@ def test_the_sources_are_listed_by_priority() -> None:
     assert [(s.name, s.priority) for s in statuses] == [("high", 100), ("left", 50), ("low", 10)]
 
 
-def test_a_source_that_was_never_heard_has_no_age_and_waits_for_a_command() -> None:
+def test_a_source_that_never_sent_has_no_age_and_waits_for_a_command() -> None:
     bench = Bench(HIGH, armed=False)
     assert bench.status(HIGH) == SourceStatus("high", 100, None, Wait("command"))
 
@@ -632,14 +632,14 @@ def test_the_age_is_that_of_the_last_accepted_command() -> None:
     assert bench.status(HIGH).age_s == 0.1
 
 
-def test_a_command_that_arrived_just_now_or_while_the_step_ran_has_no_age() -> None:
+def test_a_command_that_arrived_now_or_during_the_step_has_an_age_of_zero() -> None:
     bench = Bench(HIGH)
     bench.send(HIGH)
     assert bench.status(HIGH).age_s == 0.0
     assert bench.wait(-1).status(HIGH).age_s == 0.0
 
 
-def test_a_source_that_may_drive_waits_for_nothing_before_anyone_was_chosen() -> None:
+def test_an_armed_source_waits_for_nothing_before_the_first_choice() -> None:
     bench = Bench(HIGH)
     bench.arbiter.require_neutral()
     bench.send(HIGH, REST)
@@ -653,14 +653,14 @@ def test_a_silent_source_waits_for_a_command() -> None:
     assert bench.status(HIGH).waits_for == Wait("command")
 
 
-def test_a_source_that_was_not_neutral_says_how_to_become_so() -> None:
+def test_a_source_that_sent_no_zero_is_reported_as_waiting_for_a_zero() -> None:
     bench = Bench(SLOW, armed=False)
     bench.send(SLOW)
     bench.choice()
     assert bench.status(SLOW).waits_for == Wait("neutral", "slow", 1.0)
 
 
-def test_a_lower_source_is_told_who_is_above_it() -> None:
+def test_a_lower_source_is_reported_as_waiting_for_the_higher_source() -> None:
     bench = Bench(HIGH, LOW)
     bench.send(HIGH)
     bench.send(LOW)
@@ -668,7 +668,7 @@ def test_a_lower_source_is_told_who_is_above_it() -> None:
     assert bench.status(LOW).waits_for == Wait("higher", "high")
 
 
-def test_an_equal_source_is_told_who_came_first() -> None:
+def test_an_equal_source_is_reported_as_waiting_for_the_source_that_came_first() -> None:
     bench = Bench(LEFT, RIGHT)
     bench.send(RIGHT)
     bench.choice()
@@ -689,7 +689,7 @@ def test_a_new_timeout_applies_to_a_sender_that_drives() -> None:
     assert bench.driver() == "high"
 
 
-def test_clocks_that_were_set_are_counted_by_how_much_later_they_were_believed() -> None:
+def test_the_delay_that_is_forgiven_to_an_adjusted_clock_is_counted() -> None:
     bench = Bench(HIGH, armed=False).known(HIGH)
     assert bench.arbiter.forgiven_ns == 0
     for number in range(60):

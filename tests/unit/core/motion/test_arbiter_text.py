@@ -69,11 +69,11 @@ SENTENCES = [
 
 
 @each(("wait", "text"), SENTENCES)
-def test_what_a_source_waits_for_is_a_sentence(wait: Wait, text: str) -> None:
+def test_the_text_of_a_wait_says_what_the_source_waits_for(wait: Wait, text: str) -> None:
     assert waiting(wait) == text
 
 
-def test_every_wait_has_its_sentence_above() -> None:
+def test_the_table_of_sentences_has_every_kind_of_wait() -> None:
     kinds = get_args(get_type_hints(Wait)["what"])
     assert {wait.what for wait, _ in SENTENCES} == set(kinds)
 
@@ -94,11 +94,13 @@ def test_every_wait_has_its_sentence_above() -> None:
         ),
     ],
 )
-def test_whose_command_is_followed_or_why_nobody_s_is_a_sentence(choice: Choice, text: str) -> None:
+def test_the_text_of_a_choice_names_the_followed_source_or_what_is_missing(
+    choice: Choice, text: str
+) -> None:
     assert chosen(choice) == text
 
 
-def test_whatever_a_command_is_refused_for_is_said_in_words() -> None:
+def test_every_reason_to_refuse_a_command_has_a_text() -> None:
     assert {"", *REFUSED} == {*get_args(Objection)}
     assert (
         REFUSED["too_many_senders"] == "16 other senders of this source are active; end one first"
@@ -112,11 +114,11 @@ def by(source: str, sender: str) -> Choice:
     return Choice(source, REST, Wait("nothing"), 1, sender)
 
 
-def test_the_mode_it_starts_in_is_no_event() -> None:
+def test_the_first_mode_is_not_reported() -> None:
     assert CommandEvents(Mode.WAITING).changes(Mode.WAITING, NOBODY, "no link") == []
 
 
-def test_another_mode_is_reported_once_with_why() -> None:
+def test_a_change_of_mode_is_reported_once_with_its_reason() -> None:
     told = CommandEvents(Mode.WAITING)
     assert told.changes(Mode.READY, NOBODY, "waiting for a command") == [
         Event("mode", "waiting for a command", kind="waiting -> ready")
@@ -132,7 +134,7 @@ def test_a_new_commander_is_reported_with_the_mode_and_as_the_commander() -> Non
     assert commander == Event("commander", "", by="app (joe)", kind="nobody -> app (joe)")
 
 
-def test_another_commander_is_reported_with_the_one_before() -> None:
+def test_a_change_of_commander_is_reported_with_the_previous_commander() -> None:
     told = CommandEvents(Mode.READY)
     told.changes(Mode.DRIVING, by("app", "joe"), "")
     (source,) = told.changes(Mode.DRIVING, by("nav", "joe"), "")
@@ -141,7 +143,7 @@ def test_another_commander_is_reported_with_the_one_before() -> None:
     assert sender.kind == "nav (joe) -> nav (ann)"
 
 
-def test_who_drives_on_after_a_rest_is_no_other_commander() -> None:
+def test_a_commander_that_drives_on_after_a_rest_is_not_reported_again() -> None:
     told = CommandEvents(Mode.READY)
     told.changes(Mode.DRIVING, by("app", "joe"), "")
     told.changes(Mode.READY, NOBODY, "waiting for a command")
@@ -149,13 +151,13 @@ def test_who_drives_on_after_a_rest_is_no_other_commander() -> None:
     assert event.name == "mode"
 
 
-def test_who_sends_to_a_stopped_robot_commands_nothing() -> None:
+def test_a_sender_to_a_stopped_robot_is_not_reported_as_commander() -> None:
     told = CommandEvents(Mode.STOPPED)
     choice = Choice("app", Twist(1.0, 0.0), Wait("nothing"), 1, "joe")
     assert told.changes(Mode.STOPPED, choice, "stopped") == []
 
 
-def test_a_source_whose_speeds_must_wait_is_reported_once_it_lasts() -> None:
+def test_a_source_whose_speeds_have_no_effect_for_three_seconds_is_reported_once() -> None:
     told = CommandEvents(Mode.READY)
     early = Choice("nav", None, Wait("neutral", "nav", 1.0, ros=True), sender="joe")
     assert told.changes(Mode.READY, early, "") == []
@@ -189,12 +191,12 @@ def test_a_source_held_up_by_zeros_is_reported_once_however_often_it_pauses() ->
     assert [event.kind for event in zeros("teleop")] == ["teleop"]
 
 
-def test_who_sends_to_a_stopped_robot_is_not_told_to_wait() -> None:
+def test_a_sender_to_a_stopped_robot_is_not_reported_as_waiting() -> None:
     choice = Choice("nav", None, Wait("neutral", "nav", 1.0, lasts=3.0), sender="joe")
     assert CommandEvents(Mode.STOPPED).changes(Mode.STOPPED, choice, "stopped") == []
 
 
-def test_a_refusal_is_its_reason_its_words_and_its_sender() -> None:
+def test_the_event_of_a_refusal_has_its_reason_its_text_and_its_sender() -> None:
     event = refused(Refusal("stale", "source app: late", "app", "joe" * 100))
     assert event == Event(
         "command_refused",
@@ -206,7 +208,7 @@ def test_a_refusal_is_its_reason_its_words_and_its_sender() -> None:
     )
 
 
-def test_missed_periods_are_counted_each() -> None:
+def test_the_event_of_missed_periods_counts_each_period() -> None:
     assert missed(3) == Event(
         "missed_periods",
         "3 control periods in a row",

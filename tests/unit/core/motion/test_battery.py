@@ -40,12 +40,12 @@ class Pack:
         return None if self.battery.status is None else self.battery.status.level
 
     def at(self, volts: float, seconds: float, ms: int = 100) -> BatteryLevel | None:
-        """Report this voltage for so long, once in `ms`."""
+        """Report this voltage for this time, once every `ms`."""
         count = round(seconds * 1000 / ms)
         return [self.step(BoardStatus(volts=volts), ms=ms) for _ in range(count)][-1]
 
     def quiet(self, seconds: float) -> BatteryLevel | None:
-        """Take steps without a report for so long."""
+        """Take steps without a report for this time."""
         return [self.step() for _ in range(round(seconds * 10))][-1]
 
     @property
@@ -63,7 +63,7 @@ def test_a_battery_that_is_never_reported_has_no_status() -> None:
     assert (pack.events, pack.stops, pack.battery.held) == ([], 0, False)
 
 
-def test_without_thresholds_a_reported_battery_is_ok_at_once() -> None:
+def test_a_battery_without_thresholds_is_ok_from_the_first_report() -> None:
     pack = Pack(BatteryConfig())
     assert pack.step(BoardStatus(volts=3.0, amps=-1.25, charge=0.29)) == "ok"
     assert pack.status == BatteryStatus("ok", pack.now_ms * MS, 3.0, 29.0, -1.25, 3.0)
@@ -180,7 +180,7 @@ def test_an_exchanged_battery_ends_the_stop_within_seconds() -> None:
 
 @each("start_ms", range(0, 1000, 50))
 @each("ms", [20, 100, 250])
-def test_a_motor_start_is_not_a_level(start_ms: int, ms: int) -> None:
+def test_a_motor_start_does_not_change_the_level(start_ms: int, ms: int) -> None:
     """The start takes 0.3 s and lowers the voltage by 2 V. The battery is 0.1 V above the stop."""
     pack = Pack()
     pack.at(21.1, 30.0, ms=ms)
@@ -198,7 +198,7 @@ def test_a_motor_start_is_not_a_level(start_ms: int, ms: int) -> None:
 @each("before", range(4))
 @each("ms", [100, 500, 1000])
 @each("lost_s", [0.1, 4.0])
-def test_a_motor_start_in_the_first_reports_is_not_a_level(
+def test_a_motor_start_in_the_first_reports_does_not_change_the_level(
     lost_s: float, ms: int, before: int
 ) -> None:
     """The battery is 0.3 V above the stop, and one report shows the drop of 2 V."""
@@ -212,7 +212,7 @@ def test_a_motor_start_in_the_first_reports_is_not_a_level(
 
 
 @each("ms", [500, 1000])
-def test_a_motor_start_is_not_a_level_for_a_board_of_few_reports(ms: int) -> None:
+def test_a_motor_start_does_not_change_the_level_of_a_board_that_reports_seldom(ms: int) -> None:
     pack = Pack()
     pack.at(21.1, 60.0, ms=ms)
     pack.at(19.1, ms / 1000, ms=ms)
@@ -260,7 +260,7 @@ def test_several_lines_of_one_read_count_once() -> None:
 # silence
 
 
-def test_a_board_that_falls_silent_is_unknown_and_stops_nothing() -> None:
+def test_the_level_of_a_silent_board_is_unknown_and_stops_nothing() -> None:
     pack = Pack()
     pack.at(24.0, 10.0)
     assert pack.quiet(SILENT_S) == "ok"
@@ -312,7 +312,7 @@ def test_a_board_that_does_not_report_the_measure_is_named(
     assert words(pack.battery._config, pack.status) == text
 
 
-def test_a_measure_that_falls_silent_alone_is_named_too() -> None:
+def test_a_measure_that_the_board_no_longer_reports_is_named() -> None:
     pack = Pack()
     for _ in range(50):
         pack.step(BoardStatus(volts=24.0, charge=0.5))
@@ -322,7 +322,7 @@ def test_a_measure_that_falls_silent_alone_is_named_too() -> None:
     assert pack.events[-1][1].endswith("but the board reports no voltage")
 
 
-def test_the_words_before_the_level_is_known_say_so() -> None:
+def test_the_text_says_that_the_level_is_not_known_yet() -> None:
     pack = Pack()
     pack.at(24.0, 1.0)
     assert words(CONFIG, pack.status) == (

@@ -76,7 +76,7 @@ def test_each_place_allows_only_the_straight_motion_that_leads_away(
             assert allowed == Twist(sign * min(0.1, abs(twist.linear)), 0.0)
 
 
-def test_two_bumpers_at_one_place_allow_what_one_allows() -> None:
+def test_two_bumpers_at_one_place_allow_the_same_motion_as_one() -> None:
     pins = away("front", "front", "rear")
     for pressed in ("X..", ".X.", "XX."):
         pins.step(pressed)
@@ -112,13 +112,13 @@ def test_a_pressed_bumper_that_limits_says_which_motion_it_allows(pressed: str, 
     assert pins.events[-1] == Event("bumper_pressed", f"{why}; {rest}", "error")
 
 
-def test_words_name_the_place_or_the_number() -> None:
+def test_the_text_names_the_place_or_the_number_of_each_pressed_bumper() -> None:
     assert pressed_words(FOUR, (True, False, True, False)) == "front and left bumpers pressed"
     assert pressed_words((), (False, True)) == "bumper 2 pressed"
     assert pressed_words((), (True, False, True)) == "bumpers 1 and 3 pressed"
 
 
-def test_a_press_counts_at_once_and_a_release_ends_it() -> None:
+def test_a_press_counts_immediately_until_the_release() -> None:
     pins = stop("front", "rear")
     pins.step("..")
     assert pins.step("X.") == "pressed"
@@ -140,7 +140,7 @@ def test_a_press_counts_at_once_and_a_release_ends_it() -> None:
     ]  # fmt: skip
 
 
-def test_a_second_bumper_is_a_new_press_and_the_release_of_one_is_none() -> None:
+def test_a_second_pressed_bumper_is_a_new_press_but_the_release_of_one_bumper_is_not() -> None:
     pins = stop("front", "rear")
     pins.step("X.")
     pins.step("XX")
@@ -200,7 +200,7 @@ def test_the_missing_bumpers_are_named_with_the_field_of_the_line() -> None:
     )
 
 
-def test_a_line_with_the_wrong_number_is_as_good_as_none() -> None:
+def test_a_line_with_the_wrong_number_of_bumpers_does_not_count_as_a_report() -> None:
     pins = stop("front", "rear")
     pins.step("X.")
     for _ in range(6):
@@ -217,7 +217,7 @@ def test_without_places_every_bumper_counts_wherever_it_is() -> None:
     assert pins.bumpers.held == "bumper 3 pressed"
 
 
-def test_without_places_a_number_that_changed_releases_nothing_at_first() -> None:
+def test_without_places_the_first_line_with_another_number_of_bumpers_releases_nothing() -> None:
     pins = stop()
     assert pins.step("X...") == "pressed"
     assert pins.step("...") == "pressed"

@@ -84,7 +84,7 @@ def test_delays_may_fall_by_50_ms_of_which_a_tenth_of_the_time_is_forgotten(
     assert Sender().each(steps)[-1] == verdict
 
 
-def test_a_steady_clock_that_came_early_counts_no_more_before_it_has_proved_itself() -> None:
+def test_a_steady_clock_whose_delay_fell_does_not_count_until_it_proves_itself_again() -> None:
     assert Sender(steady=True).each([(PERIOD, -200 * MS), (PERIOD, -40 * MS)]) == [
         "first",
         "unproven",
@@ -107,7 +107,7 @@ def test_a_clock_is_new_after_250_s_by_both_clocks(
     assert Sender().sends(after, delay) == verdict
 
 
-def test_a_number_that_comes_twice_with_its_stamp_is_stale_even_if_it_is_0() -> None:
+def test_a_repeated_number_with_the_same_stamp_is_stale_even_if_the_number_is_0() -> None:
     sender = Sender()
     assert sender.sends(PERIOD, 0, 0) == "fresh"
     assert sender.sends(10 * MS, 10 * MS, 0) == "stale"
@@ -228,7 +228,7 @@ def test_a_command_that_ends_a_proof_counts_only_if_it_is_not_late_itself(
 
 
 @pytest.mark.parametrize(("beyond", "verdict"), [(0, "set"), (1, "stale")])
-def test_a_late_command_at_the_end_of_a_proof_delays_that_by_a_half(
+def test_a_late_command_at_the_end_of_a_proof_delays_the_proof_by_a_half(
     beyond: int, verdict: Verdict
 ) -> None:
     """An earlier version looked again 4.5 s later."""
@@ -295,13 +295,13 @@ def test_a_delay_from_before_an_adjustment_is_counted() -> None:
     assert sender.freshness.forgiven_ns == 200 * MS - drift
 
 
-def test_a_clock_that_was_set_forward_is_forgiven_nothing() -> None:
+def test_a_clock_that_was_set_forward_uses_none_of_the_forgiven_delay() -> None:
     sender = Sender()
     assert sender.steadily(-600 * MS, 31)[-1] == "set"
     assert sender.freshness.forgiven_ns == 0
 
 
-def test_what_an_adjustment_shows_forgives_no_other_delay() -> None:
+def test_an_adjustment_that_shows_forgives_no_delay_of_the_network() -> None:
     """The clock is set back by 500 ms, and the network holds everything back for 8 s."""
     sender = Sender()
     sender.sends(PERIOD, 500 * MS)
@@ -317,7 +317,9 @@ def test_an_adjustment_that_was_believed_forgives_no_later_delay() -> None:
 
 
 @pytest.mark.parametrize(("departed", "verdict"), [(10_000, "set"), (10_001, "stale")])
-def test_a_clock_that_advances_by_10_us_at_most_stands(departed: int, verdict: Verdict) -> None:
+def test_a_clock_that_advances_by_10_us_at_most_counts_as_standing_still(
+    departed: int, verdict: Verdict
+) -> None:
     sender, late = Sender(), 0
     for _ in range(60):
         late += PERIOD - departed
@@ -383,7 +385,7 @@ def test_stamps_that_leap_in_commands_that_came_together_show_no_pause() -> None
         (7, 7, "stale"),
     ],
 )
-def test_numbers_tell_a_pause_from_a_loss(
+def test_numbers_distinguish_a_pause_from_a_loss(
     before: int | None, then: int | None, verdict: Verdict
 ) -> None:
     sender, late = Sender(), 5 * NS_PER_S
@@ -534,7 +536,7 @@ def test_commands_that_are_lost_show_no_adjustment_of_a_clock_that_goes_on() -> 
         assert sender.numbered(100 + n, n, n + 100) == "stale"
 
 
-def test_one_wrong_stamp_behind_lost_commands_shows_no_adjustment() -> None:
+def test_one_wrong_stamp_after_lost_commands_shows_no_adjustment() -> None:
     sender = Numbered()
     assert sender.numbered(103, 3, 3, 1000 * BACK) == "stale"
     assert {sender.numbered(104 + n, 4 + n, 43 + n) for n in range(100)} == {"stale"}
@@ -595,7 +597,7 @@ def test_lost_commands_show_an_adjustment_only_since_a_command_with_a_number(
     assert ("set" in verdicts) == (verdict == "set")
 
 
-def test_numbers_that_begin_again_stop_nobody() -> None:
+def test_commands_stay_fresh_when_the_numbers_of_their_sender_restart() -> None:
     sender = Numbered()
     assert [sender.numbered(n, n, n) for n in range(1, 40)] == ["fresh"] * 39
     assert "set" in [sender.numbered(n, n, n, BACK) for n in range(40, 80)]
@@ -612,7 +614,7 @@ def test_numbers_that_begin_again_with_a_clock_that_was_set_back_count_after_the
 
 
 @pytest.mark.parametrize(("beyond", "verdict"), [(0, "set"), (1, "stale")])
-def test_a_second_and_a_sixtieth_of_the_proof_time_is_forgiven_at_once(
+def test_a_first_jump_by_a_second_and_a_sixtieth_of_the_proof_time_is_forgiven(
     beyond: int, verdict: Verdict
 ) -> None:
     sender, proof = Sender(), 1500 * MS
@@ -630,7 +632,7 @@ def test_a_fourth_jump_of_300_ms_is_over_the_second_that_is_forgiven() -> None:
 
 
 @pytest.mark.parametrize(("beyond", "verdict"), [(0, "set"), (1, "stale")])
-def test_after_a_pause_that_took_all_a_sixtieth_of_the_time_is_forgiven(
+def test_a_sixtieth_of_the_time_is_forgiven_after_a_pause_that_used_the_whole_budget(
     beyond: int, verdict: Verdict
 ) -> None:
     sender, proof, paused = Sender(), 1500 * MS, 5 * NS_PER_S
@@ -645,7 +647,7 @@ def test_after_a_pause_that_took_all_a_sixtieth_of_the_time_is_forgiven(
 # many senders
 
 
-def test_senders_without_a_name_are_told_apart_by_their_source() -> None:
+def test_senders_without_a_name_are_distinguished_by_their_source() -> None:
     freshness = Freshness()
     verdicts = [
         freshness.judge(Command(source, GO, n * PERIOD, n * PERIOD - delay), TIMEOUT)
@@ -663,7 +665,7 @@ def test_the_proof_of_a_sender_among_others_ends_with_a_silence_of_over_2_s_as_w
 
 
 @pytest.mark.parametrize(("beyond", "verdict"), [(0, "stale"), (1, "first")])
-def test_a_clock_that_others_saw_silent_for_over_an_hour_is_forgotten(
+def test_a_clock_that_is_silent_for_over_an_hour_while_others_send_is_forgotten(
     beyond: int, verdict: Verdict
 ) -> None:
     sender, hour = Sender(), 3600 * NS_PER_S
@@ -728,7 +730,7 @@ def test_the_numbers_of_1024_senders_without_stamps_are_remembered(
 # messages that must not prove a clock
 
 
-def test_bursts_of_a_backlog_never_count_although_one_ends_a_half() -> None:
+def test_bursts_of_a_backlog_never_count_although_one_burst_ends_a_half_of_a_proof() -> None:
     """The oldest command of a burst has the delay of the burst before."""
     freshness, start = Freshness(), 15 * NS_PER_S
     backlog, number, last, accepted = 5 * NS_PER_S, 0, 0, []

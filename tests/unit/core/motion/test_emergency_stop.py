@@ -49,7 +49,7 @@ class Input:
         return self.estop.state
 
     def quiet(self, ms: int) -> str:
-        """Take steps without a report for so long."""
+        """Take steps without a report for this time."""
         for _ in range(ms // 10):
             self.step()
         return self.estop.state
@@ -79,7 +79,7 @@ def test_an_input_that_is_never_reported_is_never_pressed() -> None:
     assert (pin.estop.why, pin.events) == ("", [])
 
 
-def test_a_press_counts_at_once_and_a_release_ends_it() -> None:
+def test_a_press_counts_immediately_until_the_release() -> None:
     pin = Input()
     pin.step(False)
     assert pin.step(True) == "pressed"

@@ -32,7 +32,9 @@ def noise(distance: float, yaw: float, skid: float) -> Noise:
 
 
 @given(distance=steps, turn=steps)
-def test_a_k_of_each_side_can_be_said_with_the_settings(distance: float, turn: float) -> None:
+def test_a_noise_of_each_side_can_be_expressed_by_the_settings(
+    distance: float, turn: float
+) -> None:
     left, right = abs(distance - turn * L / 2), abs(distance + turn * L / 2)
     got = noise(K / 2, 2 * K / L**2, 0.0).of(distance, turn, abs(turn))
     assert got == pytest.approx(
@@ -46,7 +48,7 @@ def test_a_straight_has_the_variances_per_metre(settings: tuple[float, float, fl
     assert (along, yaw, both) == pytest.approx((2 * settings[0], 2 * settings[1], 0.0))
 
 
-def test_skidding_adds_to_what_counts_as_turned() -> None:
+def test_skidding_adds_to_the_turn_that_counts_for_the_yaw_variance() -> None:
     with_skid, without = noise(1e-4, 1e-4, 1e-2), noise(1e-4, 1e-4, 0.0)
     more = with_skid.of(0.1, 0.3, 0.2)[1] - without.of(0.1, 0.3, 0.2)[1]
     assert more == pytest.approx(2e-3)
@@ -93,11 +95,11 @@ def test_a_column_is_the_derivative_by_its_multiplier(multiplier: str) -> None:
     assert yaw * d + of_turn * turn == pytest.approx((turn2 - turn) / tiny * std, rel=1e-4)
 
 
-def test_what_is_certain_has_no_column() -> None:
+def test_a_certain_parameter_has_no_column() -> None:
     assert columns(OdometryConfig(), Kinematics(DriveConfig())) == ()
 
 
-def test_a_scale_that_is_off_bends_no_turn() -> None:
+def test_an_error_of_the_distance_scale_does_not_change_the_turn() -> None:
     config = OdometryConfig(distance_scale_std=0.01)
     assert columns(config, Kinematics(DriveConfig())) == ((0.01, 0.0, 0.0, 0.0),)
 
@@ -111,14 +113,14 @@ ALL = OdometryConfig(
 )
 
 
-def test_the_column_of_a_track_to_be_learned_is_the_last_and_does_nothing_at_first() -> None:
+def test_the_column_of_a_track_to_be_learned_is_the_last_and_is_zero_at_first() -> None:
     kinematics = Kinematics(CALIBRATED)
     *declared, learned = columns(ALL, kinematics, CONFIGURED)
     assert tuple(declared) == columns(ALL, kinematics)
     assert learned == (0.0, 0.0, 0.0, 0.0)
 
 
-def test_the_error_of_a_learned_track_takes_the_place_of_the_configured_ones() -> None:
+def test_the_error_of_a_learned_track_replaces_that_of_the_configured_track() -> None:
     kinematics = Kinematics(CALIBRATED)
     left, separation, _, learned = columns(ALL, kinematics, Track(1.25, 0.03))
     assert separation == (0.0, 0.0, 0.0, 0.0)
@@ -138,7 +140,7 @@ def uncertainty(config: OdometryConfig = EXACT, counts: int = 0) -> TwistUncerta
     return TwistUncertainty(ErrorModel(config, Kinematics(DriveConfig())), counts)
 
 
-def test_two_decimals_are_the_turnings_least_doubt() -> None:
+def test_the_rounding_to_two_decimals_gives_the_least_variance_of_the_turn_rate() -> None:
     # Four wheels have 0.01^2 / 12 rad2/s2 each. The twist uses a quarter of their sum, and the
     # difference of the sides.
     variances = uncertainty().of(Twist(0.5, 0.0), 0.01)
@@ -161,7 +163,9 @@ def test_counts_that_the_lines_show_are_as_coarse_as_those_that_are_configured()
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_noise_is_that_of_a_period_over_its_square(sign: float) -> None:
+def test_the_twist_noise_is_the_noise_of_a_period_divided_by_the_square_of_the_period(
+    sign: float,
+) -> None:
     # The noise is 1e-4 m2/m x 0.5 m/s / 0.01 s and 1e-4 rad2/m x 0.5 m/s / 0.01 s.
     variances = uncertainty(OdometryConfig()).of(Twist(0.5 * sign, 0.0), 0.01)
     assert variances.linear == pytest.approx(5e-3, rel=1e-3)
@@ -218,7 +222,7 @@ def test_coarse_encoders_see_rest_only_after_a_while() -> None:
     assert early.angular > late.angular
 
 
-def test_to_the_side_it_is_what_is_configured_but_at_rest() -> None:
+def test_the_lateral_variance_is_the_configured_one_except_at_rest() -> None:
     config = OdometryConfig(twist_covariance_diagonal=(1.0, 0.25, 1.0, 1.0, 1.0, 1.0))
     assert uncertainty(config).of(REST, 0.01).lateral == 0.25
     assert uncertainty(config).at_rest(1.0).lateral == LEAST
@@ -241,7 +245,7 @@ def test_the_ratio_s_error_makes_one_side_larger_and_the_other_smaller() -> None
     assert along == of_turn == 0.0
 
 
-def test_slip_is_a_share_of_the_distance_beside_that_of_the_scale() -> None:
+def test_the_deviations_of_slip_and_distance_scale_add_up_in_one_column() -> None:
     slip = columns(
         OdometryConfig(wheel_slip_std=0.03, distance_scale_std=0.04), Kinematics(DriveConfig())
     )

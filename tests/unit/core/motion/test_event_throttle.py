@@ -1,4 +1,4 @@
-"""The log gets a bounded number of lines per second: the first at once, the rest as a count."""
+"""The log gets few lines per second: the first event immediately, the rest as a count."""
 
 from __future__ import annotations
 
@@ -28,28 +28,28 @@ def told(events: list[Event], seconds: float, every_ms: int = 10) -> list[Event]
     return lines
 
 
-def test_nothing_is_nothing() -> None:
+def test_no_events_give_no_lines() -> None:
     assert told([], 3.0) == []
 
 
-def test_what_happens_once_is_reported_at_once_as_it_is() -> None:
+def test_a_single_event_is_reported_immediately_and_unchanged() -> None:
     event = Event("fault", "a wheel is dead", "error")
     assert EventThrottle().lines([event], 5) == (event,)
 
 
-def test_its_kind_comes_before_the_words() -> None:
+def test_the_kind_of_an_event_precedes_its_text() -> None:
     (line,) = EventThrottle().lines([refused()], 0)
     assert (line.text, line.by, line.count) == ("stale: late", "joe", 1)
     assert line.level == "warning"
 
 
-def test_more_of_the_same_is_one_line_a_second_with_how_often() -> None:
+def test_repeated_events_give_one_line_a_second_with_their_count() -> None:
     lines = told([refused()], 2.5)
     assert [line.count for line in lines] == [1, 100, 100]
     assert lines[1].text == "100 x stale; the last: late"
 
 
-def test_what_waits_is_told_when_its_second_is_over_and_only_once() -> None:
+def test_a_waiting_event_is_reported_only_once_when_its_second_is_over() -> None:
     tally = EventThrottle()
     tally.lines([refused()], 0)
     assert tally.lines([refused()], 500 * MS) == ()
@@ -59,7 +59,7 @@ def test_what_waits_is_told_when_its_second_is_over_and_only_once() -> None:
     assert tally.lines([], 5000 * MS) == ()
 
 
-def test_kinds_and_who_are_told_apart() -> None:
+def test_a_line_lists_the_kinds_and_the_senders_of_its_events() -> None:
     tally = EventThrottle()
     tally.lines([refused()], 0)
     tally.lines([refused(by="ann"), refused(), refused("wildcard", text="a star")], MS)
@@ -68,7 +68,7 @@ def test_kinds_and_who_are_told_apart() -> None:
     assert (line.by, line.count) == ("ann, joe", 3)
 
 
-def test_more_kinds_and_names_than_fit_are_others() -> None:
+def test_kinds_and_senders_that_do_not_fit_are_reported_as_others() -> None:
     many = [refused(f"reason{n}", by=f"sender{n}") for n in range(1000)]
     (line,) = EventThrottle().lines(many, 0)
     assert line.count == 1000
@@ -82,14 +82,14 @@ def test_an_event_may_count_for_many() -> None:
     assert (line.text, line.count) == ("29 x missed: 29 in a row", 29)
 
 
-def test_news_is_reported_at_once_until_it_comes_too_often() -> None:
+def test_news_is_reported_immediately_until_it_comes_too_often() -> None:
     lines = told([mode()], 10.0)
     assert [line.count for line in lines[:BURST]] == [1] * BURST
     assert len(lines) == BURST + 9
     assert sum(line.count for line in lines) <= 1000
 
 
-def test_after_a_rest_a_burst_is_told_in_full_again() -> None:
+def test_a_burst_after_a_pause_is_reported_in_full_again() -> None:
     tally = EventThrottle()
     for start_s in (0, 2 * BURST, 4 * BURST):
         for step in range(BURST):
@@ -97,7 +97,7 @@ def test_after_a_rest_a_burst_is_told_in_full_again() -> None:
         assert tally.lines([mode()], start_s * NS_PER_S + BURST * MS) == ()
 
 
-def test_news_takes_along_what_waited() -> None:
+def test_a_line_of_news_includes_the_events_that_waited() -> None:
     tally = EventThrottle()
     first = Event("activate", "active", by="joe")
     again = Event("activate", "active", by="ann", news=False)
@@ -107,24 +107,24 @@ def test_news_takes_along_what_waited() -> None:
     assert (line.text, line.by, line.count) == ("2 times; the last: active", "ann, joe", 2)
 
 
-def test_names_do_not_wait_for_each_other() -> None:
+def test_events_of_different_names_do_not_delay_each_other() -> None:
     lines = EventThrottle().lines([refused(), mode()], 0)
     assert [line.name for line in lines] == ["command_refused", "mode"]
 
 
-def test_a_line_is_as_bad_as_the_worst_in_it() -> None:
+def test_a_line_has_the_highest_level_of_its_events() -> None:
     good, bad = Event("link_check", "fine"), Event("link_check", "no answer", "error")
     (line,) = EventThrottle().lines([bad, good], 0)
     assert (line.level, line.text) == ("error", "2 times; the last: fine")
 
 
-def test_more_of_the_same_is_told_as_such_and_news_is_not() -> None:
+def test_a_line_is_news_only_if_its_event_is_news() -> None:
     (again,), (news,) = EventThrottle().lines([refused()], 0), EventThrottle().lines([mode()], 0)
     assert not again.news
     assert news.news
 
 
-def test_two_lines_are_one_with_how_often_in_all_and_the_words_of_the_last() -> None:
+def test_two_joined_lines_have_the_total_count_and_the_last_text() -> None:
     one = Event("command_refused", "12 x stale; the last: late", "info", "joe, ann", count=12)
     other = Event("command_refused", "3 x wildcard: a star", "warning", "ann, eve", count=3)
     line = together(one, other)
@@ -134,7 +134,7 @@ def test_two_lines_are_one_with_how_often_in_all_and_the_words_of_the_last() -> 
     assert together(refused(), line).text == "16 times; the last: a star"
 
 
-def test_lines_of_any_number_of_senders_name_a_few() -> None:
+def test_joined_lines_of_many_senders_name_only_a_few() -> None:
     line = refused(by="")
     for number in range(100):
         line = together(line, refused(by=f"sender{number}"))
@@ -153,7 +153,7 @@ events = st.builds(
 
 
 @given(st.lists(st.tuples(st.integers(0, NS_PER_S), st.lists(events, max_size=4)), max_size=40))
-def test_nothing_is_lost_and_no_second_has_more_than_its_lines(
+def test_every_event_is_counted_and_no_second_has_more_lines_than_the_limit(
     steps: list[tuple[int, list[Event]]],
 ) -> None:
     tally, now_ns = EventThrottle(), 0

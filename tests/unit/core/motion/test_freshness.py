@@ -40,20 +40,22 @@ class Clock:
 
 
 @pytest.mark.parametrize("delay", [0.0, 300.0, -86_400_000.0, 1.8e12])
-def test_a_clock_never_heard_counts_once_its_delays_were_steady_for_a_timeout(delay: float) -> None:
+def test_a_new_clock_counts_once_its_delays_were_steady_for_a_timeout(delay: float) -> None:
     verdicts = Clock(known=False).steadily(delay, 400)
     assert verdicts == ["first", *["unproven"] * 4, *["fresh"] * 3]
 
 
 @pytest.mark.parametrize("every", [263.0, 500.0, 1900.0])
-def test_one_that_sends_seldom_needs_three(every: float) -> None:
+def test_a_new_clock_that_sends_seldom_needs_three_commands(every: float) -> None:
     verdicts = Clock(known=False).steadily(0.0, 3 * every, every)
     assert verdicts == ["first", "unproven", "fresh"]
 
 
 @pytest.mark.parametrize("faster", [0.98, 0.9, 0.8, 1.02, 1.1, 1.3, 2.0, 5.0, 50.0])
 @pytest.mark.parametrize("heaps", [1, 6])
-def test_a_backlog_never_counts_however_fast_or_slowly_it_pours(faster: float, heaps: int) -> None:
+def test_a_backlog_never_counts_however_fast_or_slowly_the_backlog_arrives(
+    faster: float, heaps: int
+) -> None:
     # The sender sends at 20 Hz for a minute. The backlog arrives `faster` than it was sent, one by
     # one or in groups.
     clock = Clock(known=False)
@@ -63,12 +65,12 @@ def test_a_backlog_never_counts_however_fast_or_slowly_it_pours(faster: float, h
         assert clock.sends(delay, after) in ("first", "unproven")
 
 
-def test_what_pours_out_at_the_pace_it_was_sent_is_a_clock_that_is_behind() -> None:
+def test_commands_that_arrive_late_at_the_pace_of_sending_count_as_a_clock_that_is_behind() -> None:
     assert Clock(known=False).steadily(5000.0, 300)[-1] == "fresh"
 
 
 @pytest.mark.parametrize("jitter", [1.0, 10.0, 30.0, 100.0])
-def test_jitter_keeps_nobody_out_for_three_seconds(jitter: float) -> None:
+def test_a_new_clock_with_jitter_counts_within_three_seconds(jitter: float) -> None:
     for seed in range(50):
         dice, clock = random.Random(seed), Clock(known=False)
         assert "fresh" in [clock.sends(dice.uniform(0.0, jitter)) for _ in range(60)]
@@ -119,7 +121,7 @@ def test_a_zero_at_the_head_of_a_backlog_is_forgotten() -> None:
     assert bench.choice().wait.what == "neutral"
 
 
-def test_a_network_that_lets_in_by_heaps_keeps_nobody_out() -> None:
+def test_a_new_clock_counts_although_its_commands_arrive_in_bursts() -> None:
     clock = Clock(known=False)
     for _ in range(10):
         verdicts = [clock.sends(80.0 - 20.0 * n, 0.0 if n else 100.0) for n in range(5)]
@@ -138,13 +140,13 @@ def test_a_proof_takes_the_source_s_timeout_but_no_more_than_two_seconds() -> No
 
 
 @pytest.mark.parametrize("source", [SLOW, Source("quick", 1, timeout=0.02)])
-def test_how_late_is_stale_depends_on_the_source(source: Source) -> None:
+def test_a_command_later_than_the_timeout_of_its_source_is_stale(source: Source) -> None:
     bench = Bench(source).known(source)
     assert bench.wait(1100).stamped(source, late_ms=source.timeout * 1000) == ""
     assert bench.wait(1100).stamped(source, late_ms=source.timeout * 1000 + 1) == "stale"
 
 
-def test_a_stale_command_refreshes_nothing() -> None:
+def test_a_stale_command_does_not_refresh_the_timeout() -> None:
     bench = Bench(HIGH).known(HIGH)
     for _ in range(5):
         bench.wait(51)
@@ -153,7 +155,7 @@ def test_a_stale_command_refreshes_nothing() -> None:
     assert bench.driver() == ""
 
 
-def test_a_backlog_is_not_obeyed_and_what_is_fresh_again_is() -> None:
+def test_a_backlog_is_refused_until_its_commands_are_fresh_again() -> None:
     bench = Bench(HIGH).known(HIGH)
     bench.wait(3000)
     ages = [float(age) for age in range(3000, -1, -50)]
@@ -162,7 +164,7 @@ def test_a_backlog_is_not_obeyed_and_what_is_fresh_again_is() -> None:
     assert answers == ["stale" if age > 250.6 else "" for age in ages]
 
 
-def test_each_clock_is_known_for_itself_and_on_all_its_sources() -> None:
+def test_each_clock_is_known_separately_and_on_all_its_sources() -> None:
     bench = Bench(HIGH, LOW).known(HIGH, clock="alice")
     bench.offset_ns -= HOUR_NS
     assert bench.stamped(HIGH, clock="bob") == "unproven"
@@ -183,7 +185,7 @@ def test_an_hour_with_a_drifting_clock_loses_no_command(drift: float) -> None:
         assert bench.wait(200).stamped(HIGH) == ""
 
 
-def test_only_so_many_clocks_are_remembered_and_the_longest_unheard_goes_first() -> None:
+def test_only_1024_clocks_are_remembered_and_the_one_silent_longest_is_forgotten_first() -> None:
     clock = Clock()
     for number in range(1023):
         clock.sends(0.0, 1e-3, f"sender {number}")
@@ -201,7 +203,7 @@ def test_a_known_clock_outlives_any_number_of_senders_that_send_once(steady: boo
     assert clock.sends(0.0) == "fresh"
 
 
-def test_one_at_20_hz_stays_known_among_four_thousand_names_a_second() -> None:
+def test_a_sender_at_20_hz_stays_known_among_four_thousand_other_senders_a_second() -> None:
     clock = Clock()
     for number in range(2000):
         verdict = clock.sends(0.0, 0.0) if number % 200 == 0 else "fresh"
@@ -209,7 +211,7 @@ def test_one_at_20_hz_stays_known_among_four_thousand_names_a_second() -> None:
         clock.sends(0.0, 0.25, f"stranger {number}")
 
 
-def test_one_at_20_hz_who_is_new_becomes_known_among_four_thousand_names_a_second() -> None:
+def test_a_new_sender_at_20_hz_becomes_known_among_four_thousand_other_senders_a_second() -> None:
     clock = Clock(known=False)
     verdicts = []
     for number in range(2000):
@@ -219,7 +221,7 @@ def test_one_at_20_hz_who_is_new_becomes_known_among_four_thousand_names_a_secon
     assert verdicts[-1] == "fresh"
 
 
-def test_one_who_comes_late_among_others_who_send_as_well_begins_anew_at_best() -> None:
+def test_a_clock_that_is_late_among_other_senders_stays_stale_for_over_a_second() -> None:
     clock, verdicts = Clock(), []
     for _ in range(100):
         for number in range(40):
@@ -236,7 +238,9 @@ def test_one_who_comes_late_among_others_who_send_as_well_begins_anew_at_best() 
         max_size=60,
     )
 )
-def test_what_is_forgotten_would_have_begun_anew(order: list[tuple[int, float]]) -> None:
+def test_a_sender_among_others_gets_the_same_verdicts_as_alone(
+    order: list[tuple[int, float]],
+) -> None:
     """Each sender among others gets the same verdicts as if it were alone."""
     among = Clock(known=False)
     alone = {name: Clock(known=False) for name in range(5)}
@@ -270,20 +274,20 @@ def test_a_clock_that_was_set_is_refused_until_its_delays_were_steady_for_a_seco
 
 
 @pytest.mark.parametrize("step", [200.0, -40.0])
-def test_a_step_that_a_network_may_make_is_none(step: float) -> None:
+def test_a_change_of_delay_that_a_network_may_cause_is_no_adjustment(step: float) -> None:
     clock = Clock()
     assert clock.sends(step, after=250.0) == "fresh"
     assert set(clock.steadily(step, 1000)) == {"fresh"}
 
 
 @pytest.mark.parametrize("step", [5000.0, -5000.0])
-def test_one_stamp_that_is_wrong_costs_nothing_but_itself(step: float) -> None:
+def test_a_wrong_stamp_makes_only_its_own_command_stale(step: float) -> None:
     clock = Clock()
     assert clock.sends(step) == "stale"
     assert set(clock.steadily(0.0, 500)) == {"fresh"}
 
 
-def test_delays_that_keep_falling_below_the_promptest_do_not_count() -> None:
+def test_delays_that_keep_falling_below_the_minimum_do_not_count() -> None:
     # A clock set forward hides a delay, so delays that fall like those of a backlog are treated as
     # one.
     clock = Clock()
@@ -304,12 +308,12 @@ def test_a_clock_that_is_slewed_slow_counts_again_each_time_it_has_crept_too_far
     assert verdicts.count("stale") <= 20
 
 
-def test_late_by_a_jump_and_rising_no_less_is_a_queue_that_grows_and_no_clock() -> None:
+def test_a_delay_that_jumped_and_still_rises_is_a_growing_queue_and_stays_stale() -> None:
     clock = Clock()
     assert {clock.sends(1000.0 + 4.0 * n) for n in range(200)} == {"stale"}
 
 
-def test_a_clock_that_was_set_has_its_sender_let_go_first() -> None:
+def test_a_sender_whose_clock_was_adjusted_must_send_a_zero() -> None:
     bench = Bench(HIGH).known(HIGH)
     assert bench.stamped(HIGH) == ""
     assert bench.driver() == "high"
@@ -331,7 +335,7 @@ def driving(bench: Bench, source: Source, late_ms: float, ms: float) -> list[str
     return [bench.wait(50).stamped(source, late_ms, "joe", GO, "joe") for _ in range(int(ms / 50))]
 
 
-def test_zeros_of_a_clock_that_wavers_on_another_source_made_nobody_neutral() -> None:
+def test_unproven_zeros_do_not_arm_a_sender_whose_clock_wavers_on_another_source() -> None:
     bench = Bench(HIGH, LOW, armed=False)
     for _ in range(3):
         assert bench.wait(50).stamped(HIGH, 0.0, "joe", REST, "joe") == "unproven"
@@ -340,7 +344,7 @@ def test_zeros_of_a_clock_that_wavers_on_another_source_made_nobody_neutral() ->
     assert bench.driver() == ""
 
 
-def test_a_clock_that_was_set_must_be_neutral_on_each_of_its_sources() -> None:
+def test_a_sender_whose_clock_was_adjusted_must_send_a_zero_on_each_of_its_sources() -> None:
     bench = Bench(HIGH, LOW, armed=False).known(HIGH, "joe", "joe").known(LOW, "joe", "joe")
     bench.wait(50).stamped(LOW, 0.0, "joe", GO, "joe")
     assert bench.driver() == "high" or bench.driver() == "low"
@@ -351,7 +355,7 @@ def test_a_clock_that_was_set_must_be_neutral_on_each_of_its_sources() -> None:
     assert bench.driver() == ""
     bench.wait(300)
     assert driving(bench, LOW, 5000.0, 50) == [""]
-    assert bench.driver() == "", "it was free there before its clock was set"
+    assert bench.driver() == "", "it was armed there before its clock was set"
 
 
 # two kinds of clocks
@@ -361,7 +365,7 @@ def test_a_clock_that_was_set_must_be_neutral_on_each_of_its_sources() -> None:
 def test_a_steady_clock_that_is_late_stays_refused_however_long(delay: float) -> None:
     clock = Clock(steady=True)
     assert set(clock.steadily(delay, 60_000)) == {"stale"}
-    assert clock.sends(delay, after=10_000.0) == "stale", "also behind a pause of its own"
+    assert clock.sends(delay, after=10_000.0) == "stale", "also after a pause of its own"
     assert clock.sends(0.0) == "fresh"
 
 
@@ -418,17 +422,17 @@ def test_a_jump_of_over_a_second_is_forgiven_only_where_the_clock_shows_it(
     assert set(held.steadily(step, waited)) == {"stale"}
     assert "set" in held.steadily(step, 20_000), "it is never locked out for ever"
     shown = Clock()
-    assert "set" in shown.steadily(step, 2000), "stamps that go back are no network's"
+    assert "set" in shown.steadily(step, 2000), "a network does not set stamps back"
 
 
-def test_a_pause_by_its_own_stamps_lets_a_foreign_clock_have_been_set() -> None:
+def test_a_foreign_clock_that_pauses_by_its_own_stamps_may_have_been_adjusted() -> None:
     clock = Clock()
     clock.sends(5000.0, after=7100.0)
     assert clock.steadily(5000.0, 1600)[-1] in ("set", "fresh")
-    assert clock.freshness.forgiven_ns == pytest.approx(5e9, rel=0.01), "it is told all the same"
+    assert clock.freshness.forgiven_ns == pytest.approx(5e9, rel=0.01), "it is counted anyway"
 
 
-def test_a_clock_that_stands_until_it_is_caught_up_was_set_back() -> None:
+def test_a_clock_that_stands_still_until_real_time_catches_up_was_set_back() -> None:
     clock = Clock()
     for late in range(0, 3000, 50):
         clock.sends(float(late))
@@ -436,7 +440,7 @@ def test_a_clock_that_stands_until_it_is_caught_up_was_set_back() -> None:
     assert clock.freshness.forgiven_ns <= 3 * NS_PER_S // 10, "the timeout, and the last step"
 
 
-def test_the_budget_is_never_more_than_its_limit() -> None:
+def test_the_budget_of_forgiven_delay_never_exceeds_its_limit() -> None:
     clock = Clock()
     clock.steadily(0.0, 200_000, 200.0)
     clock.now += FORGIVE_NS / MS + 100
@@ -501,7 +505,7 @@ def test_one_command_that_is_swapped_or_repeated_across_a_jump_of_the_delays_sho
 # order
 
 
-def test_a_command_behind_a_newer_one_is_stale_and_refreshes_nothing() -> None:
+def test_a_command_older_than_the_last_one_is_stale_and_later_ones_stay_fresh() -> None:
     clock = Clock()
     assert clock.sends(0.0) == "fresh"
     assert clock.sends(100.0) == "stale"
@@ -513,7 +517,7 @@ def test_a_command_behind_a_newer_one_is_stale_and_refreshes_nothing() -> None:
     ("stamp", "number", "fresh"),
     [(0, 8, True), (0, 7, False), (0, 6, False), (1, 1, True), (-1, 9, False)],
 )
-def test_of_equal_stamps_the_number_decides(stamp: int, number: int, fresh: bool) -> None:
+def test_the_number_decides_between_equal_stamps(stamp: int, number: int, fresh: bool) -> None:
     clock = Clock()
     at_ns = round(clock.now * MS) + 50 * MS
     for after, sent, count in ((0, 0, 7), (10 * MS, stamp, number)):
@@ -560,7 +564,9 @@ def test_a_late_command_of_a_source_does_not_disarm_it_while_its_others_are_fres
 
 
 @each("rise", [400.0, 2.0])
-def test_a_source_with_a_long_timeout_does_not_keep_another_of_its_clock_out(rise: float) -> None:
+def test_a_source_with_a_long_timeout_does_not_block_another_source_of_the_same_clock(
+    rise: float,
+) -> None:
     clock, delay, refused = Clock(), 0.0, 0
     clock.now += 500.0
     for _ in range(300):

@@ -40,32 +40,32 @@ def total(rolled: Rolled) -> float:
     return rolled.turned[0] + sum(piece[0] for piece in rolled.pieces)
 
 
-def test_a_line_is_its_speed_times_its_time() -> None:
+def test_a_line_turns_the_wheels_by_its_speed_times_its_duration() -> None:
     rolled = Rolling().take(Feedback(AT, FOUR, 0.01), TWO)
     assert rolled.pieces == (all_four(0.04),)
     assert rolled.seen == all_four(0.04)
     assert (rolled.seconds, rolled.known, rolled.unknown) == (0.01, 0.01, 0.0)
 
 
-def test_who_stands_rolls_nowhere() -> None:
+def test_wheels_at_rest_roll_no_angle() -> None:
     rolled = Rolling().take(Feedback(AT, WheelSpeeds(), 0.01), WheelSpeeds())
     assert rolled.pieces == ()
     assert rolled.turned == NOWHERE
 
 
-def test_what_no_line_reported_lies_between_two_speeds() -> None:
+def test_a_bridged_time_has_the_mean_of_the_speeds_around_it() -> None:
     rolled = Rolling().take(Feedback(AT, FOUR, 0.03, bridged=0.02), TWO)
     assert rolled.pieces == (all_four(0.06), all_four(0.04))
     assert rolled.seen == all_four(0.1)
     assert (rolled.seconds, rolled.bridged) == near(0.03, 0.02)
 
 
-def test_a_silence_goes_on_as_before_it_no_longer_than_until_wheels_are_told_to_stand() -> None:
+def test_a_silence_continues_the_speed_before_it_until_rest_is_commanded() -> None:
     rolling = Rolling(quiet=0.1)
     stood = rolling.take(Feedback(AT, WheelSpeeds(), 0.6, bridged=0.5), FOUR)
     assert total(stood) == pytest.approx(0.4)
     short = rolling.take(Feedback(AT, WheelSpeeds(), 0.2, bridged=0.1), FOUR)
-    assert total(short) == pytest.approx(0.2), "as long as nobody told them"
+    assert total(short) == pytest.approx(0.2), "until rest is commanded"
 
 
 def test_a_stall_of_the_daemon_delays_the_command_to_rest_in_the_next_line_only() -> None:
@@ -76,7 +76,7 @@ def test_a_stall_of_the_daemon_delays_the_command_to_rest_in_the_next_line_only(
         assert total(stood) == pytest.approx(4.0 * seconds)
 
 
-def test_counts_go_before_the_speed() -> None:
+def test_counts_take_precedence_over_the_speed() -> None:
     counted = (0.05, 0.05, 0.05, 0.05)
     rolled = Rolling().take(Feedback(AT, FOUR, 0.01, counted=counted), TWO)
     assert rolled.pieces == (counted,)
@@ -86,7 +86,7 @@ def test_counts_go_before_the_speed() -> None:
     assert (rolled.turned, rolled.pieces, rolled.seen) == (turned, (), turned)
 
 
-def test_counts_of_a_line_passed_over_behind_a_silence_are_reported_once() -> None:
+def test_counts_of_a_skipped_line_after_a_long_silence_are_added_once() -> None:
     """The line has no duration of its own, because the silence before it covers that time."""
     rolling, turned = Rolling(), (0.06, 0.06, 0.06, 0.06)
     rolling.skip(Feedback(AT, FOUR, 0.0, gap=0.5, turned=turned))
@@ -96,7 +96,7 @@ def test_counts_of_a_line_passed_over_behind_a_silence_are_reported_once() -> No
 
 
 @pytest.mark.parametrize("lines", [1, 4])
-def test_a_moment_of_lines_passed_over_went_on_at_the_next_ones_speed(lines: int) -> None:
+def test_a_short_time_of_skipped_lines_has_the_speed_of_the_next_line(lines: int) -> None:
     rolling = Rolling()
     for _ in range(lines):
         rolling.skip(Feedback(AT, TWO, 0.01))
@@ -106,7 +106,7 @@ def test_a_moment_of_lines_passed_over_went_on_at_the_next_ones_speed(lines: int
     assert total(rolling.take(Feedback(AT, FOUR, 0.01), FOUR)) == pytest.approx(0.04)
 
 
-def test_of_more_nobody_knows() -> None:
+def test_motion_is_unknown_after_too_many_implausible_lines() -> None:
     rolling = Rolling()
     rolling.skip(Feedback(AT, TWO, MAX_LOST_S))
     rolling.skip(Feedback(AT, TWO, 0.01))
@@ -115,7 +115,7 @@ def test_of_more_nobody_knows() -> None:
     assert (rolled.known, rolled.unknown) == near(0.0, MAX_LOST_S + 0.01)
 
 
-def test_of_counts_passed_over_none_is_lost_nor_their_time() -> None:
+def test_neither_the_counts_nor_the_time_of_a_skipped_line_are_lost() -> None:
     rolling, turned = Rolling(), (0.06, 0.06, 0.06, 0.06)
     rolling.skip(Feedback(AT, TWO, 0.01, turned=turned))
     rolled = rolling.take(Feedback(AT, FOUR, 0.01, turned=turned), TWO)
@@ -124,14 +124,14 @@ def test_of_counts_passed_over_none_is_lost_nor_their_time() -> None:
     assert (rolled.seconds, rolled.known) == near(0.01, 0.02)
 
 
-def test_gaps_before_lines_passed_over_stay_gaps() -> None:
+def test_gaps_before_skipped_lines_stay_unknown_motion() -> None:
     rolling = Rolling()
     rolling.skip(Feedback(AT, TWO, 0.0, gap=0.5))
     rolled = rolling.take(Feedback(AT, FOUR, 0.0, gap=0.3), TWO)
     assert (rolled.known, rolled.unknown) == near(0.0, 0.8)
 
 
-def test_of_a_slow_link_one_line_passed_over_is_bridged_too() -> None:
+def test_one_skipped_line_of_a_slow_link_is_bridged_too() -> None:
     rolling = Rolling()
     rolling.skip(Feedback(AT, TWO, 0.1))
     rolled = rolling.take(Feedback(AT, FOUR, 0.1), TWO)
@@ -139,7 +139,7 @@ def test_of_a_slow_link_one_line_passed_over_is_bridged_too() -> None:
     assert (rolled.known, rolled.unknown) == near(0.2, 0.0)
 
 
-def test_counts_passed_over_behind_a_silence_are_added_once() -> None:
+def test_counts_of_a_skipped_line_after_a_short_silence_are_added_once() -> None:
     rolling, turned = Rolling(), (0.06, 0.06, 0.06, 0.06)
     rolling.skip(Feedback(AT, TWO, 0.0, gap=0.15, turned=turned))
     first, second = (rolling.take(Feedback(AT, FOUR, 0.01, turned=turned), TWO) for _ in range(2))
@@ -147,7 +147,7 @@ def test_counts_passed_over_behind_a_silence_are_added_once() -> None:
     assert second.turned == turned
 
 
-def test_a_gap_before_a_line_passed_over_lies_between_the_speeds_around_it() -> None:
+def test_a_gap_before_a_skipped_line_has_the_mean_of_the_speeds_around_it() -> None:
     rolling = Rolling()
     rolling.skip(Feedback(AT, TWO, 0.51, bridged=0.5))
     rolled = rolling.take(Feedback(AT, FOUR, 0.01), TWO)
@@ -157,9 +157,7 @@ def test_a_gap_before_a_line_passed_over_lies_between_the_speeds_around_it() -> 
     assert total(rolling.take(Feedback(AT, FOUR, 0.01), FOUR)) == pytest.approx(0.04)
 
 
-def test_a_gap_before_a_line_passed_over_goes_on_at_the_next_lines_speed_if_that_has_counts() -> (
-    None
-):
+def test_a_gap_before_a_skipped_line_has_the_next_lines_speed_if_that_line_has_counts() -> None:
     rolling, turned = Rolling(), (0.06, 0.06, 0.06, 0.06)
     rolling.skip(Feedback(AT, TWO, 0.51, bridged=0.5))
     rolled = rolling.take(Feedback(AT, FOUR, 0.01, turned=turned), TWO)
@@ -219,7 +217,7 @@ def test_wheels_of_a_side_that_change_alike_in_a_gap_need_no_other_line() -> Non
     assert doubtful.hear(WheelSpeeds(40.0, -9.0, -9.2, 40.1), 0.51, bridged=0.5) == ([2], [])
 
 
-def test_a_doubtful_angle_no_larger_than_that_of_a_usual_line_is_used_at_once() -> None:
+def test_a_doubtful_angle_no_larger_than_that_of_a_usual_line_is_used_immediately() -> None:
     # (1500 rad/s2 x 10 ms + 2 rad/s) x 10 ms / 0.51 s is 0.333 rad/s.
     assert Doubtful().hear(one(2, 4.33), 0.51, bridged=0.5) == ([2], [])
     assert Doubtful().hear(one(2, 4.34), 0.51, bridged=0.5) == ([], [])
@@ -236,13 +234,13 @@ def test_a_pause_without_lost_lines_is_judged_like_a_gap() -> None:
     assert doubtful.hear(FOUR, 0.01) == ([3], [2])
 
 
-def test_lines_passed_over_belong_to_the_time_of_the_next_one() -> None:
+def test_a_line_after_skipped_lines_is_doubtful_like_a_line_after_a_gap() -> None:
     doubtful = Doubtful()
     doubtful.skipped = 0.5
     assert doubtful.hear(one(0, 14.0), 0.01) == ([], [])
 
 
-def test_a_line_with_counts_is_used_at_once() -> None:
+def test_a_line_with_counts_is_used_immediately() -> None:
     assert Doubtful().hear(one(0, 14.0), 0.51, turned=(0.0,) * 4) == ([2], [])
 
 
@@ -256,7 +254,7 @@ def test_a_line_with_counts_is_used_at_once() -> None:
     ],
     ids=["none", "first", "second", "third"],
 )
-def test_of_three_lines_the_one_that_differs_much_is_dropped(
+def test_the_line_that_differs_much_from_two_others_is_dropped(
     speeds: tuple[float, ...], used: list[int], dropped: list[int]
 ) -> None:
     """A wheel changes alone, because the encoder of the other one is dead."""
@@ -293,7 +291,7 @@ def test_on_a_slow_link_the_usual_time_is_longer() -> None:
 CRUISE = Twist(0.5, 0.5)
 
 
-def test_until_it_is_measured_the_acceleration_is_guessed() -> None:
+def test_the_acceleration_is_guessed_until_it_is_measured() -> None:
     along, yaw = Gaps().unseen(SPAN, CRUISE, CRUISE)
     assert along == pytest.approx((GUESS.linear * SPAN**2 / 2) ** 2)
     assert yaw == pytest.approx((GUESS.angular * SPAN**2 / 2) ** 2)
@@ -310,7 +308,7 @@ def test_a_steady_drive_makes_gaps_certain() -> None:
     assert measured[1] < 0.02 * guessed[1]
 
 
-def test_a_jerky_drive_is_measured_as_what_it_is() -> None:
+def test_the_uncertainty_of_a_gap_follows_the_measured_accelerations_of_a_jerky_drive() -> None:
     # The speed alternates between 0.4 and 0.6 m/s every 0.1 s. A span begins and ends at one of
     # them.
     gaps = Gaps()
@@ -321,7 +319,7 @@ def test_a_jerky_drive_is_measured_as_what_it_is() -> None:
     assert yaw < 1e-5
 
 
-def test_standing_says_nothing_of_driving() -> None:
+def test_time_at_rest_does_not_change_the_uncertainty_of_gaps() -> None:
     gaps = Gaps()
     before = gaps.unseen(0.3, CRUISE, CRUISE)
     for _ in range(6000):
@@ -329,16 +327,16 @@ def test_standing_says_nothing_of_driving() -> None:
     assert gaps.unseen(0.3, CRUISE, CRUISE) == before
 
 
-def test_who_stood_before_and_after_was_nowhere() -> None:
+def test_a_gap_between_two_rests_has_no_uncertainty() -> None:
     assert Gaps().unseen(5.0, REST, REST) == (0.0, 0.0)
 
 
-def test_no_gap_is_longer_than_its_faster_speed_goes() -> None:
+def test_the_uncertainty_of_a_gap_is_bounded_by_its_faster_speed() -> None:
     along, yaw = Gaps().unseen(30.0, Twist(0.1, -0.2), Twist(-0.5, 0.1))
     assert (along, yaw) == pytest.approx((15.0**2, 6.0**2))
 
 
-def test_a_line_between_them_makes_two_gaps_of_one() -> None:
+def test_a_line_between_two_gaps_makes_their_errors_independent() -> None:
     gaps = Gaps()
     first = gaps.bridge(0.3, CRUISE, CRUISE)
     gaps.follow(CRUISE, 0.01)

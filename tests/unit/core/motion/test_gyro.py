@@ -1,4 +1,4 @@
-"""Gyro samples and feedback lines give the turn of each line, or none."""
+"""Tests of the turn of each feedback line, which the gyro samples give if they can."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def over_a_gap(bench: Bench, seconds: float, rate: float) -> Turn | None:
 
 
 @pytest.mark.parametrize("sample_ms", [2, 10, 50, 100])
-def test_the_turn_is_the_gyros_however_the_wheels_skid(sample_ms: int) -> None:
+def test_the_turn_is_that_of_the_gyro_even_if_the_wheels_skid(sample_ms: int) -> None:
     bench = Bench(bias=0.01, sample_ms=sample_ms)
     bench.run(REST_FIRST)
     bench.told = bench.true = 0.0
@@ -138,7 +138,7 @@ def test_the_turn_is_the_gyros_however_the_wheels_skid(sample_ms: int) -> None:
     assert bench.told == pytest.approx(bench.true, abs=2e-3 + 1e-3 * sample_ms)
 
 
-def test_before_it_has_stood_the_wheels_alone_tell() -> None:
+def test_the_wheels_alone_give_the_turn_until_the_robot_has_rested() -> None:
     bench = Bench()
     bench.run(3.0, 0.5)
     assert bench.none == 300
@@ -147,7 +147,7 @@ def test_before_it_has_stood_the_wheels_alone_tell() -> None:
 
 
 @pytest.mark.slow
-def test_at_rest_nothing_turns_whatever_its_bias_and_noise() -> None:
+def test_a_robot_at_rest_does_not_turn_whatever_the_bias_and_noise_of_its_gyro() -> None:
     bench = Bench(bias=-0.03, noise=0.01)
     bench.run(REST_FIRST)
     bench.told = 0.0
@@ -169,7 +169,7 @@ def test_a_robot_that_is_turned_by_hand_while_its_wheels_stand_is_followed() -> 
 @pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.floats(0.01, 1.5), min_size=2, max_size=6), st.integers(0, 60))
-def test_in_the_end_the_turn_is_whole_however_late_it_came(
+def test_the_whole_turn_is_counted_however_late_the_gyro_reports(
     rates: list[float], late_ms: int
 ) -> None:
     bench = Bench(late_ms=late_ms)
@@ -182,7 +182,7 @@ def test_in_the_end_the_turn_is_whole_however_late_it_came(
     assert bench.told == pytest.approx(bench.true, abs=5e-3)
 
 
-def test_a_gap_in_the_wheels_lines_is_no_gap_in_the_turn() -> None:
+def test_the_gyro_gives_the_turn_of_a_gap_in_the_feedback() -> None:
     bench = Bench()
     bench.run(REST_FIRST)
     bench.run(1.0, 0.5)
@@ -195,7 +195,7 @@ def test_a_gap_in_the_wheels_lines_is_no_gap_in_the_turn() -> None:
 
 
 @pytest.mark.parametrize("late_ms", [0, 20, 50])
-def test_how_late_it_tells_is_found_at_a_rest(late_ms: int) -> None:
+def test_the_delay_of_a_gyro_is_found_at_a_rest(late_ms: int) -> None:
     bench = Bench(late_ms=late_ms)
     bench.run(REST_FIRST)
     bench.run(20.0, stirring)
@@ -203,7 +203,7 @@ def test_how_late_it_tells_is_found_at_a_rest(late_ms: int) -> None:
     assert bench.gyro.status.delay == pytest.approx(late_ms / 1000, abs=0.012)
 
 
-def test_stamps_take_the_jitter_of_the_way_out() -> None:
+def test_stamps_remove_the_jitter_of_the_transmission() -> None:
     bench, worst = Bench(stamped=True), 0.0
     bench.run(REST_FIRST)
     for n in range(500):
@@ -215,7 +215,7 @@ def test_stamps_take_the_jitter_of_the_way_out() -> None:
     assert worst < 2e-3
 
 
-def test_a_clock_that_is_set_costs_nothing() -> None:
+def test_a_sample_with_a_wrong_stamp_does_not_spoil_the_turn() -> None:
     bench = Bench(stamped=True)
     bench.run(REST_FIRST)
     bench.run(1.0, 0.5)
@@ -226,7 +226,7 @@ def test_a_clock_that_is_set_costs_nothing() -> None:
 
 
 @pytest.mark.parametrize("set_ms", [-15, -175, -240, 175])
-def test_a_clock_that_is_set_makes_no_wrong_turn(set_ms: int) -> None:
+def test_an_adjustment_of_the_stamp_clock_makes_no_wrong_turn(set_ms: int) -> None:
     bench, worst = Bench(stamped=True), 0.0
     bench.run(REST_FIRST)
     bench.run(2.0)
@@ -238,7 +238,7 @@ def test_a_clock_that_is_set_makes_no_wrong_turn(set_ms: int) -> None:
     assert worst < 0.07
 
 
-def test_stamps_that_jitter_backwards_are_no_clock_that_was_set() -> None:
+def test_stamps_that_jitter_backwards_are_no_adjustment_of_the_clock() -> None:
     worst = {}
     for back_ms in (0, 12):
         bench, worst[back_ms] = Bench(stamped=True), 0.0
@@ -254,7 +254,7 @@ def test_stamps_that_jitter_backwards_are_no_clock_that_was_set() -> None:
 # silence, slip, contradictions
 
 
-def test_a_gyro_that_falls_silent_leaves_the_wheels_alone_and_comes_back() -> None:
+def test_the_wheels_alone_give_the_turn_while_the_gyro_is_silent() -> None:
     bench = Bench()
     bench.run(REST_FIRST)
     bench.run(1.0, 0.5)
@@ -275,7 +275,9 @@ def test_a_gyro_that_falls_silent_leaves_the_wheels_alone_and_comes_back() -> No
 
 @pytest.mark.parametrize("back_ms", [150, 210, 230, 290, 400])
 @pytest.mark.parametrize("rate", [1.0, -2.0])
-def test_what_was_told_of_a_silence_is_not_told_again(back_ms: int, rate: float) -> None:
+def test_a_turn_that_was_assumed_during_a_silence_is_not_counted_twice(
+    back_ms: int, rate: float
+) -> None:
     bench = Bench(stamped=True, skid=1.0)
     bench.run(REST_FIRST)
     bench.run(1.0, rate)
@@ -286,7 +288,7 @@ def test_what_was_told_of_a_silence_is_not_told_again(back_ms: int, rate: float)
 
 
 @pytest.mark.parametrize("late_ms", [150, 250])
-def test_one_that_is_late_is_not_silent(late_ms: int) -> None:
+def test_a_late_gyro_is_not_silent(late_ms: int) -> None:
     bench = Bench(late_ms=late_ms, sample_ms=100)
     bench.run(REST_FIRST)
     for _ in range(5):
@@ -302,7 +304,7 @@ def test_one_that_is_late_is_not_silent(late_ms: int) -> None:
     assert bench.told - begun == pytest.approx(bench.true - true, abs=0.03)
 
 
-def test_for_a_moment_without_samples_it_turns_on_as_it_did() -> None:
+def test_the_last_turn_rate_continues_for_a_moment_without_samples() -> None:
     bench = Bench()
     bench.run(REST_FIRST)
     bench.run(1.0, 0.5)
@@ -339,7 +341,7 @@ def test_a_gyro_that_is_mounted_upside_down_is_not_believed() -> None:
 
 @pytest.mark.parametrize(("sign", "named"), [(-1.0, "reversed"), (0.0, "dead")])
 @pytest.mark.parametrize("rate", [0.02, 0.05, 0.1])
-def test_a_slow_turn_is_the_wheels_too_until_the_gyro_is_proved(
+def test_the_wheels_give_a_slow_turn_until_the_gyro_is_proved(
     sign: float, named: GyroDoes, rate: float
 ) -> None:
     bench = Bench(sign=sign)
@@ -349,10 +351,10 @@ def test_a_slow_turn_is_the_wheels_too_until_the_gyro_is_proved(
     # Wheels with unequal tyres report 0.08 rad/s on a straight, where a good gyro reports nothing.
     assert (bench.says() == named) == (rate > (0.02 if sign else 0.05))
     bench.run(1.0)
-    assert bench.told == pytest.approx(60.0 * rate * 1.6, abs=1e-6), "nor is it owed at rest"
+    assert bench.told == pytest.approx(60.0 * rate * 1.6, abs=1e-6), "nor is it corrected at rest"
 
 
-def test_a_slow_turn_proves_a_gyro_and_what_it_had_to_say_is_made_up_for() -> None:
+def test_a_slow_turn_proves_a_gyro_and_corrects_the_turn_before_the_proof() -> None:
     bench = Bench()
     bench.run(REST_FIRST)
     bench.run(5.0, 0.02)
@@ -361,7 +363,7 @@ def test_a_slow_turn_proves_a_gyro_and_what_it_had_to_say_is_made_up_for() -> No
     assert bench.told == pytest.approx(bench.true, abs=1e-3)
 
 
-def test_a_gap_on_trial_is_the_wheels_until_the_gyro_is_proved() -> None:
+def test_a_gyro_gives_the_turn_of_a_gap_only_once_it_is_proved() -> None:
     reversed_one = Bench(sign=-1.0)
     reversed_one.run(REST_FIRST)
     assert over_a_gap(reversed_one, 0.3, 0.5) is None
@@ -372,7 +374,7 @@ def test_a_gap_on_trial_is_the_wheels_until_the_gyro_is_proved() -> None:
     assert bench.told == pytest.approx(bench.true, abs=1e-3)
 
 
-def test_where_the_pose_is_set_it_owes_nothing_of_what_was_before() -> None:
+def test_a_gyro_corrects_no_earlier_turn_after_the_pose_is_set() -> None:
     bench = Bench()
     bench.run(REST_FIRST)
     bench.run(0.1, 0.5)
@@ -384,7 +386,7 @@ def test_where_the_pose_is_set_it_owes_nothing_of_what_was_before() -> None:
     assert bench.told - begun == pytest.approx(bench.true - true, abs=1e-6)
 
 
-def test_another_gyro_stands_first_and_proves_itself() -> None:
+def test_another_gyro_must_rest_and_be_proved_again() -> None:
     bench = Bench(bias=0.05)
     bench.run(REST_FIRST)
     bench.run(20.0, stirring)
@@ -397,13 +399,13 @@ def test_another_gyro_stands_first_and_proves_itself() -> None:
     bench.run(1.0, 0.5)
     assert bench.told - begun == pytest.approx((bench.true - true) * 1.6)
     assert bench.gyro.status.bias is None
-    assert bench.gyro.learned == learned, "of the floor, whoever told it"
+    assert bench.gyro.learned == learned, "the track belongs to the floor, not to the gyro"
     bench.run(REST_FIRST)
     bench.run(2.0, 0.5)
     assert bench.does == ["waiting for rest", "used", "reversed"]
 
 
-def test_the_track_it_implies_is_shown_once_it_has_turned_enough() -> None:
+def test_the_implied_track_is_reported_once_the_robot_has_turned_enough() -> None:
     bench = Bench(skid=1.7)
     bench.run(REST_FIRST)
     assert bench.gyro.status.track is None
@@ -413,7 +415,7 @@ def test_the_track_it_implies_is_shown_once_it_has_turned_enough() -> None:
 
 
 @pytest.mark.slow
-def test_how_well_it_knows_the_track_is_a_share_of_that() -> None:
+def test_the_deviation_of_the_learned_track_is_a_share_of_the_track() -> None:
     even, uneven = Bench(skid=1.7), Bench(skid=1.7)
     for bench in (even, uneven):
         bench.run(REST_FIRST)
@@ -431,7 +433,7 @@ def test_how_well_it_knows_the_track_is_a_share_of_that() -> None:
 
 
 @pytest.mark.slow
-def test_its_variance_is_that_of_its_errors() -> None:
+def test_the_variance_of_the_turn_is_that_of_its_errors() -> None:
     """Heading errors divided by their claimed deviations are about normal."""
     squares = []
     for seed in range(60):
@@ -445,5 +447,5 @@ def test_its_variance_is_that_of_its_errors() -> None:
     assert 0.5 < sum(squares) / 60 < 2.0
 
 
-def test_every_state_has_its_words() -> None:
+def test_every_state_of_the_gyro_has_a_text() -> None:
     assert set(WORDS) == set(GyroDoes.__args__)  # type: ignore[attr-defined]

@@ -24,17 +24,17 @@ def rested(seconds: float, bias: float = 0.01, noise: float = 0.0, seed: int = 1
 
 
 @given(st.floats(-0.9 * MAX_BIAS, 0.9 * MAX_BIAS))
-def test_a_gyro_without_noise_tells_its_bias_at_once(bias: float) -> None:
+def test_the_bias_of_a_gyro_without_noise_is_exact_after_the_shortest_rest(bias: float) -> None:
     learned = rested(KNOWN_S + DT, bias)
     assert learned.known
     assert learned.value == pytest.approx(bias, abs=1e-6)
 
 
-def test_it_is_not_known_before_it_has_stood_long_enough() -> None:
+def test_the_bias_is_unknown_until_the_robot_has_rested_long_enough() -> None:
     assert not rested(KNOWN_S - DT).known
 
 
-def test_its_error_is_that_of_a_mean_and_its_variance_says_so() -> None:
+def test_the_error_of_the_bias_is_that_of_a_mean_and_matches_the_variance() -> None:
     noise, seconds = 0.01, 1.0
     runs = [rested(seconds, noise=noise, seed=seed) for seed in range(200)]
     spread = statistics.pstdev([run.value for run in runs])
@@ -47,7 +47,7 @@ def test_the_noise_of_a_sample_is_learned() -> None:
     assert math.sqrt(rested(5.0, noise=0.02).noise) == pytest.approx(0.02, rel=0.35)
 
 
-def test_while_it_drives_the_bias_gets_less_certain_by_its_walk() -> None:
+def test_the_variance_of_the_bias_grows_by_its_random_walk_while_the_robot_drives() -> None:
     learned = rested(2.0, noise=0.01)
     before = learned.variance
     for _ in range(1000):
@@ -63,7 +63,7 @@ def test_a_bias_that_has_walked_is_found_again() -> None:
     assert learned.value == pytest.approx(0.016, abs=0.0015)
 
 
-def test_a_robot_that_is_turned_while_its_wheels_stand_teaches_nothing() -> None:
+def test_a_fast_turn_while_the_wheels_stand_does_not_change_the_bias() -> None:
     learned = rested(2.0, noise=0.005)
     before = learned.value
     assert not learned.rest(0.3, 0.0, DT)
@@ -71,13 +71,13 @@ def test_a_robot_that_is_turned_while_its_wheels_stand_teaches_nothing() -> None
 
 
 @pytest.mark.parametrize("rate", [1.1 * MAX_BIAS, -3.0])
-def test_what_no_bias_can_be_is_none_from_the_start(rate: float) -> None:
+def test_a_rate_above_the_largest_bias_is_not_taken_as_the_first_bias(rate: float) -> None:
     learned = Bias()
     assert not learned.rest(rate, 0.0, DT)
     assert (learned.value, learned.known) == (0.0, False)
 
 
-def test_what_the_gyro_claims_of_its_noise_counts() -> None:
+def test_the_noise_that_a_gyro_claims_reduces_the_weight_of_its_samples() -> None:
     claiming, silent = rested(2.0), rested(2.0)
     for learned, claim in ((claiming, 0.05**2), (silent, 0.0)):
         learned.drift(1000.0)
@@ -88,7 +88,7 @@ def test_what_the_gyro_claims_of_its_noise_counts() -> None:
 
 @pytest.mark.parametrize("noise", [0.0, 0.005])
 @pytest.mark.parametrize("jump", [0.03, 0.1, -0.15])
-def test_a_bias_that_has_jumped_is_learned_anew_at_rest(jump: float, noise: float) -> None:
+def test_a_bias_that_has_jumped_is_learned_again_at_rest(jump: float, noise: float) -> None:
     learned, off = rested(10.0, noise=noise), 0.0
     for n in range(6000):
         learned.drift(DT)
@@ -99,7 +99,7 @@ def test_a_bias_that_has_jumped_is_learned_anew_at_rest(jump: float, noise: floa
     assert abs(off) < 1.2 * abs(jump)  # the error of one second, not of the whole minute
 
 
-def test_a_robot_that_is_turned_while_its_wheels_stand_has_no_other_bias() -> None:
+def test_swinging_to_and_fro_while_the_wheels_stand_does_not_change_the_bias() -> None:
     learned = rested(10.0)
     for n in range(300):
         learned.rest(0.01 + 0.15 * math.sin(n * DT), 0.0, DT)

@@ -35,7 +35,7 @@ def matched(seconds: float, ratio: float = 0.6, delay: float = 0.0, rate: Rate =
     return match
 
 
-def test_at_first_the_robot_turns_by_and_large_as_its_wheels_say() -> None:
+def test_the_first_ratio_is_one_with_a_rough_deviation_and_no_delay() -> None:
     assert (Match().ratio, Match().deviation) == (1.0, ROUGH)
     assert Match().delay() is None
 
@@ -56,18 +56,18 @@ def test_the_delay_is_found_to_a_few_milliseconds(ratio: float, delay: float) ->
     assert found == pytest.approx(delay, abs=0.006)
 
 
-def test_a_delay_that_was_told_is_not_told_again() -> None:
+def test_a_delay_is_reported_only_once() -> None:
     match = matched(20.0, delay=0.05)
     assert match.delay() is not None
     assert match.delay() is None
 
 
 @pytest.mark.parametrize("rate", [0.0, 0.8], ids=["standing", "turning steadily"])
-def test_without_a_change_of_rate_there_is_no_delay_to_be_found(rate: float) -> None:
+def test_no_delay_is_found_without_a_change_of_the_turn_rate(rate: float) -> None:
     assert matched(30.0, rate=lambda t: rate).delay() is None
 
 
-def test_the_encoder_counts_of_a_straight_drive_are_no_delay() -> None:
+def test_the_encoder_counts_of_a_straight_drive_show_no_delay() -> None:
     match = matched(20.0, ratio=1.0)
     match.delay()
     dice, count = random.Random(1), math.tau / 400 * 0.125 / 0.266
@@ -82,7 +82,7 @@ def test_the_encoder_counts_of_a_straight_drive_are_no_delay() -> None:
 
 
 @pytest.mark.parametrize("delay", [-0.04, 0.12])
-def test_the_encoder_counts_of_a_straight_drive_leave_the_ratio(delay: float) -> None:
+def test_the_encoder_counts_of_a_straight_drive_do_not_change_the_ratio(delay: float) -> None:
     for seed in range(20):
         match, dice, before = matched(6.0, 0.625, delay), random.Random(seed), 0
         for _ in range(4000):
@@ -92,7 +92,7 @@ def test_the_encoder_counts_of_a_straight_drive_leave_the_ratio(delay: float) ->
         assert match.ratio == pytest.approx(0.625, abs=0.05)
 
 
-def test_changes_of_the_wheels_that_the_gyro_does_not_follow_leave_a_ratio() -> None:
+def test_the_ratio_stays_bounded_if_the_gyro_does_not_follow_the_wheels() -> None:
     match, pattern = Match(), (0.0, 0.0, 0.1, 0.1, 0.0, 0.0, -0.1, -0.1)
     for n in range(4000):
         wheels, gyro = pattern[n // 10 % 8], pattern[(n // 10 + 3) % 8]
@@ -102,7 +102,7 @@ def test_changes_of_the_wheels_that_the_gyro_does_not_follow_leave_a_ratio() -> 
         match.delay()
 
 
-def test_a_robot_that_stands_teaches_nothing() -> None:
+def test_nothing_is_learned_while_the_robot_rests() -> None:
     match = matched(30.0, rate=lambda t: 0.0)
     assert (match.ratio, match.blocks) == (1.0, 0.0)
 
@@ -115,7 +115,7 @@ def slipping(match: Match, seconds: float, wheels: float, gyro: float) -> list[b
     return found
 
 
-def test_wheels_that_turn_a_robot_that_does_not_are_contradicted_within_their_time() -> None:
+def test_a_gyro_at_rest_contradicts_turning_wheels_within_a_quarter_of_a_second() -> None:
     match = matched(20.0)
     slipping(match, 1.0, 1.0, 0.6)
     found = slipping(match, 0.25, 1.0, 0.0)
@@ -124,12 +124,12 @@ def test_wheels_that_turn_a_robot_that_does_not_are_contradicted_within_their_ti
 
 
 @pytest.mark.parametrize("share", [0.85, 1.0, 1.15])
-def test_a_floor_that_is_a_little_other_is_no_contradiction(share: float) -> None:
+def test_a_slightly_different_floor_is_no_contradiction(share: float) -> None:
     match = matched(20.0)
     assert not any(slipping(match, 2.0, 1.0, 0.6 * share))
 
 
-def test_driving_with_a_gyro_that_is_late_contradicts_nothing() -> None:
+def test_a_late_gyro_does_not_contradict_the_wheels() -> None:
     match, found = Match(), 0
     for n in range(3000):
         t = n * DT
@@ -138,7 +138,7 @@ def test_driving_with_a_gyro_that_is_late_contradicts_nothing() -> None:
     assert found == 0
 
 
-def test_what_slips_is_not_learned() -> None:
+def test_the_ratio_is_not_learned_during_slip() -> None:
     match = matched(20.0)
     slipping(match, 1.0, 1.0, 0.0)  # the blocks before the slip are still learned
     before = match.ratio
@@ -146,14 +146,14 @@ def test_what_slips_is_not_learned() -> None:
     assert match.ratio == before
 
 
-def test_a_delay_that_is_put_right_is_in_the_ratio_at_once() -> None:
+def test_a_corrected_delay_changes_the_ratio_immediately() -> None:
     match = matched(20.0, delay=0.02)
     before = match.ratio
     assert match.delay() is not None
     assert match.ratio != before
 
 
-def test_the_spread_is_what_the_ratio_differs_by_from_one_turn_to_the_next() -> None:
+def test_the_spread_is_the_variation_of_the_ratio_between_turns() -> None:
     mixed = Match()
     for n in range(12000):
         ratio = 0.66 if int(n * DT / 5.0) % 2 else 0.54
@@ -162,7 +162,7 @@ def test_the_spread_is_what_the_ratio_differs_by_from_one_turn_to_the_next() -> 
     assert mixed.spread == pytest.approx(0.06, rel=0.3)
 
 
-def test_a_gyro_that_comes_by_fits_and_starts_makes_the_ratio_no_less_certain() -> None:
+def test_a_changing_delay_of_the_gyro_does_not_make_the_ratio_less_certain() -> None:
     """The samples are up to 50 ms late, with a delay that changes each time."""
     match, told, true = Match(), 0.0, 0.0
     for n in range(6000):
@@ -173,5 +173,5 @@ def test_a_gyro_that_comes_by_fits_and_starts_makes_the_ratio_no_less_certain() 
     assert match.spread < 0.05 * match.ratio
 
 
-def test_before_anything_is_learned_the_spread_is_the_deviation_of_what_is_assumed() -> None:
+def test_the_spread_is_the_deviation_of_the_assumed_ratio_until_something_is_learned() -> None:
     assert Match().spread == ROUGH

@@ -32,7 +32,7 @@ def turned(trial: Trial, rate: float, share: float, seconds: float, late_s: floa
         (0.0, "dead"), (0.05, "dead"), (5.0, "not believed"), (-9.0, "not believed"),
     ],
 )  # fmt: skip
-def test_it_is_named_by_what_it_says_of_the_wheels_turn(
+def test_the_verdict_on_a_gyro_depends_on_its_share_of_the_wheels_turn(
     rate: float, share: float, verdict: Verdict
 ) -> None:
     assert turned(Trial(), rate, share, 2.0) == verdict
@@ -50,12 +50,12 @@ def test_a_good_gyro_is_never_refuted_however_late_it_reports(
     assert seen - {"none yet", "dead"} == {"good"}
 
 
-def test_a_tenth_of_a_radian_proves_it() -> None:
+def test_a_turn_of_a_tenth_of_a_radian_proves_a_gyro() -> None:
     assert turned(Trial(), 1.0, 0.6, 0.11) == "good"
     assert turned(Trial(), 1.0, 0.6, 0.09) == "none yet"
 
 
-def test_one_that_was_refuted_may_still_prove_itself() -> None:
+def test_a_refuted_gyro_may_still_prove_itself() -> None:
     trial = Trial()
     assert turned(trial, 1.0, 0.0, 1.0) == "dead"
     assert trial.open
@@ -63,7 +63,7 @@ def test_one_that_was_refuted_may_still_prove_itself() -> None:
     assert not trial.open
 
 
-def test_slow_turns_and_the_end_of_the_one_before_tell_nothing() -> None:
+def test_very_slow_turns_and_short_turns_to_and_fro_give_no_verdict() -> None:
     trial = Trial()
     assert turned(trial, 0.04, -1.0, 60.0) == "none yet"
     for _ in range(10):
@@ -85,14 +85,14 @@ def test_slow_lines_add_up_to_a_verdict(rate: float, share: float, verdict: Verd
 
 
 @pytest.mark.parametrize("seconds", [6.0, 60.0])
-def test_a_turn_behind_a_straight_of_unequal_tyres_proves_a_gyro(seconds: float) -> None:
+def test_a_turn_after_a_straight_on_unequal_tyres_proves_a_gyro(seconds: float) -> None:
     trial = Trial()
     turned(trial, 0.08, 0.0, seconds)
     told = [turned(trial, 0.5, 1.0, DT) for _ in range(1000)]
     assert set(told) == {"none yet", "good"}
 
 
-def test_lines_that_are_slow_in_turns_are_no_fast_ones() -> None:
+def test_alternating_slow_rates_do_not_add_up_to_a_verdict() -> None:
     trial = Trial()
     for _ in range(1000):
         trial.add(0.04 * DT, 0.0, DT)
@@ -100,7 +100,7 @@ def test_lines_that_are_slow_in_turns_are_no_fast_ones() -> None:
     assert trial.verdict == "none yet"
 
 
-def test_a_straight_between_two_turns_begins_anew() -> None:
+def test_a_straight_between_two_turns_restarts_the_trial() -> None:
     trial = Trial()
     for _ in range(20):
         turned(trial, 1.0, 0.0, 0.09)
@@ -108,7 +108,7 @@ def test_a_straight_between_two_turns_begins_anew() -> None:
     assert trial.verdict == "none yet"
 
 
-def test_to_stand_is_no_turning() -> None:
+def test_time_at_rest_does_not_count_as_turning() -> None:
     """A late gyro has reported nothing yet, no matter how long the robot stood before."""
     trial = Trial()
     turned(trial, 1.0, 0.0, 0.05)
@@ -116,7 +116,7 @@ def test_to_stand_is_no_turning() -> None:
     assert turned(trial, 4.0, 0.0, 0.1) == "none yet"
 
 
-def test_without_a_bias_degrees_are_seen_and_nothing_else() -> None:
+def test_only_a_gyro_in_degrees_is_recognized_without_a_known_bias() -> None:
     for share, verdict in ((57.3, "in degrees"), (-1.0, "none yet"), (1.0, "none yet")):
         trial = Trial()
         for _ in range(100):

@@ -81,7 +81,9 @@ LINES = st.lists(
 
 
 @given(LINES)
-def test_what_a_gyro_hears_of_the_wheels_is_what_the_heading_turned(lines: list[One]) -> None:
+def test_the_turn_of_the_wheels_that_a_gyro_gets_is_the_turn_of_the_heading(
+    lines: list[One],
+) -> None:
     robot, listening = Odometry(OdometryConfig(), KINEMATICS, 3200), Listening()
     robot.checks.gyro = listening
     for one in lines:
@@ -93,7 +95,7 @@ def test_what_a_gyro_hears_of_the_wheels_is_what_the_heading_turned(lines: list[
     assert off == pytest.approx(0.0, abs=1e-9)
 
 
-def test_a_line_passed_over_leaves_the_gap_before_it_to_the_next() -> None:
+def test_a_gap_before_a_skipped_line_counts_for_the_next_line() -> None:
     robot = Odometry(OdometryConfig(), KINEMATICS)
     robot.fold(said(One(10.0, 10.0)))
     robot.skip(said(One(10.0, 10.0, gap=0.5)))
@@ -101,7 +103,7 @@ def test_a_line_passed_over_leaves_the_gap_before_it_to_the_next() -> None:
     assert robot.missed() == {"gaps": 1, "gap_ms": 500}
 
 
-def test_over_a_way_that_is_unknown_there_is_nothing_to_compare() -> None:
+def test_the_gyro_is_compared_with_the_wheels_over_no_unknown_distance() -> None:
     robot, listening = Odometry(OdometryConfig(), KINEMATICS), Listening()
     robot.checks.gyro = listening
     for one in (One(9.0, 9.0), One(9.0, 9.0, bridged=0.3), One(9.0, 9.0, gap=0.5)):
@@ -153,7 +155,7 @@ class Turning:
         return math.remainder(self.robot.pose.yaw - self.true, math.tau)
 
 
-def test_a_gap_that_is_bridged_is_no_slip() -> None:
+def test_a_bridged_gap_is_not_reported_as_slip() -> None:
     bench = Turning()
     bench.run(2.0, Twist(0.0, 1.0))
     for rate in (-1.0, 1.0, 0.0, 1.0, -1.0):
@@ -163,7 +165,7 @@ def test_a_gap_that_is_bridged_is_no_slip() -> None:
     assert bench.off == pytest.approx(0.0, abs=0.01)
 
 
-def test_a_gap_that_is_bridged_while_the_gyro_is_on_trial_costs_nothing() -> None:
+def test_a_bridged_gap_during_the_gyro_trial_causes_no_heading_error() -> None:
     bench = Turning()
     bench.run(0.1, Twist(0.0, 0.5), gap=True)
     bench.run(0.1, Twist(0.0, 0.9), gap=True)
@@ -175,7 +177,7 @@ def test_a_gap_that_is_bridged_while_the_gyro_is_on_trial_costs_nothing() -> Non
 @pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(st.floats(0.0, 0.4), st.floats(0.4, 2.0), st.floats(0.2, 1.0))
-def test_a_lie_told_while_the_gyro_is_on_trial_is_put_right_once(
+def test_a_wheel_fault_during_the_gyro_trial_is_corrected_only_once(
     before: float, turning: float, ahead: float
 ) -> None:
     # If the dead wheel should hardly turn, it does not contradict the others.
@@ -211,7 +213,7 @@ def test_the_error_of_a_gyros_scale_grows_with_the_turns(turns: int) -> None:
     assert off**2 / variance == pytest.approx(1.0, rel=0.25)
 
 
-def test_the_error_of_a_gyros_scale_is_turned_back() -> None:
+def test_the_error_of_a_gyros_scale_cancels_when_the_robot_turns_back() -> None:
     bench = proved(1 + GYRO_SCALE)
     off, variance = bench.off, bench.yaw_variance
     for rate in (2.0, -2.0):

@@ -38,7 +38,7 @@ def test_a_twist_gives_the_wheel_speeds_worked_by_hand(
 
 
 @each(("robot", "twist", "left", "right"), WHEELS_OF_TWIST)
-def test_those_wheel_speeds_give_the_twist_back(
+def test_the_wheel_speeds_worked_by_hand_give_the_twist_back(
     robot: DriveConfig, twist: Pair, left: float, right: float
 ) -> None:
     back = Kinematics(robot).twist(WheelSpeeds(right, left, left, right))
@@ -60,7 +60,9 @@ def test_rest_is_exactly_still_and_still_is_exactly_rest() -> None:
 
 
 @given(robot=robots, twist=twists)
-def test_there_and_back_is_where_it_began(robot: DriveConfig, twist: Twist) -> None:
+def test_converting_a_twist_to_wheel_speeds_and_back_keeps_the_twist(
+    robot: DriveConfig, twist: Twist
+) -> None:
     kinematics = Kinematics(robot)
     back = kinematics.twist(kinematics.wheel_speeds(twist))
     # v and w are the sum and the difference of the two sides, so each contains the other's error.
@@ -89,7 +91,7 @@ def test_a_twist_beyond_the_wheel_speed_is_scaled_as_a_whole() -> None:
     assert (got.linear, got.angular) == pytest.approx((0.2, 2 / 3))
 
 
-def test_the_faster_side_decides_whichever_it_is() -> None:
+def test_the_limit_applies_to_the_faster_side_whichever_side_is_faster() -> None:
     kinematics = Kinematics(DriveConfig())
     for twist in (Twist(0.3, 1.0), Twist(0.3, -1.0), Twist(-0.3, 1.0), Twist(-0.3, -1.0)):
         speeds = kinematics.wheel_speeds(kinematics.saturate(twist, 6.0))
@@ -109,7 +111,7 @@ def test_saturation_keeps_the_curvature_and_no_wheel_is_too_fast(
 
 
 @given(st.floats(-40.0, 40.0), st.floats(-40.0, 40.0))
-def test_the_other_side_is_what_makes_the_turn(left: float, right: float) -> None:
+def test_the_speed_of_the_other_side_follows_from_the_turn(left: float, right: float) -> None:
     kinematics = Kinematics(DriveConfig(left_wheel_radius_multiplier=1.1))
     turn = kinematics.twist(WheelSpeeds(right, left, left, right)).angular
     assert kinematics.opposite(left, right, turn) == pytest.approx((left, right), abs=1e-9)

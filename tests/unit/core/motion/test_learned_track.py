@@ -25,14 +25,14 @@ def told(track: LearnedTrack) -> str | None:
     return None if track.event is None else track.event.kind
 
 
-def test_until_something_is_learned_the_configured_one_is_used_and_nothing_is_reported() -> None:
+def test_the_configured_track_is_used_until_the_learned_track_is_certain() -> None:
     track = LearnedTrack(1.0)
     track.look(None)
     track.look(Track(1.6, 2 * CERTAIN))
     assert (track.used, track.use, track.event) == (CONFIGURED, "uncertain", None)
 
 
-def test_once_it_is_certain_the_learned_one_is_used_and_told_once() -> None:
+def test_a_certain_learned_track_is_used_and_reported_once() -> None:
     track = LearnedTrack(1.5)
     track.look(Track(1.2, CERTAIN))
     assert track.used == Track(1.2, CERTAIN)
@@ -48,7 +48,7 @@ def test_once_it_is_certain_the_learned_one_is_used_and_told_once() -> None:
     assert told(track) is None
 
 
-def test_what_is_in_use_is_given_up_only_when_it_is_doubted_by_far() -> None:
+def test_a_learned_track_in_use_is_dropped_only_if_it_becomes_clearly_uncertain() -> None:
     track = LearnedTrack(1.0)
     for deviation, use in (
         (SURE, "used"), (1.5 * CERTAIN, "used"), (1.01 * UNCERTAIN, "uncertain"),
@@ -60,7 +60,9 @@ def test_what_is_in_use_is_given_up_only_when_it_is_doubted_by_far() -> None:
 
 
 @pytest.mark.parametrize("share", [0.99 * BOUNDS[0], 1.01 * BOUNDS[1]])
-def test_one_that_is_too_far_from_the_configured_one_is_named_and_not_used(share: float) -> None:
+def test_a_learned_track_too_far_from_the_configured_one_is_reported_and_not_used(
+    share: float,
+) -> None:
     track = LearnedTrack(1.0)
     track.look(Track(share, SURE))
     assert track.used == CONFIGURED
@@ -72,7 +74,9 @@ def test_one_that_is_too_far_from_the_configured_one_is_named_and_not_used(share
 
 
 @pytest.mark.parametrize(("bound", "inwards"), [(BOUNDS[0], 1.0), (BOUNDS[1], -1.0)])
-def test_at_a_bound_it_is_used_or_not_and_not_in_turns(bound: float, inwards: float) -> None:
+def test_a_learned_track_at_a_bound_is_not_switched_on_and_off(
+    bound: float, inwards: float
+) -> None:
     """A learned track in use stays in use up to the bounds.
 
     One not in use must come a little further inside first.
@@ -92,7 +96,7 @@ def test_at_a_bound_it_is_used_or_not_and_not_in_turns(bound: float, inwards: fl
     assert told(track) == "used"
 
 
-def test_one_that_is_too_far_off_is_known_until_it_is_doubted_by_far() -> None:
+def test_a_learned_track_too_far_off_is_reported_once_while_it_is_nearly_certain() -> None:
     track, seen = LearnedTrack(1.0), []
     for _ in range(10):
         for deviation in (0.99 * CERTAIN, 1.01 * CERTAIN):
@@ -109,6 +113,8 @@ def test_one_that_is_too_far_off_is_known_until_it_is_doubted_by_far() -> None:
         ("used", "learned 1.800 ± 0.090 (in use), configured 1.500"),
     ],
 )
-def test_both_stand_beside_each_other_as_multipliers(use: TrackUse, says: str) -> None:
+def test_the_text_compares_the_learned_and_the_configured_multiplier(
+    use: TrackUse, says: str
+) -> None:
     assert tracks(GyroStatus("used", track=1.2, track_deviation=0.05, track_use=use), 1.5) == says
     assert tracks(GyroStatus("used", track_use=use), 1.5) == ""

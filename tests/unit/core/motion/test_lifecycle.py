@@ -143,7 +143,7 @@ def test_a_stop_latches_until_a_later_clear() -> None:
     assert (life.mode, life.latches) == (Mode.READY, Latches())
 
 
-def test_a_number_is_the_wall_time_in_ms_and_grows_even_if_that_does_not() -> None:
+def test_a_number_is_the_wall_time_in_ms_and_grows_even_if_the_clock_does_not() -> None:
     life = ready()
     stop(life, 1.0)
     assert number(life) == (WALL_NS + NS_PER_S) // 1_000_000
@@ -245,7 +245,7 @@ def test_a_cause_that_comes_many_times_is_named_once_under_the_newest_number() -
     )
 
 
-def test_a_flood_of_clients_leaves_the_first_ones_the_last_one_and_each_press() -> None:
+def test_the_reason_after_many_stops_names_the_first_clients_the_last_and_each_press() -> None:
     life = ready()
     press(life, 0.5)
     life.hold("", "", ns(0.6))
@@ -259,7 +259,7 @@ def test_a_flood_of_clients_leaves_the_first_ones_the_last_one_and_each_press() 
     ]  # fmt: skip
 
 
-def test_a_stop_in_the_step_of_a_press_is_named_although_it_arrived_before() -> None:
+def test_a_stop_in_the_step_of_a_press_is_named_although_it_arrived_before_the_press() -> None:
     life = ready()
     press(life, 1.0)
     pressed = number(life)
@@ -432,7 +432,7 @@ def test_a_stop_in_the_first_step_is_not_older_than_the_start() -> None:
         clear(life, 11.0)
 
 
-def test_a_named_clear_releases_a_stop_from_the_start_at_once() -> None:
+def test_a_named_clear_releases_a_stop_from_the_start_immediately() -> None:
     life = Lifecycle(active=True, latches=Latches(stop=STOP))
     life.begin(at(10.0))
     assert life.clear(STOP.number, ns(9.9), at(10.0))
@@ -456,7 +456,7 @@ def test_the_first_fault_stays() -> None:
     assert life.why == f"first, latched at {AT}:01 UTC; call srv/clear"
 
 
-def test_a_fault_keeps_the_stop_and_each_is_cleared_by_itself() -> None:
+def test_a_fault_keeps_the_stop_and_each_is_cleared_separately() -> None:
     life = both()
     assert mode(life) is Mode.FAULT
     assert life.why == (
@@ -499,7 +499,7 @@ def test_a_clear_named_for_a_stop_is_refused_when_a_fault_has_come() -> None:
     assert life.latches.stop is not None
 
 
-def test_a_clear_releases_a_fault_that_goes_on_if_it_arrived_after_its_beginning() -> None:
+def test_a_clear_that_arrived_after_the_beginning_of_a_lasting_fault_releases_the_fault() -> None:
     life = ready()
     life.fault("a wheel is dead", at(3.0))
     assert not life.fault("a wheel is dead", at(5.0))
@@ -624,7 +624,7 @@ def test_each_deactivate_has_a_new_number_and_the_last_is_the_one_that_is_report
     assert life.why == f"switched off by ann at {AT}:02 UTC; call srv/activate"
 
 
-def test_an_activate_of_an_active_robot_changes_nothing_whatever_it_names() -> None:
+def test_an_activate_of_an_active_robot_changes_nothing_whatever_number_is_named() -> None:
     life = ready()
     before = life.latches
     assert not activate(life, 1.0)
@@ -799,7 +799,7 @@ def test_every_combination_of_facts_and_latches_is_reached() -> None:
     assert len(tried) == 2**6 * 3 * len(TRIGGERS) * 2
 
 
-def test_the_mode_always_follows_from_the_list() -> None:
+def test_the_mode_always_follows_from_the_facts_and_the_latches() -> None:
     for edge in explore():
         *held, inactive, linked, commanded, dormant, _ = edge.after
         shutting_down, fault, stopped = held
@@ -835,9 +835,7 @@ def test_clear_releases_exactly_one_latch_and_the_fault_first() -> None:
     assert cleared > 100
 
 
-def test_a_clear_by_the_current_number_succeeds_unless_the_daemon_goes_down_or_it_is_pressed() -> (
-    None
-):
+def test_a_clear_by_the_current_number_succeeds_unless_shutting_down_or_pressed() -> None:
     for edge in explore():
         if edge.trigger == "clear by number":
             assert edge.refused == (edge.before.shutting_down or edge.before.pressed)
@@ -927,7 +925,7 @@ def test_a_stop_always_ends_in_a_latched_stop() -> None:
             assert before is None or after.number > before.number
 
 
-def test_the_shutdown_is_for_good() -> None:
+def test_nothing_ends_a_shutdown() -> None:
     assert all(edge.after.shutting_down for edge in explore() if edge.before.shutting_down)
 
 

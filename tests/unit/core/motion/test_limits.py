@@ -97,7 +97,7 @@ def pair(twist: Twist) -> tuple[float, float]:
         ((1e308, 0.0), (1.0, 0.0)),
     ],
 )
-def test_a_wish_beyond_the_speed_limits_is_scaled_as_a_whole(
+def test_a_twist_beyond_the_speed_limits_is_scaled_as_a_whole(
     wish: tuple[float, float], end: tuple[float, float]
 ) -> None:
     assert pair(limiter().follow(Twist(*wish), 1000.0)) == approx(*end)
@@ -137,7 +137,7 @@ def test_a_wheel_that_would_be_too_fast_slows_the_whole_twist() -> None:
     assert pair(slow.follow(Twist(1.0, 4.0), 1000.0)) == approx(0.5, 2.0)
 
 
-def test_between_two_twists_the_wheels_can_follow_no_wheel_is_too_fast_either() -> None:
+def test_no_wheel_is_too_fast_on_the_way_between_two_allowed_twists() -> None:
     # At 0.8 m/s all wheels have 16 rad/s; 4 rad/s take 12 rad/s. The robot turns before it has
     # slowed down.
     found = moving(0.8, 0.0, LimitsConfig(wheel_speed=16.0, linear_deceleration=0.1))
@@ -178,7 +178,7 @@ def test_the_two_axes_have_their_own_decelerations() -> None:
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_slowing_down_is_deceleration_and_speeding_up_is_not_in_both_directions(
+def test_only_slowing_down_uses_the_deceleration_in_both_directions(
     sign: float,
 ) -> None:
     slowing, hurrying = moving(sign * 1.0, 0.0, UNEVEN), moving(sign * 1.0, 0.0, UNEVEN)
@@ -186,7 +186,7 @@ def test_slowing_down_is_deceleration_and_speeding_up_is_not_in_both_directions(
     assert hurrying.follow(Twist(sign * 1.5, 0.0), 0.1).linear == pytest.approx(sign * 1.05)
 
 
-def test_no_time_changes_nothing() -> None:
+def test_a_step_of_zero_duration_changes_nothing() -> None:
     found = moving(0.5, 1.0)
     assert found.follow(REST, 0.0) == Twist(0.5, 1.0)
 
@@ -273,7 +273,7 @@ def test_the_slope_falls_no_faster_than_jerk_unless_the_goal_would_be_passed(sig
     assert [sign * twist.linear for twist in got] == pytest.approx([0.032, 0.0325])
 
 
-def test_a_long_way_with_jerk_takes_the_time_worked_by_hand() -> None:
+def test_a_large_change_of_speed_with_jerk_takes_the_time_worked_by_hand() -> None:
     # The slope rises to 1 m/s2 in 20 steps of 0.05 m/s2, which covers 0.105 m/s. It falls in 19
     # steps, which covers 0.095 m/s. The 0.3 m/s in between take 30 steps of 10 ms.
     path = followed(limiter(JERKY), Twist(0.5, 0.0), 69)
@@ -308,7 +308,7 @@ def test_jerk_bounds_the_change_of_slope_on_the_way_to_a_goal(
 
 
 @given(wishes=st.lists(st.tuples(mixed, st.integers(1, 40)), max_size=8))
-def test_jerk_bounds_how_much_steeper_a_slope_gets_whatever_is_wished(
+def test_jerk_bounds_how_much_steeper_a_slope_gets_whatever_is_commanded(
     wishes: list[tuple[Twist, int]],
 ) -> None:
     found = limiter(JERKY)
@@ -371,7 +371,7 @@ def test_with_jerk_the_goal_is_approached_from_one_side_reached_and_never_oversh
         assert min(start, goal) - EPS <= after <= max(start, goal) + EPS
 
 
-def test_with_jerk_an_acceleration_that_is_lowered_on_the_way_holds_at_once() -> None:
+def test_with_jerk_a_lowered_acceleration_applies_from_the_next_step() -> None:
     one = limiter(JERKY)
     followed(one, Twist(1.0, 0.0), 30)
     one.use(msgspec.structs.replace(JERKY, linear_acceleration=0.3))
@@ -486,7 +486,7 @@ def test_after_coasting_jerk_begins_from_a_level_slope(sign: float) -> None:
 # cut and restore
 
 
-def test_a_cut_is_rest_at_once() -> None:
+def test_a_cut_brings_the_robot_to_rest_in_one_step() -> None:
     found = moving(1.0, 4.0)
     assert found.cut() == REST
     assert found.twist == REST

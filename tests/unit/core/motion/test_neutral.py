@@ -28,7 +28,7 @@ def sent(twist: Twist, at_ms: float, shared: bool = False) -> Command:
     return Command("high", twist, int(at_ms * MS), shared=shared)
 
 
-def test_a_zero_of_its_own_arms_at_once_right_behind_a_speed() -> None:
+def test_a_zero_of_an_unshared_sender_arms_immediately_even_right_after_a_speed() -> None:
     one = sender()
     one.take(sent(GO, 0), 0)
     assert not one.armed(0)
@@ -39,7 +39,7 @@ def test_a_zero_of_its_own_arms_at_once_right_behind_a_speed() -> None:
 
 
 @pytest.mark.parametrize("after_ms", [1, 250, 999.999])
-def test_a_shared_zero_that_a_speed_follows_too_soon_arms_nobody(after_ms: float) -> None:
+def test_a_shared_zero_that_a_speed_follows_too_soon_does_not_arm(after_ms: float) -> None:
     bench = Bench(HIGH, armed=False)
     bench.send(HIGH, REST, "a", shared=True)
     bench.wait(after_ms).send(HIGH, GO, "a", shared=True)
@@ -48,7 +48,7 @@ def test_a_shared_zero_that_a_speed_follows_too_soon_arms_nobody(after_ms: float
     assert bench.driver() == ""
 
 
-def test_a_shared_zero_that_no_speed_follows_for_the_pause_arms() -> None:
+def test_a_shared_zero_arms_if_no_speed_follows_during_the_pause() -> None:
     one = sender()
     one.take(sent(REST, 0, shared=True), 0)
     assert not one.armed(1000 * MS - 1)
@@ -57,7 +57,7 @@ def test_a_shared_zero_that_no_speed_follows_for_the_pause_arms() -> None:
     assert one.armed(1001 * MS)
 
 
-def test_more_zeros_do_not_begin_the_pause_again() -> None:
+def test_more_zeros_do_not_restart_the_pause() -> None:
     one = sender()
     for at_ms in range(0, 1000, 100):
         one.take(sent(REST, at_ms, shared=True), 0)
@@ -66,7 +66,7 @@ def test_more_zeros_do_not_begin_the_pause_again() -> None:
 
 
 @pytest.mark.parametrize("shared", [False, True])
-def test_a_zero_that_arrived_before_it_was_required_arms_nobody(shared: bool) -> None:
+def test_a_zero_that_arrived_before_zeros_were_required_does_not_arm(shared: bool) -> None:
     one = sender()
     one.take(sent(REST, 0, shared), since_ns=1)
     assert not one.armed(HOUR_NS)
@@ -76,7 +76,7 @@ def test_a_zero_that_arrived_before_it_was_required_arms_nobody(shared: bool) ->
 
 
 @pytest.mark.parametrize("pause_ms", [1, 2000, 3_600_000])
-def test_a_pause_of_any_length_arms_nobody(pause_ms: int) -> None:
+def test_a_pause_without_a_zero_does_not_arm_however_long(pause_ms: int) -> None:
     for shared in (False, True):
         one = sender()
         for number in range(10):
@@ -86,7 +86,7 @@ def test_a_pause_of_any_length_arms_nobody(pause_ms: int) -> None:
 
 @pytest.mark.parametrize("other", ["speed", "cancelled", "not finite", "unreadable", "stale"])
 @pytest.mark.parametrize("name", ["a", "b"])
-def test_what_may_be_a_speed_of_a_shared_identity_ends_the_wait_of_each_shared_zero(
+def test_a_possible_speed_of_a_shared_identity_ends_the_wait_of_each_shared_zero(
     name: str, other: str
 ) -> None:
     """The samples of one program may have the stamps of a router at one time and none at another.
@@ -111,7 +111,7 @@ def test_what_may_be_a_speed_of_a_shared_identity_ends_the_wait_of_each_shared_z
         assert (bench.driver() == "high") == arms
 
 
-def test_a_speed_of_an_identity_of_its_own_leaves_the_zero_of_a_shared_one() -> None:
+def test_a_speed_of_an_unshared_identity_does_not_end_the_wait_of_a_shared_zero() -> None:
     bench = Bench(HIGH, armed=False)
     bench.send(HIGH, REST, "a", shared=True)
     bench.send(HIGH, GO, "b")
@@ -120,7 +120,7 @@ def test_a_speed_of_an_identity_of_its_own_leaves_the_zero_of_a_shared_one() -> 
     assert bench.driver() == "high"
 
 
-def test_a_speed_on_another_source_leaves_the_zero_of_a_shared_identity() -> None:
+def test_a_speed_on_another_source_does_not_end_the_wait_of_a_shared_zero() -> None:
     bench = Bench(HIGH, LOW, armed=False)
     bench.send(HIGH, REST, "a", shared=True)
     bench.send(LOW, GO, "a", shared=True)
@@ -132,7 +132,7 @@ def test_a_speed_on_another_source_leaves_the_zero_of_a_shared_identity() -> Non
     ("name", "shared", "ends"),
     [("", False, True), ("never seen", True, True), ("never seen", False, False)],
 )
-def test_what_cannot_be_read_ends_the_wait_of_a_shared_zero_unless_its_sender_is_another_one(
+def test_an_unreadable_message_ends_a_shared_wait_unless_a_named_unshared_sender_sent_it(
     name: str, shared: bool, ends: bool
 ) -> None:
     bench = Bench(HIGH, armed=False)
@@ -166,7 +166,7 @@ def test_an_unproven_zero_arms_unless_its_clock_proves_wrong(shared: bool) -> No
         assert one.armed(1100 * MS) is not wrong, "a proven zero is never forgotten"
 
 
-def test_a_shared_zero_that_was_proven_arms_after_the_pause_whatever_proves_wrong_later() -> None:
+def test_a_proven_shared_zero_arms_after_the_pause_even_if_later_zeros_prove_wrong() -> None:
     one = sender()
     one.take(sent(REST, 0, shared=True), 0)
     one.take(sent(REST, 900, shared=True), 0, "unproven")
@@ -188,7 +188,7 @@ def test_a_shared_zero_that_armed_is_not_forgotten_when_a_later_speed_proves_wro
 
 
 @pytest.mark.parametrize("shared", [False, True])
-def test_a_speed_before_an_unproven_zero_that_arms_never_counts_by_it(shared: bool) -> None:
+def test_a_speed_before_an_unproven_zero_is_not_followed_once_the_zero_arms(shared: bool) -> None:
     one = Sender(5000 * MS, 1000 * MS, neutral_first=True)
     one.take(sent(GO, 0, shared), 0)
     one.take(sent(REST, 10, shared), 0, "unproven")
@@ -209,7 +209,7 @@ def test_an_unproven_zero_leaves_an_unarmed_sender_live_so_its_source_keeps_prio
 
 @each("proven", [True, False])
 @each(("before_ms", "rest_ms"), [(400, 600), (950, 100)])
-def test_a_stall_does_not_count_as_pause_and_leaves_time_for_what_arrived_meanwhile(
+def test_a_stall_does_not_count_as_pause_and_leaves_time_for_commands_that_waited(
     before_ms: int, rest_ms: int, proven: bool
 ) -> None:
     one = sender()
@@ -230,7 +230,7 @@ def test_a_pause_that_was_over_before_a_stall_stays_over() -> None:
 
 
 @each(("silent_ms", "stays"), [(250, True), (251, False)])
-def test_a_sender_that_was_not_silent_before_a_stall_keeps_its_place_behind_it(
+def test_a_sender_that_was_not_silent_before_a_stall_keeps_its_place_after_the_stall(
     silent_ms: int, stays: bool
 ) -> None:
     one = sender()
@@ -270,7 +270,7 @@ def test_commands_in_doubt_count_as_zeros_or_speeds_too() -> None:
     ]  # fmt: skip
 
 
-def test_a_shared_zero_that_arrived_before_a_stall_ended_begins_its_pause_then() -> None:
+def test_a_shared_zero_that_arrived_in_a_stall_begins_its_pause_at_the_end_of_the_stall() -> None:
     one = sender()
     one.take(sent(REST, 0, shared=True), 0, watched_ns=800 * MS)
     one.take(sent(REST, 5, shared=True), 0)
@@ -298,7 +298,7 @@ def test_a_sender_that_was_silent_gets_no_place_by_a_command_in_doubt() -> None:
 
 @each("way", ["unproven", "stale"])
 @each(("stamp", "twist"), [(25, REST), (15, GO), (None, GO)])
-def test_a_zero_whose_stamp_is_in_doubt_ends_an_earlier_speed_and_holds_no_robot(
+def test_a_zero_whose_stamp_is_in_doubt_ends_an_earlier_speed_but_refreshes_no_timeout(
     way: Verdict, stamp: int | None, twist: Twist
 ) -> None:
     one = sender()
@@ -318,7 +318,7 @@ def test_a_zero_whose_stamp_is_in_doubt_ends_an_earlier_speed_and_holds_no_robot
     ("ahead_ms", "clock", "twist"),
     [(1, "a", REST), (250, "a", REST), (251, "a", GO), (0, "a", GO), (1, "b", GO)],
 )
-def test_a_speed_that_a_zero_in_doubt_overtook_does_not_begin_again(
+def test_a_speed_that_a_zero_in_doubt_overtook_is_not_followed_again(
     ahead_ms: int, clock: str, twist: Twist
 ) -> None:
     """A stamp that is ahead by more than the timeout of 250 ms is wrong."""
@@ -366,7 +366,7 @@ def test_the_first_zero_after_a_speed_is_remembered_while_the_sender_is_not_sile
     assert zeros == [None, 100 * MS, 100 * MS, None, 400 * MS, 900 * MS]
 
 
-def test_asking_for_a_zero_again_forgets_zeros_that_wait() -> None:
+def test_requiring_a_zero_again_forgets_the_zeros_that_wait() -> None:
     one = sender()
     one.take(sent(REST, 0, shared=True), 0)
     one.require_neutral()
@@ -416,7 +416,7 @@ def test_a_negative_zero_is_neutral() -> None:
 
 
 @pytest.mark.parametrize("twist", [Twist(0.0, 1e-9), Twist(1e-9, 0.0)])
-def test_hardly_moving_is_not_neutral(twist: Twist) -> None:
+def test_a_tiny_speed_is_not_neutral(twist: Twist) -> None:
     bench = Bench(HIGH, armed=False)
     bench.send(HIGH, twist)
     bench.send(HIGH, GO)
@@ -434,14 +434,14 @@ def test_a_refused_zero_is_not_neutral() -> None:
     assert bench.driver() == ""
 
 
-def test_a_source_that_was_neutral_stays_so_through_its_own_silence() -> None:
+def test_a_source_stays_armed_through_its_own_silence() -> None:
     bench = Bench(HIGH)
     bench.send(HIGH)
     bench.wait(60_000).send(HIGH)
     assert bench.driver() == "high"
 
 
-def test_the_neutral_of_one_source_is_not_that_of_another() -> None:
+def test_a_zero_on_one_source_does_not_arm_another_source() -> None:
     bench = Bench(HIGH, LOW, armed=False)
     bench.send(LOW, REST)
     bench.send(HIGH)
@@ -456,7 +456,7 @@ def test_requiring_neutral_forgets_every_command() -> None:
     assert bench.status(LOW).age_s is None
 
 
-def test_requiring_neutral_forgets_who_came_first() -> None:
+def test_requiring_neutral_forgets_which_sender_came_first() -> None:
     bench = Bench(LEFT, RIGHT)
     bench.send(RIGHT)
     assert bench.driver() == "right"
@@ -467,7 +467,7 @@ def test_requiring_neutral_forgets_who_came_first() -> None:
     assert bench.driver() == "left"
 
 
-def test_a_waiting_source_holds_its_place_with_zero() -> None:
+def test_an_unarmed_source_of_higher_priority_is_chosen_without_a_twist() -> None:
     bench = Bench(HIGH, LOW, armed=False)
     bench.send(LOW, REST)
     bench.send(LOW, GO)
@@ -488,7 +488,7 @@ def test_without_neutral_first_the_first_command_drives() -> None:
     assert bench.driver() == "high"
 
 
-def test_a_zero_that_did_not_count_yet_never_does_once_its_delay_proved_wrong() -> None:
+def test_a_zero_that_waits_never_counts_once_its_delay_proved_wrong() -> None:
     bench = Bench(HIGH, armed=False).known(HIGH)
     bench.arbiter.require_neutral(bench.now_ns + 1)
     bench.wait(50).stamped(HIGH)
@@ -503,7 +503,7 @@ def test_a_zero_that_did_not_count_yet_never_does_once_its_delay_proved_wrong() 
 # events that are not a silence
 
 
-def test_what_a_network_held_back_and_then_lets_in_arms_nobody() -> None:
+def test_commands_that_a_network_held_back_do_not_arm() -> None:
     bench = Bench(HIGH, armed=False).known(HIGH)
     bench.wait(50).arbiter.require_neutral(bench.now_ns)
     assert bench.stamped(HIGH) == ""
@@ -513,7 +513,7 @@ def test_what_a_network_held_back_and_then_lets_in_arms_nobody() -> None:
     assert bench.driver() == ""
 
 
-def test_what_pours_in_soon_after_a_clear_arms_nobody_however_late_each_came() -> None:
+def test_late_commands_that_arrive_together_soon_after_a_clear_do_not_arm() -> None:
     bench = Bench(HIGH, armed=False).known(HIGH)
     bench.wait(600).arbiter.require_neutral(bench.now_ns)
     assert [bench.wait(5).stamped(HIGH, late_ms=late) for late in (500, 400, 100)] == [
@@ -527,7 +527,7 @@ def test_what_pours_in_soon_after_a_clear_arms_nobody_however_late_each_came() -
 
 
 @pytest.mark.parametrize("source", [Source("stranger", 1), HIGH])
-def test_what_cannot_be_read_is_nothing_of_one_who_was_never_heard(source: Source) -> None:
+def test_an_unreadable_message_of_an_unknown_sender_has_no_effect(source: Source) -> None:
     bench = Bench(HIGH, armed=False)
     bench.unreadable(source, "a")
     bench.wait(1000).send(HIGH, GO, "a")
@@ -535,7 +535,7 @@ def test_what_cannot_be_read_is_nothing_of_one_who_was_never_heard(source: Sourc
     assert bench.status(HIGH).waits_for == Wait("neutral", "high", 1.0)
 
 
-def test_a_refused_command_is_no_sign_of_one_who_may_drive() -> None:
+def test_a_refused_command_does_not_take_the_robot_from_a_lower_source() -> None:
     bench = Bench(HIGH, LOW)
     bench.send(LOW)
     assert bench.send(HIGH, Twist(math.nan, 0.0), "a") == "not_finite"
@@ -552,7 +552,7 @@ def test_a_twist_that_is_zero_because_opposites_cancel_is_not_neutral() -> None:
     assert bench.driver() == ""
 
 
-def test_a_twist_that_cancels_out_is_followed_of_one_who_may_drive() -> None:
+def test_a_twist_that_cancels_out_is_followed_if_its_sender_is_armed() -> None:
     bench = Bench(HIGH)
     assert bench.arbiter.accept(Command("high", REST, bench.now_ns, cancelled=True)) == ""
     assert bench.choice().twist == REST
@@ -578,7 +578,7 @@ KINDS = ("go", "zero", "cancelled", "nan", "unreadable", "stamped", "neutral")
         max_size=30,
     )
 )
-def test_no_twist_is_followed_of_a_sender_that_no_zero_has_armed(
+def test_no_twist_of_a_sender_that_no_zero_has_armed_is_followed(
     story: list[tuple[int, str, str, int]],
 ) -> None:
     bench = Bench(HIGH, armed=False)

@@ -303,7 +303,7 @@ def test_a_turn_in_place_makes_only_the_yaw_less_certain(sign: float) -> None:
     assert covariance.xx + covariance.yy == pytest.approx(2e-6 + 3.375e-7)
 
 
-def test_an_arc_noises_along_its_chord() -> None:
+def test_the_noise_of_an_arc_acts_along_its_chord() -> None:
     # From yaw -pi/4 through pi/2 the chord, 0.6 x sqrt(2) = 0.848528 m, points along x: F shears y
     # by 0.848528 x yaw, its square is 0.72. d = 0.3 x pi = 0.942478: along = 0.942478e-4,
     # yaw = 0.942478e-4 + 1e-2 x (pi / 2 - pi / 1200) = 0.0157760. The right side rolls further by
@@ -335,7 +335,7 @@ def gone(gap: float, linear: float, angular: float) -> PoseCovariance:
 
 
 @pytest.mark.parametrize("gap", [0.15, 0.5])
-def test_a_gap_adds_the_way_between_the_speeds_before_and_after(gap: float) -> None:
+def test_a_gap_adds_the_distance_at_the_speeds_around_it_to_the_deviation(gap: float) -> None:
     # The speed goes from 0.3 to 0.1 m/s at a constant 0.5 rad/s. The mean is 0.2 m/s and 0.5 rad/s,
     # and the bound is twice that.
     grown = matrix(gone(gap, 0.1, 0.5)) - matrix(START)
@@ -343,7 +343,7 @@ def test_a_gap_adds_the_way_between_the_speeds_before_and_after(gap: float) -> N
     assert (0.5 * gap) ** 2 <= grown[2, 2] <= 2 * (0.5 * gap) ** 2
 
 
-def test_the_longer_a_gap_the_less_is_known_of_it() -> None:
+def test_a_longer_gap_makes_the_pose_less_certain() -> None:
     ways = [gone(gap, 0.3, 0.5) for gap in (0.1, 0.2, 0.5, 1.0, 2.0)]
     for cell in ("xx", "yy", "yawyaw"):
         grown = [getattr(way, cell) for way in ways]
@@ -351,7 +351,7 @@ def test_the_longer_a_gap_the_less_is_known_of_it() -> None:
         assert len(set(grown)) == 5
 
 
-def test_gaps_all_err_to_the_same_side() -> None:
+def test_the_errors_of_several_gaps_add_up_without_cancelling() -> None:
     # Ten gaps of 0.1 s at 0.5 m/s miss 0.5 m of the path, not 0.05 m x sqrt(10).
     robot = odometry()
     for _ in range(10):
@@ -377,7 +377,7 @@ def bridged(seconds: float, pieces: int) -> float:
     return estimate.covariance.xx - before - 0.5 * seconds * 1e-4
 
 
-def test_what_was_bridged_is_less_certain_the_longer_it_was() -> None:
+def test_a_longer_bridged_time_is_less_certain() -> None:
     short, longer = bridged(0.2, 1), bridged(0.4, 1)
     # With s_a = 0.125 m/s2, (0.125 x 0.2 x 0.2 / 2)^2 = 6.25e-6, and it grows by the fifth power of
     # time.
@@ -389,7 +389,7 @@ def test_a_gap_bridged_in_pieces_is_one_gap() -> None:
     assert bridged(0.3, 30) == pytest.approx(bridged(0.3, 1), rel=1e-3)
 
 
-def test_what_counts_bridge_is_certain() -> None:
+def test_a_time_that_counts_bridge_adds_no_uncertainty() -> None:
     by_counts, by_lines = odometry(), odometry()
     turned = (5.0,) * 4
     line = Feedback(AT, WheelSpeeds(*(10.0,) * 4), 0.5, turned=turned, bridged=0.49)
@@ -440,14 +440,14 @@ def test_the_further_the_robot_drives_the_less_certain_it_is() -> None:
     assert far_p.yawyaw > near_p.yawyaw
 
 
-def test_who_drives_on_from_nowhere_knows_nothing() -> None:
+def test_a_gap_at_an_unknown_place_makes_the_whole_pose_unknown() -> None:
     robot = odometry(OdometryConfig(distance_variance_per_metre=10.0))
     before = robot.fold(feedback(40.0, 40.0, 1e9)).covariance
     assert before.xx == 1e9 > before.yawyaw
     assert robot.fold(feedback(40.0, 40.0, 0.0, gap=5.0)).covariance == NOWHERE
 
 
-def test_who_has_no_heading_knows_the_place_until_it_moves() -> None:
+def test_a_robot_of_unknown_heading_knows_its_place_until_it_moves() -> None:
     start = (1e-6, 1e-6, 1e6, 1e6, 1e6, 1e9)
     robot = odometry(OdometryConfig(pose_covariance_diagonal=start))
     assert robot.fold(feedback(0.0, 0.0, 0.01)).covariance.xx == pytest.approx(1e-6)
@@ -490,7 +490,7 @@ def counted(*turned: float, dt: float = 0.01, gap: float = 0.0, speed: float = 0
     return Feedback(AT, WheelSpeeds(*(speed,) * 4), dt, gap, (a, b, c, d))
 
 
-def test_counts_move_the_robot_and_its_wheels_by_what_they_say() -> None:
+def test_counts_move_the_robot_and_its_wheels_whatever_the_speed_and_duration_of_the_line() -> None:
     estimate = odometry().fold(counted(2.0, dt=99.0, speed=50.0))
     assert same_pose(estimate.pose, (0.1, 0.0, 0.0))
     assert estimate.positions == (2.0, 2.0, 2.0, 2.0)
@@ -509,7 +509,7 @@ def test_counts_that_agree_with_the_speeds_make_the_same_path(
     assert same_pose(by_counts.pose, (pose.x, pose.y, pose.yaw))
 
 
-def test_counts_bridge_a_gap_without_a_doubt_of_their_own() -> None:
+def test_counts_over_a_gap_add_no_uncertainty_of_the_gap() -> None:
     by_gap, at_once = odometry(), odometry()
     by_gap.fold(counted(0.0, speed=10.0))
     bridged = by_gap.fold(counted(5.0, dt=0.0, gap=0.5))
@@ -554,7 +554,7 @@ def test_more_than_50_ms_of_skipped_lines_are_a_gap() -> None:
 
 
 @pytest.mark.parametrize("after", [counted(1.0), feedback(20.0, 20.0, 0.05)])
-def test_the_counts_of_a_skipped_line_stay_true(after: Feedback) -> None:
+def test_the_counts_of_skipped_lines_are_not_lost(after: Feedback) -> None:
     robot = odometry()
     for _ in range(10):
         robot.skip(counted(1.0, speed=99.0))
@@ -562,7 +562,7 @@ def test_the_counts_of_a_skipped_line_stay_true(after: Feedback) -> None:
     assert robot.fold(counted(0.0)).positions == pytest.approx((11.0,) * 4)
 
 
-def test_what_no_line_reported_is_linear_from_one_report_to_the_next() -> None:
+def test_the_speed_of_a_bridged_time_is_linear_between_two_reports() -> None:
     robot = odometry()
     robot.fold(feedback(10.0, 10.0, 0.01))
     before = robot.pose.x
@@ -592,7 +592,7 @@ def line(seconds: float, dt: float, speeds: WheelSpeeds, **more: Any) -> Feedbac
 
 
 @pytest.mark.parametrize("turned", [None, (0.2, 0.1, 0.1, 0.2)])
-def test_where_a_gyro_tells_the_turn_the_wheels_tell_the_distance_only(
+def test_the_wheels_give_only_the_distance_when_a_gyro_gives_the_turn(
     turned: tuple[float, float, float, float] | None,
 ) -> None:
     speeds, kinematics = WheelSpeeds(20.0, 10.0, 10.0, 20.0), Kinematics(DriveConfig())
@@ -609,7 +609,7 @@ def test_where_a_gyro_tells_the_turn_the_wheels_tell_the_distance_only(
     assert more == pytest.approx(1e-4, rel=1e-3)  # the gyro's scale adds 0.2 mrad
 
 
-def test_over_a_gap_the_gyro_knows_the_turn() -> None:
+def test_the_gyro_gives_the_turn_over_a_gap() -> None:
     odometry = Odometry(OdometryConfig(), Kinematics(DriveConfig()))
     odometry.checks.gyro = Says(Turn(0.3, 1e-4, 0.7, 1e-3))
     estimate = odometry.fold(line(1.0, 0.0, WheelSpeeds(), gap=0.4))
@@ -625,7 +625,7 @@ def at_rest(robot: Odometry) -> Estimate:
     return estimate
 
 
-def test_a_robot_at_rest_knows_its_twist() -> None:
+def test_the_twist_of_a_robot_at_rest_is_certain() -> None:
     robot = odometry()
     for _ in range(19):
         moving = robot.fold(feedback(0.0, 0.0, 0.01)).twist_variances
@@ -648,7 +648,7 @@ def test_a_count_to_and_fro_at_rest_moves_nothing() -> None:
     )
 
 
-def test_a_count_that_has_come_back_is_not_driven_later() -> None:
+def test_a_count_that_was_undone_at_rest_does_not_move_the_robot_later() -> None:
     robot = odometry()
     at_rest(robot)
     for turned in (0.002, -0.002):
@@ -666,7 +666,7 @@ def test_a_wheel_that_creeps_back_count_by_count_is_not_held() -> None:
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.21])
-def test_counts_that_only_the_steps_of_the_speeds_show_make_a_twist_doubtful(
+def test_coarse_speed_steps_make_the_twist_at_rest_less_certain(
     seconds: float,
 ) -> None:
     robot, steps = odometry(), (31.4, 31.4, 31.4, math.inf)
@@ -696,7 +696,7 @@ def test_a_robot_that_creeps_too_slowly_for_two_decimals_moves() -> None:
     assert estimate.pose.x == pytest.approx(1.0 * 0.05, abs=0.05 * 0.04)
 
 
-def test_the_counts_of_the_encoders_are_a_doubt_of_the_pose() -> None:
+def test_coarse_encoder_counts_make_the_pose_less_certain() -> None:
     coarse = Odometry(OdometryConfig(), Kinematics(DriveConfig()), 20)
     covariance = coarse.fold(feedback(0.0, 0.0, 0.01)).covariance
     # A count is 15.7 mm, and a wheel may be anywhere in it at the start and now. Each side is the
@@ -706,7 +706,7 @@ def test_the_counts_of_the_encoders_are_a_doubt_of_the_pose() -> None:
     assert covariance.yawyaw == pytest.approx(1e-6 + 2 * count**2 / 12 / 0.3**2)
 
 
-def test_gaps_and_bridges_are_counted_and_a_gap_at_rest_is_none() -> None:
+def test_gaps_and_bridged_times_are_counted_but_a_gap_at_rest_is_not() -> None:
     odometry = Odometry(OdometryConfig(), Kinematics(DriveConfig()))
     at, moving = Instant(0, 0), WheelSpeeds(5.0, 5.0, 5.0, 5.0)
     odometry.fold(Feedback(at, WheelSpeeds(), 0.0, gap=2.0))
@@ -725,28 +725,28 @@ def snapped(turned: float, dt: float = 0.01, speed: float = 9.99, bridged: float
     return Feedback(AT, speeds, dt, bridged=bridged, counted=(turned,) * 4)
 
 
-def test_what_a_line_counted_is_how_far_it_went_whatever_its_speed_and_time_say() -> None:
+def test_the_whole_counts_of_a_line_give_its_distance_whatever_its_speed_and_time() -> None:
     robot = odometry()
     for dt in (0.01, 0.003, 0.017):
         robot.fold(snapped(0.1, dt))
     assert robot.pose.x == pytest.approx(3 * 0.1 * 0.05)
 
 
-def test_what_was_bridged_comes_on_top_of_what_a_line_counted() -> None:
+def test_the_motion_of_a_bridged_time_is_added_to_the_counts_of_a_line() -> None:
     robot = odometry()
     robot.fold(snapped(0.1, dt=0.02, speed=10.0))
     robot.fold(snapped(0.1, dt=0.03, speed=10.0, bridged=0.02))
     assert robot.pose.x == pytest.approx((0.1 + 0.2 + 0.1) * 0.05)
 
 
-def test_a_line_that_was_dropped_is_made_up_for_by_the_next_ones_speed() -> None:
+def test_the_speed_of_the_next_line_replaces_a_skipped_line() -> None:
     robot = odometry()
     robot.skip(snapped(5.0, speed=99.0))
     robot.fold(snapped(0.1, speed=10.0))
     assert robot.pose.x == pytest.approx((0.1 + 0.1) * 0.05)
 
 
-def test_the_twist_of_a_line_is_as_uncertain_as_its_counts_are_coarse() -> None:
+def test_coarser_counts_make_the_twist_of_a_line_less_certain() -> None:
     coarse, fine = (
         odometry().fold(msgspec.structs.replace(snapped(0.1), steps=(step,) * 4))
         for step in (31.4, 0.3)
@@ -754,7 +754,7 @@ def test_the_twist_of_a_line_is_as_uncertain_as_its_counts_are_coarse() -> None:
     assert coarse.twist_variances.angular > 100 * fine.twist_variances.angular
 
 
-def test_an_encoder_that_is_unknown_makes_no_twist_infinitely_uncertain() -> None:
+def test_an_unknown_encoder_leaves_the_twist_variance_finite() -> None:
     robot, steps = odometry(), (math.inf, 31.4, 31.4, math.inf)
     some = robot.fold(msgspec.structs.replace(snapped(0.1), steps=steps))
     assert math.isfinite(some.twist_variances.linear)
@@ -764,7 +764,7 @@ def test_an_encoder_that_is_unknown_makes_no_twist_infinitely_uncertain() -> Non
 
 
 @pytest.mark.parametrize("share", [0.7, 1.6])
-def test_by_another_track_only_the_turns_to_come_are_others(share: float) -> None:
+def test_another_track_changes_only_later_turns(share: float) -> None:
     asked, plain = odometry(OdometryConfig(learned_track=True)), odometry()
     for robot in (asked, plain):
         robot.fold(feedback(4.0, 9.0, 1.0))
@@ -778,7 +778,7 @@ def test_by_another_track_only_the_turns_to_come_are_others(share: float) -> Non
     assert asked.travelled == plain.travelled
 
 
-def test_a_learned_track_that_is_asked_for_and_not_known_changes_no_bit() -> None:
+def test_an_enabled_learned_track_changes_nothing_until_it_is_known() -> None:
     asked, plain = odometry(OdometryConfig(learned_track=True)), odometry()
     for n in range(200):
         line = feedback(math.sin(n), 9.0 + math.cos(n), 0.01)
@@ -790,7 +790,7 @@ def test_a_learned_track_that_is_asked_for_and_not_known_changes_no_bit() -> Non
         )
 
 
-def test_what_is_taken_back_was_turned_by_the_track_of_its_time() -> None:
+def test_a_corrected_turn_is_computed_with_the_track_at_the_time_of_that_turn() -> None:
     """The front left wheel is dead, and the learned track changes before that is found."""
     asked = OdometryConfig(learned_track=True)
     liar, honest = (Odometry(asked, Kinematics(DriveConfig()), 3200) for _ in range(2))
@@ -808,7 +808,7 @@ def test_what_is_taken_back_was_turned_by_the_track_of_its_time() -> None:
 
 
 @pytest.mark.parametrize("share", [0.5, 1.6])
-def test_by_a_learned_track_it_is_as_uncertain_as_if_that_were_configured(share: float) -> None:
+def test_a_learned_track_makes_the_estimate_as_uncertain_as_a_configured_one(share: float) -> None:
     """A learned track affects more than its own error.
 
     Wheel noise, counts and their play depend on it as well.

@@ -19,7 +19,7 @@ finite = st.floats(-1e6, 1e6)
 
 
 @given(a=finite, b=finite)
-def test_a_sum_and_what_it_leaves_out_are_the_whole(a: float, b: float) -> None:
+def test_a_sum_and_its_rounding_error_together_are_exact(a: float, b: float) -> None:
     total, rest = plus(a, b)
     assert math.fsum((a, b, -total, -rest)) == 0.0
     assert total == a + b
@@ -74,7 +74,7 @@ def test_a_million_lines_end_within_a_nanometre(drive: str, lines: int) -> None:
     assert off[2] < 1e-12
 
 
-def test_setting_the_pose_starts_over() -> None:
+def test_setting_the_pose_discards_the_path_before() -> None:
     path = Path()
     path.advance(0.1, 0.1)
     path.set(Pose(1.0, 2.0, 0.5))

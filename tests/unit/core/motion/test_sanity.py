@@ -103,7 +103,9 @@ def test_forgetting_starts_over() -> None:
 
 
 @pytest.mark.parametrize("forget", [False, True])
-def test_new_or_after_forgetting_it_takes_three_impossible_lines(forget: bool) -> None:
+def test_three_impossible_lines_are_doubtful_at_the_start_and_after_forgetting(
+    forget: bool,
+) -> None:
     sanity = Sanity(FeedbackConfig())
     if forget:
         sanity.forget()
@@ -158,7 +160,7 @@ def test_a_damaged_line_before_the_encoders_are_known_is_no_fault_of_the_true_li
 
 
 @pytest.mark.parametrize("first", [0, 1])
-def test_of_a_wire_that_damages_every_second_line_the_true_lines_are_found(first: int) -> None:
+def test_the_true_lines_are_found_on_a_wire_that_damages_every_second_line(first: int) -> None:
     sanity, wild = Sanity(FeedbackConfig()), (79.0, -60.0, 35.0, -79.0, 60.0, -35.0)
     lines = []
     for speed in wild:
@@ -166,7 +168,7 @@ def test_of_a_wire_that_damages_every_second_line_the_true_lines_are_found(first
     assert verdicts(sanity, *lines[first:])[3 - first :: 2] == [True] * 5
 
 
-def test_a_speed_that_no_wheel_reaches_agrees_with_nothing() -> None:
+def test_a_repeated_speed_that_no_wheel_reaches_stays_impossible() -> None:
     sanity, fast = Sanity(FeedbackConfig()), line(only(0, 80.1))
     sanity.impossible(line(SPIKE))
     assert [bool(sanity.impossible(fast)) for _ in range(3)] == [True] * 3
@@ -189,7 +191,7 @@ def test_lines_that_agree_with_no_other_are_a_fault_from_the_first_on() -> None:
     assert found == [False, False, False, True]
 
 
-def test_after_a_gap_nothing_from_before_it_is_compared() -> None:
+def test_a_line_after_a_gap_is_not_compared_with_lines_before_the_gap() -> None:
     sanity = Sanity(FeedbackConfig())
     verdicts(sanity, line(STILL), line(STILL), line(SPIKE))
     assert verdicts(sanity, line(STILL, dt=0.0, gap=2.0), line(SPIKE)) == [True, False]
@@ -211,7 +213,7 @@ def test_a_count_more_or_less_at_each_end_is_no_change_of_speed() -> None:
     assert "front_right" in sanity.impossible(stepping(only(0, -0.2), 31.4))
 
 
-def test_a_proven_count_more_is_not_too_fast() -> None:
+def test_one_additional_proven_count_is_not_too_fast() -> None:
     sanity = Sanity(FeedbackConfig(wheel_speed=50.0))
     assert sanity.impossible(stepping(only(2, 80.0), 31.4, proven=True)) == ""
     assert "wheel_speed" in sanity.impossible(stepping(only(2, 81.5), 31.4, proven=True))
@@ -236,12 +238,12 @@ def test_one_count_is_never_too_fast_and_two_in_its_time_are(number: int) -> Non
         assert ("wheel_speed" in sanity.impossible(line)) is (number == 2)
 
 
-def test_a_step_that_may_be_a_lie_leaves_no_speed_too_fast_unsaid() -> None:
+def test_an_unproven_quantization_step_excuses_no_speed_above_the_limit() -> None:
     sanity = Sanity(FeedbackConfig(wheel_speed=50.0))
     assert "feedback.wheel_speed" in sanity.impossible(stepping(only(2, 50.1), 31.4))
 
 
-def test_while_an_encoder_is_unknown_any_change_may_be_a_count_but_no_speed_too_fast() -> None:
+def test_an_unknown_encoder_makes_any_change_possible_but_no_speed_above_the_limit() -> None:
     sanity = Sanity(FeedbackConfig())
     assert sanity.impossible(stepping(STILL, math.inf)) == ""
     assert sanity.impossible(stepping(only(1, 79.9), math.inf)) == ""

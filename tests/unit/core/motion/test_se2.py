@@ -63,7 +63,9 @@ def test_the_bracket_is_the_commutator(a: Vector, b: Vector) -> None:
 
 
 @given(error=vectors, dx=number, dy=number)
-def test_from_further_on_an_error_is_the_same_motion(error: Vector, dx: float, dy: float) -> None:
+def test_an_error_that_is_seen_from_a_further_point_is_the_same_motion(
+    error: Vector, dx: float, dy: float
+) -> None:
     moved = np.array([[1.0, 0.0, dx], [0.0, 1.0, dy], [0.0, 0.0, 1.0]])
     seen = np.linalg.inv(moved) @ hat(error) @ moved
     assert seen_from(error, dx, dy) == pytest.approx((seen[0, 2], seen[1, 2], seen[1, 0]))
@@ -77,7 +79,7 @@ def test_a_covariance_is_carried_like_its_errors(root: list[float], dx: float, d
 
 
 @given(a=vectors, root=roots, times=number)
-def test_brackets_correlate_with_what_they_are_of(
+def test_the_correlation_of_brackets_with_their_errors_is_that_of_the_matrices(
     a: Vector, root: list[float], times: float
 ) -> None:
     p = covariance(root)
@@ -110,7 +112,9 @@ def test_the_third_terms_are_those_of_barfoot_and_furgale(
 
 
 @given(p_root=roots, q_root=roots, c=number, s=number)
-def test_sums_are_by_cell(p_root: list[float], q_root: list[float], c: float, s: float) -> None:
+def test_sums_of_covariances_are_taken_cell_by_cell(
+    p_root: list[float], q_root: list[float], c: float, s: float
+) -> None:
     p, q = covariance(p_root), covariance(q_root)
     assert matrix(total(p, q)) == pytest.approx(matrix(p) + matrix(q))
     assert matrix(difference(p, q)) == pytest.approx(matrix(p) - matrix(q))

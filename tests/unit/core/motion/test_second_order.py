@@ -48,7 +48,9 @@ def sampled(metres: int, yaw: float, column: float) -> float:
 
 
 @pytest.mark.parametrize(("yaw", "column"), [(1e-3, 0.0), (0.0, 0.01), (1e-3, 0.01), (1e-3, 0.03)])
-def test_noise_and_a_parameter_bend_a_straight_as_sampling_says(yaw: float, column: float) -> None:
+def test_the_second_order_terms_of_noise_and_a_parameter_agree_with_sampling(
+    yaw: float, column: float
+) -> None:
     second, _ = straight(10, yaw, column)
     assert second.xx == pytest.approx(sampled(10, yaw, column), rel=0.06)
     assert second.yy == pytest.approx(0.0, abs=1e-12)
@@ -59,14 +61,14 @@ def test_heading_noise_on_a_straight_has_a_48th_of_its_square() -> None:
     assert second.xx == pytest.approx(1e-8 * 20**4 / 48, rel=0.02)
 
 
-def test_a_heading_that_says_nothing_adds_nothing() -> None:
+def test_an_unknown_heading_adds_no_second_order_term() -> None:
     second = SecondOrder(0)
     p = PoseCovariance(1.0, 0.0, 0.0, 1.0, 0.0, MAX_HEADING_VARIANCE * 1.01)
     assert second.compose(p, heading(0.1), [], []) == NONE
     assert (second.xx, second.xy, second.yy) == (0.0, 0.0, 0.0)
 
 
-def test_a_column_more_changes_nothing_of_what_was() -> None:
+def test_an_additional_column_does_not_change_the_existing_terms() -> None:
     second, p = straight(5, 1e-3, 0.01)
     before = second.xx
     second.widen()

@@ -48,38 +48,38 @@ def lies(
 
 @each("known", [told(10.0), told(12.0, slow=8.0), felt(10.0)])
 @each(("own", "lie"), [(0.0, "dead"), (0.4, "dead"), (-10.0, "reversed")])
-def test_a_sign_that_command_or_gyro_deny_is_a_lie(
+def test_a_wheel_that_the_command_or_the_gyro_contradicts_is_faulty(
     own: float, lie: WheelFault, known: Known
 ) -> None:
     assert lies(own, 10.0, known) == (True, lie)
 
 
 @pytest.mark.parametrize("own", [0.0, -10.0])
-def test_two_lines_are_none(own: float) -> None:
+def test_two_lines_are_too_few_to_find_a_faulty_wheel(own: float) -> None:
     assert not lies(own, 20.0, told(20.0), lines=2)[0]
 
 
 @pytest.mark.parametrize("own", [0.0, -10.0])
-def test_without_command_and_gyro_nothing_is_known(own: float) -> None:
+def test_no_wheel_is_found_faulty_without_a_command_and_a_gyro(own: float) -> None:
     assert not lies(own, 10.0, NOTHING, lines=1000)[0]
 
 
-def test_who_does_as_told_does_not_lie() -> None:
+def test_a_wheel_that_follows_its_command_is_not_faulty() -> None:
     assert not lies(0.0, 10.0, told(0.4), lines=100)[0]
     assert not lies(10.0, -10.0, told(10.0), lines=100)[0]
 
 
-def test_a_gyro_is_believed_before_the_command() -> None:
+def test_a_gyro_takes_precedence_over_the_command() -> None:
     spins = told(10.0, gyro=0.0)
     assert lies(0.0, 10.0, told(10.0))[0]
     assert not lies(0.0, 10.0, spins, lines=100)[0]
 
 
-def test_half_the_speed_is_no_sign_of_a_lie() -> None:
+def test_half_the_speed_is_no_sign_of_a_fault() -> None:
     assert lies(5.0, 10.0, told(10.0), lines=100) == (False, None)
 
 
-def test_a_wheel_that_says_the_same_while_its_command_and_the_other_change_is_stuck() -> None:
+def test_a_constant_wheel_speed_while_the_command_and_the_other_wheel_change_is_stuck() -> None:
     suspect, speed = Suspect(), 10.0
     lines = 0
     while lines < 40:
@@ -108,7 +108,7 @@ def test_a_wheel_of_a_slow_robot_may_turn_against_a_new_command_while_it_slows_d
     assert suspect.is_faulty(FINE) is out
 
 
-def test_what_no_hand_turns_so_evenly_is_stuck_too() -> None:
+def test_a_wheel_that_turns_more_evenly_than_by_hand_is_stuck() -> None:
     assert not lies(3.0, 0.0, NOTHING, lines=25, same=True)[0]
     assert lies(3.0, 0.0, NOTHING, lines=35, same=True) == (True, "stuck")
 
@@ -121,13 +121,13 @@ def test_what_no_hand_turns_so_evenly_is_stuck_too() -> None:
         ("stuck", 7.0, 5.0, True), ("stuck", 7.01, 5.0, False),
     ],
 )  # fmt: skip
-def test_a_line_before_belongs_to_the_lie_if_it_has_its_sign(
+def test_an_earlier_line_belongs_to_the_fault_if_it_has_the_sign_of_the_fault(
     lie: WheelFault, own: float, other: float, lied: bool
 ) -> None:
     assert was_faulty(lie, own, other, 7.0) is lied
 
 
-def test_every_lie_has_its_words() -> None:
+def test_every_wheel_fault_has_a_text() -> None:
     assert set(WORDS) == set(WheelFault.__args__)  # type: ignore[attr-defined]
 
 
@@ -152,29 +152,31 @@ def after(acceleration: float, other: float = 1.0, same: bool = True, count: flo
 
 
 @pytest.mark.parametrize("acceleration", [20.0, 32.0, -20.0, -32.0])
-def test_it_is_out_within_50_ms_of_being_2_rad_s_wrong(acceleration: float) -> None:
+def test_a_stuck_wheel_is_found_within_50_ms_after_its_error_reaches_2_rad_s(
+    acceleration: float,
+) -> None:
     assert after(acceleration) <= 2.0 / abs(acceleration) + 0.05
 
 
-def test_a_steady_wheel_says_the_same_for_ever() -> None:
+def test_a_wheel_at_a_constant_command_is_never_stuck() -> None:
     assert after(0.0) == math.inf
 
 
-def test_a_wheel_that_says_another_speed_is_not_stuck() -> None:
+def test_a_wheel_that_reports_changing_speeds_is_not_stuck() -> None:
     assert after(20.0, same=False) == math.inf
 
 
-def test_if_neither_wheel_follows_it_is_the_command_that_is_not_obeyed() -> None:
+def test_a_wheel_is_not_stuck_if_the_other_wheel_does_not_follow_the_command_either() -> None:
     assert after(20.0, other=0.0) == math.inf
     assert after(20.0, other=-1.0) == math.inf
 
 
 @pytest.mark.parametrize("counts", [96, 400])
-def test_coarser_encoders_need_more_turn_to_tell(counts: int) -> None:
+def test_a_stuck_wheel_with_a_coarser_encoder_is_found_later(counts: int) -> None:
     assert after(20.0) < after(20.0, count=math.tau / counts)
 
 
-def test_a_speed_that_changes_in_between_begins_it_anew() -> None:
+def test_a_changed_speed_in_between_restarts_the_evidence_of_a_stuck_wheel() -> None:
     stuck = Stuck()
     for line in range(1, 100):
         command = 10.0 + 0.2 * line

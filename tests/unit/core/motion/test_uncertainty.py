@@ -67,7 +67,7 @@ def check(values: Array, name: str, low: float = 0.93, spare: float = 0.0) -> No
 @pytest.mark.soak
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("scenario", SCENARIOS)
-def test_the_covariance_tells_the_truth(scenario: str, model: str) -> None:
+def test_the_covariance_matches_the_pose_errors(scenario: str, model: str) -> None:
     drives = 50 if scenario == "random" else 1
     chosen = MODELS[model]
     if scenario == "straight" and chosen.radius_std:
@@ -89,7 +89,9 @@ def corner(_: np.random.Generator) -> Legs:
 @pytest.mark.variations(2)
 @pytest.mark.parametrize("model", ["default", "wheels, parameters"])
 @pytest.mark.parametrize("legs", [lap, corner])
-def test_the_covariance_of_a_short_drive_tells_the_truth(legs: Scenario, model: str) -> None:
+def test_the_covariance_of_a_short_drive_matches_the_pose_errors(
+    legs: Scenario, model: str
+) -> None:
     check(study(legs, MODELS[model], runs=1500), f"{legs.__name__}, {model}", spare=0.05)
 
 
@@ -122,13 +124,13 @@ def bursts(a_minute: float) -> Heard:
 
 @pytest.mark.soak
 @pytest.mark.parametrize("model", MODELS)
-def test_bridged_bursts_get_the_covariance_they_deserve(model: str) -> None:
+def test_the_covariance_matches_the_pose_errors_after_bridged_bursts(model: str) -> None:
     values = study(random, MODELS[model], runs=1000, drives=100, heard=bursts(2.0))
     check(values, f"bursts, {model}")
 
 
 @pytest.mark.slow
-def test_fifty_gaps_at_cruise_are_no_seven_sigma() -> None:
+def test_the_covariance_matches_the_pose_errors_after_fifty_gaps_at_cruise() -> None:
     """The drive has 50 gaps of 150 ms in which the pose does not move."""
     rng = np.random.default_rng(5)
     drive = reports([(0.5, 0.02, 60.0)])
@@ -176,7 +178,9 @@ DRIVES = SCENARIOS | {"minute": lambda rng: random(rng, 60.0)}
 @pytest.mark.soak
 @pytest.mark.parametrize("counts", [20, 96, 400, 3200])
 @pytest.mark.parametrize("scenario", ["square", "minute", "circle"])
-def test_coarse_encoders_are_not_the_covariances_trouble(scenario: str, counts: int) -> None:
+def test_the_covariance_matches_the_pose_errors_of_coarse_encoders(
+    scenario: str, counts: int
+) -> None:
     values = study(
         DRIVES[scenario], DEFAULT, 1000, drives=40, heard=counting(counts), counts=counts
     )
@@ -184,7 +188,7 @@ def test_coarse_encoders_are_not_the_covariances_trouble(scenario: str, counts: 
 
 
 @pytest.mark.parametrize("counts", [400, 3200])
-def test_a_straight_that_encoders_count_is_no_turn(counts: int) -> None:
+def test_the_encoder_counts_of_a_straight_add_no_yaw_variance(counts: int) -> None:
     rng = np.random.default_rng(1)
     drive = reports([(0.5, 0.0, 20.0)])
     _, by_counts = fold(counting(counts)(drive, rng), DEFAULT, counts)
@@ -200,7 +204,7 @@ def uncertainty(model: Model = DEFAULT, **changes: float) -> PoseUncertainty:
     return PoseUncertainty(ErrorModel(config, Kinematics(DriveConfig())), 0)
 
 
-def test_what_is_known_by_calibration_makes_the_pose_less_certain_by_its_deviation() -> None:
+def test_the_deviation_of_a_wheel_radius_makes_the_pose_less_certain() -> None:
     # After 10 m straight with the right wheels' radius off by 0.2 %, 0.01 m of length and 20 mm /
     # 0.3 m of yaw are wrong.
     odometry = OdometryConfig(
@@ -222,7 +226,7 @@ def test_what_is_known_by_calibration_makes_the_pose_less_certain_by_its_deviati
     assert math.sqrt(p.xx) == pytest.approx(math.hypot(0.01, math.sqrt(3) * bent), rel=1e-2)
 
 
-def test_the_error_of_a_radius_is_driven_back_with_the_way() -> None:
+def test_the_yaw_error_of_a_wheel_radius_cancels_on_the_way_back() -> None:
     one = uncertainty(left_wheel_radius_multiplier_std=0.01)
     for step in [0.01] * 500 + [-0.01] * 500:
         one.advance(step, 0.0, step, 0.0, 0.0)
@@ -265,7 +269,7 @@ def test_trembling_within_a_count_is_no_turning() -> None:
 
 
 @pytest.mark.parametrize("counts", [16, 96, 400])
-def test_the_heading_is_as_uncertain_as_the_place_of_the_wheels_within_their_counts(
+def test_the_unknown_wheel_angle_within_a_count_adds_to_the_yaw_variance(
     counts: int,
 ) -> None:
     kinematics, count = Kinematics(DriveConfig()), RADIUS * math.tau / counts
@@ -296,7 +300,7 @@ def test_the_error_of_a_track_counts_for_the_turns_that_it_made() -> None:
     assert turned(-1.0)[1] == pytest.approx((0.02 * 1.5 / 1.6) ** 2)
 
 
-def test_what_a_gyro_and_what_gaps_make_wrong_is_kept_apart_whichever_came_first() -> None:
+def test_the_yaw_errors_of_the_gyro_and_of_gaps_are_separate_whichever_came_first() -> None:
     gaps_first, gyro_first = uncertainty(), uncertainty()
     before = gyro_first.covariance.yawyaw
     gaps_first.stand(0.0, 0.0, 0.0, 0.0)
@@ -311,7 +315,7 @@ def test_what_a_gyro_and_what_gaps_make_wrong_is_kept_apart_whichever_came_first
         assert grown == pytest.approx((20.0 * GYRO_SCALE) ** 2 + of_skidding, rel=0.01)
 
 
-def test_wheels_that_tell_a_turn_bend_nothing_by_a_gyros_scale() -> None:
+def test_a_turn_that_the_wheels_give_has_no_error_of_the_gyro_scale() -> None:
     one, plain_one = uncertainty(), uncertainty()
     one.advance(0.0, 0.0, 0.0, 0.0, 0.0, variance=0.0)
     for each in (one, plain_one):

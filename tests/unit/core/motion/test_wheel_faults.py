@@ -87,7 +87,7 @@ def driven(told: WheelSpeeds = TEN, counts: int = 3200) -> Bench:
 # faulty wheels
 
 
-def test_a_board_that_stopped_during_a_stall_has_no_dead_wheels_behind_it() -> None:
+def test_a_board_that_stopped_during_a_stall_has_no_dead_wheels_afterwards() -> None:
     """Lines of 50 ms waited meanwhile, and the first command reaches the board 60 ms late."""
     faults = WheelFaults(Kinematics(DriveConfig()), 3200, FeedbackConfig(fault_time=0.1))
     for _ in range(40):
@@ -113,7 +113,7 @@ def test_wheels_that_run_backwards_are_found_although_stalls_repeat(own: float) 
     assert "turns against its command" in found or "turns faster than commanded" in found
 
 
-def test_a_runaway_is_found_behind_a_stall_during_which_it_never_stopped() -> None:
+def test_a_runaway_that_never_stops_during_stalls_is_found() -> None:
     faults = WheelFaults(Kinematics(DriveConfig()), 3200, FeedbackConfig(fault_time=0.1))
     found = ""
     for _ in range(10):
@@ -125,7 +125,7 @@ def test_a_runaway_is_found_behind_a_stall_during_which_it_never_stopped() -> No
 
 @each("wheel", range(4))
 @each("says", [0.0, -10.0])
-def test_a_wheel_that_lies_is_left_out_within_fifty_milliseconds_and_named(
+def test_a_faulty_wheel_is_left_out_within_fifty_milliseconds_and_named(
     wheel: int, says: float
 ) -> None:
     bench = driven()
@@ -136,7 +136,7 @@ def test_a_wheel_that_lies_is_left_out_within_fifty_milliseconds_and_named(
     assert bench.faults.believed(said) == pytest.approx((10.0,) * 4, 1e-3)
 
 
-def test_its_other_wheel_stands_in_for_it_and_no_wheel_else_changes() -> None:
+def test_the_other_wheel_of_the_side_replaces_a_faulty_wheel_and_no_other_speed_changes() -> None:
     bench = driven()
     bench.run(only(1, 0.0), TEN)
     front_right, front_left, *rear = bench.faults.believed((1, 2, 3, 4))
@@ -144,7 +144,7 @@ def test_its_other_wheel_stands_in_for_it_and_no_wheel_else_changes() -> None:
     assert front_left == pytest.approx(3, rel=1e-3)
 
 
-def test_a_wheel_of_each_side_can_be_left_out_and_never_both_of_one() -> None:
+def test_one_wheel_of_each_side_can_be_left_out_but_never_both_of_a_side() -> None:
     bench = driven()
     bench.run(WheelSpeeds(0.0, 0.0, 10.0, 10.0), TEN)
     assert bench.faults.status.left_out == ("front_left", "front_right")
@@ -152,11 +152,11 @@ def test_a_wheel_of_each_side_can_be_left_out_and_never_both_of_one() -> None:
     assert bench.faults.status.left_out == ("front_left", "front_right")
 
 
-def test_it_counts_again_when_it_has_agreed_for_half_a_second() -> None:
+def test_a_wheel_that_was_left_out_counts_again_once_it_has_agreed_for_half_a_second() -> None:
     bench = driven()
     bench.run(only(2, 0.0), TEN)
     bench.run(STILL, STILL, seconds=5.0)
-    assert bench.faults.status.left_out == ("rear_left",), "who stands agrees with everybody"
+    assert bench.faults.status.left_out == ("rear_left",), "a wheel at rest agrees with every other"
     bench.run(TEN, TEN, seconds=2.0)
     assert not bench.faults.status.left_out
     assert bench.events == ["left out", "again"]
@@ -179,7 +179,7 @@ def test_a_wheel_left_out_as_stuck_is_a_fault_only_while_it_repeats_that_speed(
     assert bench.faults.status.left_out == ("front_right",)
 
 
-def test_what_it_made_of_the_pose_until_then_is_taken_back() -> None:
+def test_the_pose_error_of_a_faulty_wheel_before_its_detection_is_taken_back() -> None:
     robot, plain = odometry(3200), Plain()
     for told in [TEN] * 200 + [only(0, 0.0)] * 50:
         fold(robot, Feedback(AT, told, PERIOD), TEN)
@@ -189,7 +189,7 @@ def test_what_it_made_of_the_pose_until_then_is_taken_back() -> None:
     assert robot.pose.x == pytest.approx(250 * 10 * PERIOD * 0.05, rel=1e-3)
 
 
-def test_the_wheels_angles_are_what_the_encoders_said() -> None:
+def test_the_wheel_angles_are_those_of_the_encoders_even_if_a_wheel_is_left_out() -> None:
     robot = odometry()
     for says in [TEN] * 100 + [only(0, 0.0)] * 100:
         estimate, _ = fold(robot, Feedback(AT, says, PERIOD), TEN)
@@ -197,7 +197,7 @@ def test_the_wheels_angles_are_what_the_encoders_said() -> None:
     assert estimate.speeds == only(0, 0.0)
 
 
-def test_a_pose_that_was_set_since_is_not_taken_back() -> None:
+def test_a_pose_that_was_set_after_the_fault_began_is_not_corrected() -> None:
     robot = odometry(3200)
     for says in [TEN] * 100 + [only(0, 0.0)] * 2:
         fold(robot, Feedback(AT, says, PERIOD), TEN)
@@ -214,7 +214,7 @@ def test_a_pose_that_was_set_since_is_not_taken_back() -> None:
 
 @pytest.mark.parametrize("pushed", [0.5, 3.0, 12.0])
 @pytest.mark.parametrize("in_the_air", range(4))
-def test_hands_that_push_with_nothing_commanded_leave_no_wheel_out(
+def test_a_push_by_hand_without_a_command_leaves_no_wheel_out(
     pushed: float, in_the_air: int
 ) -> None:
     """Either three wheels roll while one hangs in the air, or only the one in the air turns."""
@@ -226,13 +226,13 @@ def test_hands_that_push_with_nothing_commanded_leave_no_wheel_out(
         assert bench.faults.status.left_out == ()
 
 
-def test_with_a_gyro_the_wheel_in_the_air_is_left_out_though_nothing_is_commanded() -> None:
+def test_a_gyro_shows_that_a_pushed_robot_has_a_wheel_in_the_air() -> None:
     bench = Bench()
     assert bench.run(only(3, 0.0, 5.0), STILL, turn=0.0) <= 0.05
     assert bench.faults.status.left_out == ("rear_right",)
 
 
-def test_a_wheel_that_spins_in_the_air_counts_and_is_told_as_slip() -> None:
+def test_a_wheel_that_spins_in_the_air_is_not_left_out_and_is_reported_as_slip() -> None:
     bench = driven()
     assert bench.run(only(0, 12.5), TEN, seconds=10.0) == math.inf
     assert bench.faults.status.slipping == ("right",)
@@ -242,7 +242,7 @@ def test_a_wheel_that_spins_in_the_air_counts_and_is_told_as_slip() -> None:
 
 
 @pytest.mark.parametrize("wheel", range(4))
-def test_slip_is_told_by_its_side_and_ends_half_a_second_after(wheel: int) -> None:
+def test_slip_is_reported_with_its_side_until_about_half_a_second_after_its_end(wheel: int) -> None:
     bench = driven()
     bench.run(only(wheel, 11.0), TEN, seconds=0.2)
     side = WHEELS[wheel].partition("_")[2]
@@ -253,7 +253,7 @@ def test_slip_is_told_by_its_side_and_ends_half_a_second_after(wheel: int) -> No
     assert not bench.faults.slips
 
 
-def test_while_it_slips_every_variance_is_a_hundred_times_as_large() -> None:
+def test_slip_makes_every_variance_a_hundred_times_larger() -> None:
     calm, slipping = odometry(3200), odometry(3200)
     for says in [TEN] * 200:
         sure, _ = fold(calm, Feedback(AT, says, PERIOD), TEN)
@@ -268,7 +268,7 @@ def test_while_it_slips_every_variance_is_a_hundred_times_as_large() -> None:
     assert unsure.covariance.yawyaw - begun > 80 * (sure.covariance.yawyaw - begun)
 
 
-def test_wheels_that_a_gyro_denies_are_as_uncertain() -> None:
+def test_wheels_that_a_gyro_contradicts_have_a_hundred_times_larger_variances() -> None:
     calm, slipping = odometry(3200), odometry(3200)
     calm.checks.gyro = Says(Turn(0.0, 0.0, 0.0, 0.0, slips=False))
     slipping.checks.gyro = Says(Turn(0.0, 0.0, 0.0, 0.0, slips=True))
@@ -343,7 +343,9 @@ SOAK = [pytest.mark.soak, pytest.mark.timeout(3600)]
     ],
 )
 @pytest.mark.parametrize("kind", list(LIES))
-def test_a_lie_costs_less_than_a_twentieth(kind: str, counts: int, count: int) -> None:
+def test_the_check_reduces_the_pose_error_of_a_faulty_wheel_to_a_twentieth(
+    kind: str, counts: int, count: int
+) -> None:
     """The drives are random. `COARSE` allows more for coarse encoders."""
     falls = [Fall(kind, seed, counts) for seed in range(count)]
     plain = np.array([fall.plain for fall in falls]).mean(axis=0)
@@ -432,7 +434,7 @@ def healthy(
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_digit_that_flips_at_rest_makes_no_encoder_a_fine_one(seed: int) -> None:
+def test_a_digit_that_flips_at_rest_does_not_make_an_encoder_count_as_fine(seed: int) -> None:
     flipped = only(1, 0.01, 0.0)
     assert healthy(seed, 20.0, 96, (STILL, flipped, STILL, STILL, flipped, STILL)) == (0, True)
 
@@ -509,5 +511,5 @@ def test_the_time_to_report_slip_depends_on_counts_and_speed(
     assert found[-1] <= within + 1e-9
 
 
-def test_of_twenty_counts_a_turn_slip_of_a_tenth_does_not_show() -> None:
+def test_slip_of_a_tenth_is_not_found_with_twenty_counts_a_turn() -> None:
     assert slipping(np.random.default_rng(7), 20, 20.0) == math.inf

@@ -47,14 +47,14 @@ def test_a_tenth_more_on_one_wheel_is_a_contradiction_within_a_fifth_of_a_second
     assert residual.slips
 
 
-def test_wheels_of_another_size_are_learned_and_agree() -> None:
+def test_wheels_of_unequal_size_agree_once_their_ratio_is_learned() -> None:
     residual = Residual()
     rolled(residual, 10.3, 10.0, 30.0)
     assert residual.ratio == pytest.approx(0.3 / 10.15, rel=0.02)
     assert all(rolled(residual, -10.3, -10.0, 1.0))
 
 
-def test_what_is_learned_stays_within_what_tyres_can_be() -> None:
+def test_the_learned_ratio_stays_within_the_limit_for_unequal_tyres() -> None:
     residual = Residual()
     rolled(residual, 14.0, 10.0, 600.0)
     assert residual.ratio == pytest.approx(UNEQUAL)
@@ -62,7 +62,7 @@ def test_what_is_learned_stays_within_what_tyres_can_be() -> None:
 
 
 @pytest.mark.parametrize("front", [True, False])
-def test_who_stands_in_turns_as_the_other_one_would_have(front: bool) -> None:
+def test_the_wheel_that_replaces_another_one_gives_the_speed_of_that_wheel(front: bool) -> None:
     residual = Residual()
     rolled(residual, 10.4, 10.0, 60.0)
     said, missing = (10.0, 10.4) if front else (10.4, 10.0)
@@ -71,7 +71,9 @@ def test_who_stands_in_turns_as_the_other_one_would_have(front: bool) -> None:
 
 @pytest.mark.parametrize("counts", [16, 96, 400])
 @given(phase=st.floats(0.0, 1.0), speed=st.floats(0.5, 30.0))
-def test_wheels_a_part_of_a_count_apart_agree(counts: int, phase: float, speed: float) -> None:
+def test_wheels_that_differ_by_a_part_of_a_count_agree(
+    counts: int, phase: float, speed: float
+) -> None:
     residual, count = Residual(), math.tau / counts
     angles = [(math.floor(speed * DT * n / count), math.floor(speed * DT * n / count + phase))
               for n in range(301)]  # fmt: skip

@@ -114,7 +114,7 @@ def test_a_contradiction_is_a_fault_within_a_second_and_names_the_wheel(
         (10.0, 16.9, ""),
     ],
 )
-def test_what_is_too_far_from_the_command_is_worked_by_hand(
+def test_the_limits_of_the_difference_from_the_command_are_those_worked_by_hand(
     sent: float, seen: float, word: str, sign: float
 ) -> None:
     # A jitter of 0.04 rad/s keeps the wheel from looking stuck.
@@ -141,7 +141,7 @@ def test_a_wheel_that_reports_one_rad_s_and_no_other_speed_is_stuck() -> None:
 @pytest.mark.parametrize("wheel", range(4))
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize(("seen", "word"), [(10.0, "faster than"), (2.1, "faster than"), (1.9, "")])
-def test_a_wheel_that_does_not_come_to_rest_when_it_is_told_to_is_running_away(
+def test_a_wheel_that_does_not_come_to_rest_on_command_is_running_away(
     wheel: int, sign: float, seen: float, word: str
 ) -> None:
     robot = driven(sign * 10.0)
@@ -151,7 +151,7 @@ def test_a_wheel_that_does_not_come_to_rest_when_it_is_told_to_is_running_away(
     assert fault.startswith(f"{WHEELS[wheel]} wheel") if word else fault == ""
 
 
-def test_a_wheel_that_turns_while_only_the_others_are_told_to_is_running_away() -> None:
+def test_a_wheel_that_turns_while_only_other_wheels_are_commanded_is_running_away() -> None:
     pivot, robot = WheelSpeeds(10.0, 0.0, 0.0, 10.0), watching()
     assert not any(robot.watch(pivot, noisy(pivot, step), DT) for step in range(300))
     turning = WheelSpeeds(10.0, 5.0, 0.0, 10.0)
@@ -165,7 +165,7 @@ def test_a_dead_wheel_is_found_half_a_second_after_a_healthy_one_would_have_turn
     assert after == pytest.approx(0.04 + 0.5, abs=0.011)
 
 
-def test_a_contradiction_that_does_not_last_is_none() -> None:
+def test_a_contradiction_that_does_not_last_is_no_fault() -> None:
     robot = watching()
     for _ in range(20):
         assert not any(robot.watch(TEN, STILL, DT) for _ in range(45))
@@ -214,12 +214,12 @@ def test_one_wheel_turned_by_hand_is_reported_too() -> None:
     assert "rad/s without a command" in next(filter(None, told))
 
 
-def test_one_and_the_same_speed_by_hand_is_not_a_stuck_encoder() -> None:
+def test_a_constant_speed_by_hand_is_not_a_stuck_encoder() -> None:
     after, fault = watched(STILL, WheelSpeeds(5.0, 5.0, 5.0, 5.0))
     assert (after, fault) == (math.inf, "")
 
 
-def test_a_push_no_faster_than_the_slack_or_as_short_as_rocking_to_rest_is_not_told() -> None:
+def test_a_push_within_the_slack_or_as_short_as_rocking_to_rest_is_not_reported() -> None:
     robot = watching()
     assert pushed(robot, 1.85, 3.0) == ([], [])
     for _ in range(10):
@@ -227,7 +227,7 @@ def test_a_push_no_faster_than_the_slack_or_as_short_as_rocking_to_rest_is_not_t
         assert pushed(robot, 0.0, 0.02) == ([], [])
 
 
-def test_a_push_while_a_commander_holds_almost_zero_is_none_either() -> None:
+def test_a_push_during_an_almost_zero_command_is_no_fault_either() -> None:
     robot, hardly = watching(), WheelSpeeds(0.004, -0.004, 0.0, 0.0)
     moves = [noisy(TEN, step) for step in range(200)]
     assert not any(robot.watch(hardly, move, DT) for move in moves)
@@ -261,7 +261,7 @@ def test_a_wheel_that_slows_down_slowly_a_second_time_is_no_fault() -> None:
 
 
 def test_a_slow_wheel_that_sped_up_during_a_stall_and_now_slows_down_is_no_fault() -> None:
-    """The line behind the stall is the first that is too fast, and shows a much higher speed."""
+    """The line after the stall is the first that is too fast, and shows a much higher speed."""
     robot = watching()
     lines = [(9.29, 0.23, 0.1), (17.52, 1.41, 0.1), (17.95, 4.47, 0.1), (17.95, 7.86, 0.1)]
     lines += [(0.0, 11.83, 0.25), (1.21, 13.48, 0.02), (4.18, 12.63, 0.03)]
@@ -303,7 +303,7 @@ def test_a_runaway_is_found_soon_after_forgetting() -> None:
     assert "faster than" in next(filter(None, lines))
 
 
-def test_without_a_fault_time_a_push_is_still_told() -> None:
+def test_a_push_is_reported_even_without_a_fault_time() -> None:
     robot = watching(FeedbackConfig(fault_time=0.0))
     faults, told = pushed(robot, 5.0, 0.5)
     assert faults == []
@@ -327,7 +327,7 @@ def test_a_wheel_slowed_by_half_under_load_is_no_fault() -> None:
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_slow_wheel_that_brakes_as_it_was_said_to_is_no_fault(sign: float) -> None:
+def test_a_slow_wheel_that_brakes_by_its_configured_response_time_is_no_fault(sign: float) -> None:
     robot, speed = watching(FeedbackConfig(response_time=2.0)), 0.0
     for told in (sign * 20.0, 0.0):
         for _ in range(1000):
@@ -336,7 +336,7 @@ def test_a_slow_wheel_that_brakes_as_it_was_said_to_is_no_fault(sign: float) -> 
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_wheel_that_is_sooner_than_it_was_said_to_be_is_no_fault(sign: float) -> None:
+def test_a_wheel_faster_than_its_configured_response_time_is_no_fault(sign: float) -> None:
     robot = watching(FeedbackConfig(response_time=2.0))
     for told in (sign * 20.0, 0.0):
         for step in range(1000):
@@ -345,7 +345,7 @@ def test_a_wheel_that_is_sooner_than_it_was_said_to_be_is_no_fault(sign: float) 
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_wheel_that_slows_to_a_creep_sooner_than_it_was_said_to_is_not_dead(sign: float) -> None:
+def test_a_wheel_that_slows_to_a_creep_before_its_response_time_is_not_dead(sign: float) -> None:
     """A coarse encoder reports a speed below one count per line as zero."""
     robot = watching(FeedbackConfig(response_time=2.0))
     for told, reported in ((sign * 20.0, sign * 20.0), (sign * 0.6, 0.0)):
@@ -354,7 +354,7 @@ def test_a_wheel_that_slows_to_a_creep_sooner_than_it_was_said_to_is_not_dead(si
             assert robot.watch(WheelSpeeds(*[told] * 4), seen, DT) == ""
 
 
-def test_a_wheel_at_its_command_sooner_than_it_was_said_to_is_not_stuck() -> None:
+def test_a_wheel_that_reaches_its_command_before_its_response_time_is_not_stuck() -> None:
     """A coarse encoder reports one and the same speed for several lines."""
     robot = watching(FeedbackConfig(response_time=2.0))
     for _ in range(1000):
@@ -399,7 +399,7 @@ def test_one_line_that_stands_for_a_whole_stall_is_not_enough_evidence() -> None
     assert [bool(robot.watch(STILL, TEN, 0.311)) for _ in range(3)] == [False, False, True]
 
 
-def test_fault_time_zero_switches_it_off() -> None:
+def test_a_fault_time_of_zero_switches_the_check_off() -> None:
     robot = watching(FeedbackConfig(fault_time=0.0))
     assert not any(robot.watch(TEN, STILL, DT) for _ in range(1000))
 
@@ -409,7 +409,7 @@ def test_fault_time_zero_switches_it_off() -> None:
     st.floats(0.0, 0.15),
     st.floats(0.8, 1.1),
 )
-def test_a_healthy_wheel_is_never_a_fault_whatever_it_is_told(
+def test_a_healthy_wheel_is_never_a_fault_whatever_its_command(
     wishes: list[tuple[float, int]], lag: float, gain: float
 ) -> None:
     robot, speed, dice = watching(), 0.0, random.Random(2)
@@ -421,7 +421,7 @@ def test_a_healthy_wheel_is_never_a_fault_whatever_it_is_told(
 
 
 @pytest.mark.parametrize(("sent", "pushed"), [(0.0045, True), (0.005, False), (0.006, False)])
-def test_a_command_of_5_mrad_a_second_is_one(sent: float, pushed: bool) -> None:
+def test_a_wheel_speed_of_5_mrad_a_second_counts_as_a_command(sent: float, pushed: bool) -> None:
     robot = watching(FeedbackConfig(fault_time=0.0))
     told = [bool(robot.watch(both(0, sent), TEN, 0.1) or robot.pushed) for _ in range(5)]
     assert any(told) is pushed
@@ -476,7 +476,7 @@ def test_a_wheel_that_turns_back_while_it_should_slow_to_a_creep_is_reversed() -
 
 
 @pytest.mark.parametrize("counts", [96, 3200])
-def test_wheels_that_coast_behind_a_lost_link_are_no_fault(counts: int) -> None:
+def test_wheels_that_coast_after_a_lost_link_are_no_fault(counts: int) -> None:
     robot = WheelFaults(Kinematics(DriveConfig()), counts, FeedbackConfig(fault_time=0.3))
     step, speed, angle, whole = math.tau / counts, 20.0, 0.0, 0
     for line in range(500):
