@@ -154,7 +154,7 @@ IN_ONE_VIEW = Elsewhere(
 BROKEN = Elsewhere(HERE, "test_the_broken_board_of_the_firmware_page_is_found_broken")
 CABLE = Elsewhere(HERE, "test_the_first_page_pulls_a_cable_and_the_robot_waits_until_it_is_back")
 DRIVE = Elsewhere(
-    "tests/system/test_cli.py", "test_a_held_key_drives_and_letting_go_stops_by_itself"
+    "tests/system/test_cli.py", "test_a_held_key_drives_and_its_release_stops_the_robot"
 )
 INSTALLED = Elsewhere(SERVICE, "test_installed_it_runs_and_uninstalled_nothing_is_left")
 OPENED = Elsewhere(SERVICE, "test_after_lan_init_the_service_listens_on_the_network")
@@ -281,7 +281,7 @@ COMMANDS: dict[str, How] = {
     ),
     "acsard bench": Elsewhere(
         "tests/system/test_bench.py",
-        "test_it_measures_the_simulator_and_moves_nothing_on_a_real_port",
+        "test_bench_measures_the_simulator_and_moves_nothing_on_a_real_port",
     ),
     # deploy/clients
     "python deploy/clients/python/follow.py": Elsewhere(
@@ -453,7 +453,7 @@ COMMANDS: dict[str, How] = {
     "sudo systemctl restart acsard": OPENED,
     "sudo /opt/acsard/venv/bin/acsard doctor --config /etc/acsard/acsard.toml": Elsewhere(
         "tests/system/test_doctor.py",
-        "test_for_people_each_finding_is_a_line_and_its_mend_another",
+        "test_the_text_output_has_a_line_for_each_finding_and_one_for_its_remedy",
     ),
     'sudo sh -c "/opt/acsard/venv/bin/pip install -r deploy/systemd/requirements.lock && '
     "/opt/acsard/venv/bin/pip install --no-deps --no-build-isolation . && "
@@ -516,7 +516,7 @@ COMMANDS: dict[str, How] = {
     ),
     "zenohd -c /etc/zenohd/router.json5": Elsewhere(
         FLEET,
-        "test_each_may_do_what_the_table_says_and_nothing_else",
+        "test_each_certificate_may_do_exactly_what_the_access_table_allows",
         "by Zenoh's own router mode in the place of the program",
     ),
     "acsard check": Run("effective configuration"),
