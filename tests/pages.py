@@ -145,7 +145,7 @@ TEN = Elsewhere(HERE, "test_one_authority_and_one_file_serve_the_ten_robots_of_t
 LAPTOP = Elsewhere(HERE, "test_the_laptop_of_the_fleet_page_does_what_its_role_may")
 MANY = Elsewhere(
     "tests/system/test_many.py",
-    "test_by_tls_a_wildcard_sees_nobody_and_is_told_why_and_names_do",
+    "test_over_tls_a_wildcard_finds_no_robot_and_says_why_and_named_robots_are_found",
     "robot2 is not there",
 )
 IN_ONE_VIEW = Elsewhere(
@@ -218,7 +218,7 @@ COMMANDS: dict[str, How] = {
     "export ACSARD_CONFIG=$PWD/robot.toml": Run(),
     "acsard mcu check --port DEVICE --write": Elsewhere(
         "tests/system/test_mcu.py",
-        "test_what_a_person_at_the_terminal_sees_becomes_the_wheel_map",
+        "test_the_operator_s_answers_become_the_wheel_map",
         "the port is the simulator",
     ),
     "acsard drive --linear 0.2 --angular 0.5": DRIVE._replace(but="at the default speeds"),
@@ -314,7 +314,7 @@ COMMANDS: dict[str, How] = {
     # deploy/foxglove
     ".venv/bin/pip install '.[foxglove]'": Shown("an install with extras is made by other tests"),
     ".venv/bin/acsard foxglove --drive": Elsewhere(
-        FOXGLOVE, "test_a_held_button_drives_and_letting_go_stops"
+        FOXGLOVE, "test_a_held_button_drives_and_its_release_stops_the_robot"
     ),
     "ssh -N -L 8765:127.0.0.1:8765 USER@ROBOT": TWO_MACHINES,
     "acsard foxglove --drive --connect tls/robot.local:7449 --tls clients/viewer": Elsewhere(

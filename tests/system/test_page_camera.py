@@ -110,7 +110,7 @@ async def test_the_camera_needs_a_token_and_ends_with_it(filmed: Filmed) -> None
         assert (await got(viewer, url)).status == 401
 
 
-async def test_pictures_that_nobody_reads_cost_little_memory(filmed: Filmed) -> None:
+async def test_pictures_that_no_client_reads_cost_little_memory(filmed: Filmed) -> None:
     """Before, each of these clients cost a picture of its own."""
     server, pid = filmed.server, filmed.server.pid
     filmed.stream.more = 900_000

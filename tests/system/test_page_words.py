@@ -41,7 +41,7 @@ def forgets(browser: Browser, within_s: float) -> None:
     until(lambda: browser.text("complaint") == "", within_s, "the complaint is outdated")
 
 
-def test_a_page_that_has_shown_no_stop_releases_none(tmp_path: Path, browser: Browser) -> None:
+def test_a_page_that_has_not_shown_a_stop_does_not_release_it(tmp_path: Path, browser: Browser) -> None:
     """Another person may have stopped the robot while this page had no connection."""
     with running(tmp_path) as (daemon, bus):
         with Page(daemon, tmp_path) as page:
@@ -384,7 +384,7 @@ def test_a_pulled_cable_is_in_the_mode_and_in_the_title_whatever_the_mode(
     shows(browser, "mode", "READY")
 
 
-def test_a_stop_in_a_fault_says_that_it_is_latched_behind_it(
+def test_a_stop_during_a_fault_says_that_it_stays_latched_after_the_fault(
     page: Page, browser: Browser, robot: tuple[Daemon, Bus, Peer, Page]
 ) -> None:
     _, bus, board, _ = robot
@@ -410,7 +410,7 @@ NAMES = """import('/page/words.js').then(({person, named, logged}) => [
     logged('commander/0123456789abcdef -> commander/fedcba9876543210')])"""
 
 
-def test_nobody_reads_a_long_number_for_a_name(page: Page, browser: Browser) -> None:
+def test_the_page_shows_no_session_number_in_place_of_a_name(page: Page, browser: Browser) -> None:
     assert browser.js(NAMES) == [
         "a program without a name",
         "stopped by a program without a name at noon",

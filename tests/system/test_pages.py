@@ -88,7 +88,7 @@ def desk(shared: Daemon, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("block", TYPED)
-def test_what_a_page_says_to_type_does_what_it_says(block: Block, desk: Path, bus: Bus) -> None:
+def test_the_commands_on_a_page_do_what_the_page_says(block: Block, desk: Path, bus: Bus) -> None:
     if "tls init" in block.text and Path("/etc/systemd/system/acsard.service").exists():
         pytest.skip("tls init would write the drop-in of the service of this machine")
     for command in block.commands():
