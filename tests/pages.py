@@ -338,7 +338,7 @@ COMMANDS: dict[str, How] = {
     "acsard mcu check --port ./mcu --yes": BROKEN,
     "acsard echo sim/pose -n 1": Run('"frame_id":"sim"'),
     "acsard echo wheel_states imu --csv > drive.csv": Elsewhere(
-        SIMULATED, "test_a_drive_is_recorded_as_calibrate_reads_it"
+        SIMULATED, "test_calibrate_reads_a_drive_that_echo_recorded_as_csv"
     ),
     "acsard accuracy": Run("based on|stands still"),
     "acsard calibrate": Elsewhere(
@@ -411,7 +411,7 @@ COMMANDS: dict[str, How] = {
     ),
     "python3 deploy/ros2/drive.py 0.2 0.0 3": Elsewhere(
         "tests/system/test_ros_drive.py",
-        "test_the_line_of_the_pages_drives",
+        "test_the_command_line_of_the_pages_drives_the_robot",
         "by stand-ins for rclpy and the messages",
     ),
     f"{_RMW_ROUTER} ros2 run rmw_zenoh_cpp rmw_zenohd": NO_ROS,
@@ -512,7 +512,7 @@ COMMANDS: dict[str, How] = {
     "sudo install -o zenohd -m 0400 ca.pem certificate.pem key.pem /etc/zenohd/tls/": PLACES,
     "sudo install -m 0644 router.json5 /etc/zenohd/": PLACES,
     "acsard router /etc/zenohd/router.json5": Elsewhere(
-        ROUTER, "test_it_goes_whole", "with the file's addresses and certificates changed"
+        ROUTER, "test_a_signal_ends_the_router_and_its_child_process", "with the file's addresses and certificates changed"
     ),
     "zenohd -c /etc/zenohd/router.json5": Elsewhere(
         FLEET,

@@ -88,7 +88,7 @@ def test_a_port_that_is_missing_at_the_start_is_reported_and_picked_up_when_it_a
 
 @pytest.mark.slow
 @pytest.mark.parametrize("often", [1, pytest.param(4, marks=pytest.mark.slow)])
-def test_sigterm_while_the_port_is_missing_ends_with_0_however_soon_it_comes(
+def test_sigterm_while_the_port_is_missing_ends_with_0_at_any_time_after_the_start(
     tmp_path: Path, often: int
 ) -> None:
     # In the first milliseconds the signal interrupts an attempt to open the port, later a pause.
