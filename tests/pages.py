@@ -132,7 +132,7 @@ NO_ROS = Shown("needs ROS 2; the page says what was tried with it")
 TWO_MACHINES = Shown("needs a second machine")
 PLACES = Elsewhere(
     "tests/systemd/test_fleet.py",
-    "test_a_router_runs_on_the_places_that_the_page_makes_as_a_user_of_its_own",
+    "test_a_router_runs_as_its_own_user_in_the_directories_that_the_page_creates",
 )
 PYTEST = Collected()
 FIRST = Elsewhere(HERE, "test_the_first_command_of_the_readme_installs_it_and_the_robot_is_up")
@@ -156,7 +156,7 @@ CABLE = Elsewhere(HERE, "test_the_first_page_pulls_a_cable_and_the_robot_waits_u
 DRIVE = Elsewhere(
     "tests/system/test_cli.py", "test_a_held_key_drives_and_its_release_stops_the_robot"
 )
-INSTALLED = Elsewhere(SERVICE, "test_installed_it_runs_and_uninstalled_nothing_is_left")
+INSTALLED = Elsewhere(SERVICE, "test_the_service_runs_after_install_and_leaves_no_file_after_uninstall")
 OPENED = Elsewhere(SERVICE, "test_after_lan_init_the_service_listens_on_the_network")
 LAUNCH = Elsewhere(
     "tests/test_deploy_ros2.py",
@@ -174,7 +174,7 @@ TYPED = Elsewhere(
 )
 
 _AWAY = "--tls tls --address https://0.0.0.0:8443"
-INVITED = Elsewhere(WEB, "test_an_invitation_is_a_link_and_a_code_and_lets_in")
+INVITED = Elsewhere(WEB, "test_an_invitation_prints_a_link_and_a_qr_code_that_give_access")
 COOKIE = Elsewhere(WEB, "test_a_token_becomes_a_cookie_that_no_script_reads_and_ends_when_revoked")
 
 BY_THE_SERVICE = Elsewhere(
@@ -318,7 +318,7 @@ COMMANDS: dict[str, How] = {
     ),
     "ssh -N -L 8765:127.0.0.1:8765 USER@ROBOT": TWO_MACHINES,
     "acsard foxglove --drive --connect tls/robot.local:7449 --tls clients/viewer": Elsewhere(
-        "tests/system/test_whoami.py", "test_a_viewer_s_foxglove_is_told_what_he_may"
+        "tests/system/test_whoami.py", "test_foxglove_with_a_viewer_s_certificate_shows_its_permissions"
     ),
     # deploy/firmware
     "sudo apt install make gcc-avr avr-libc binutils-avr avrdude": InCi("gcc-avr"),
@@ -375,7 +375,7 @@ COMMANDS: dict[str, How] = {
     "acsard web --tls tls --address https://0.0.0.0:8443": INVITED,
     "acsard web --connect tcp/127.0.0.1:7447 --id robot1": Elsewhere(
         "tests/system/test_web_others.py",
-        "test_another_robot_is_followed_and_stopped_and_only_that",
+        "test_another_robot_can_be_followed_and_stopped_and_nothing_else",
         "by a router on loopback",
     ),
     "acsard web --tokens": COOKIE,
@@ -460,7 +460,7 @@ COMMANDS: dict[str, How] = {
     "/opt/acsard/venv/bin/acsard service install "
     '--force && systemctl restart acsard"': Elsewhere(
         SERVICE,
-        "test_nothing_of_somebody_else_is_overwritten_or_removed_without_force",
+        "test_a_foreign_file_is_not_overwritten_or_removed_without_force",
         "pip is not called again",
     ),
     "sudo /opt/acsard/venv/bin/acsard recording": Elsewhere(
@@ -486,7 +486,7 @@ COMMANDS: dict[str, How] = {
     ),
     "systemctl status acsard": INSTALLED._replace(but="the status line is asked for alone"),
     "journalctl -u acsard ACSARD_EVENT=link_down": Elsewhere(
-        UNIT, "test_the_journal_can_be_asked_for_an_event", "the event is chosen by the test"
+        UNIT, "test_journal_entries_have_the_event_fields", "the event is chosen by the test"
     ),
     "/opt/acsard/venv/bin/acsard service status": INSTALLED,
     "sudo /opt/acsard/venv/bin/acsard tls init --write /etc/acsard/acsard.toml": OPENED,

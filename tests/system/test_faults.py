@@ -388,7 +388,7 @@ def test_an_unplug_is_seen_and_a_replug_under_another_name_found_in_time_without
 
 
 @pytest.mark.slow
-def test_a_peer_that_stops_reading_and_answering_finds_at_most_quiet_of_drive_lines(
+def test_a_board_that_stops_reading_and_answering_is_sent_few_drive_lines_then_zeros(
     tmp_path: Path, peer: Peer
 ) -> None:
     with (
