@@ -227,7 +227,7 @@ COMMANDS: dict[str, How] = {
     ".venv/bin/ruff check .": InCi(".venv/bin/ruff check ."),
     ".venv/bin/ruff format --check .": InCi(".venv/bin/ruff format --check ."),
     ".venv/bin/mypy": InCi(".venv/bin/mypy"),
-    ".venv/bin/lint-imports": Elsewhere("tests/test_shape.py", "test_the_law_of_imports_is_kept"),
+    ".venv/bin/lint-imports": Elsewhere("tests/test_shape.py", "test_the_import_contracts_are_kept"),
     ".venv/bin/pytest tests/unit tests/scenarios": PYTEST,
     ".venv/bin/pre-commit install": Elsewhere(
         "tests/test_pre_commit.py", "test_a_commit_of_code_or_of_the_contract_runs_every_check"
@@ -246,7 +246,7 @@ COMMANDS: dict[str, How] = {
     ".venv/bin/pytest -m soak -s": PYTEST,
     "bash .ci/run": Shown("it is what runs everything here"),
     ".venv/bin/python -m tests.screens": Elsewhere(
-        "tests/test_screens.py", "test_each_screen_fits_its_width_and_says_the_whole_reason"
+        "tests/test_screens.py", "test_each_screen_fits_its_width_and_shows_the_whole_reason"
     ),
     ".venv/bin/python -m tests.pythons python3.12 python3.13": Shown(
         "installs into venvs of other Pythons, for who has them"
@@ -322,7 +322,7 @@ COMMANDS: dict[str, How] = {
     ),
     # deploy/firmware
     "sudo apt install make gcc-avr avr-libc binutils-avr avrdude": InCi("gcc-avr"),
-    "make": Elsewhere("tests/firmware/test_board.py", "test_it_boots_stopped_and_says_who_it_is"),
+    "make": Elsewhere("tests/firmware/test_board.py", "test_the_board_boots_stopped_and_sends_its_identity"),
     "make flash PORT=/dev/ttyACM0": Elsewhere(
         HERE,
         "test_the_flash_of_the_firmware_page_calls_avrdude_with_its_port",
