@@ -139,7 +139,7 @@ FIRST = Elsewhere(HERE, "test_the_first_command_of_the_readme_installs_it_and_th
 DOWNLOADED = Shown("downloads 44 MB; typed by hand, the venv then runs acsard")
 VENV = Elsewhere(HERE, "test_the_service_s_venv_has_all_that_lan_and_service_need")
 AUTHORITY = Elsewhere(
-    HERE, "test_the_authority_of_the_fleet_page_is_made_by_what_its_first_line_installs"
+    HERE, "test_the_install_line_of_the_fleet_page_suffices_to_make_its_authority"
 )
 TEN = Elsewhere(HERE, "test_one_authority_and_one_file_serve_the_ten_robots_of_the_fleet_page")
 LAPTOP = Elsewhere(HERE, "test_the_laptop_of_the_fleet_page_does_what_its_role_may")
@@ -152,7 +152,7 @@ IN_ONE_VIEW = Elsewhere(
     "tests/system/test_many.py", "test_the_two_robots_of_the_fleet_page_are_in_one_view"
 )
 BROKEN = Elsewhere(HERE, "test_the_broken_board_of_the_firmware_page_is_found_broken")
-CABLE = Elsewhere(HERE, "test_the_first_page_pulls_a_cable_and_the_robot_waits_until_it_is_back")
+CABLE = Elsewhere(HERE, "test_the_robot_of_the_first_page_waits_after_its_cable_is_pulled_until_it_is_back")
 DRIVE = Elsewhere(
     "tests/system/test_cli.py", "test_a_held_key_drives_and_its_release_stops_the_robot"
 )

@@ -192,7 +192,7 @@ def test_garbage_changes_no_speed_and_is_not_answered(board: Board, host: Host) 
         host.send(line)
     last = checked(speeds_line(DRIVE), 1)
     host.send(last[:-1] + (b"0" if last[-1:] != b"0" else b"1"))
-    until(lambda: board.status().to_board.last.startswith("ap10.00,bn05.00"), 3.0, "all heard")
+    until(lambda: board.status().to_board.last.startswith("ap10.00,bn05.00"), 3.0, "all lines received")
     assert stays_off(board, 100).on_ns == 0
     assert host.lines() == []
 
@@ -360,7 +360,7 @@ DIALECTS = [
 
 @pytest.mark.parametrize("line", DIALECTS)
 @pytest.mark.parametrize("end", [b"\r\n", b"\n"])
-def test_every_dialect_of_a_line_drives(board: Board, host: Host, line: bytes, end: bytes) -> None:
+def test_every_accepted_form_of_a_line_drives(board: Board, host: Host, line: bytes, end: bytes) -> None:
     def there() -> bool:
         host.send(line, end)
         host.lines(0.01)
@@ -525,7 +525,7 @@ def test_an_overflow_of_the_receive_buffer_does_not_damage_the_next_line(
     with Board(runner, hanging_firmware) as board, Host(board.path) as host:
         lines = b"".join(checked(ZERO, i) + b"\r\n" for i in range(12))
         host.write(b"!p\r\n" + lines)
-        until(lambda: board.status().to_board.bytes == 4 + len(lines), 5.0, "all is heard")
+        until(lambda: board.status().to_board.bytes == 4 + len(lines), 5.0, "all bytes are received")
         host.says(b"#00")
         host.send(checked(ZERO, 99))
         host.says(b"#63")

@@ -91,7 +91,7 @@ def refused_without_motion(bus: Bus, *bad: Bad) -> None:
     # The source may drive: if a bad command were accepted, the robot would move.
     heard = bus.count("commands")
     bus.put("cmd/app", ZERO)
-    until(lambda: bus.count("commands") > heard, 5.0, "the zero was heard")
+    until(lambda: bus.count("commands") > heard, 5.0, "the zero was received")
     before = state = bus.state()
     for payload, reason, said, key, encoding in bad:
         name, counted = f"command_{reason}", state["counters"].get(f"command_{reason}", 0)
@@ -143,9 +143,9 @@ def test_enormous_wheel_speeds_are_clamped_to_the_limits(bus: Bus) -> None:
         heard = bus.count("commands")
         bus.put("wheel_cmd/app", {"name": ALL_JOINTS, "velocity": [0.0] * 4})
         # A message of an earlier test may still arrive after this point.
-        until(lambda: bus.count("commands") >= heard + 1, 5.0, "the zero was heard")
+        until(lambda: bus.count("commands") >= heard + 1, 5.0, "the zero was received")
         bus.put("wheel_cmd/app", {"name": ALL_JOINTS, "velocity": [1e300, 1e300, -1e300, -1e300]})
-        until(lambda: bus.count("commands") >= heard + 2, 5.0, "so was this")
+        until(lambda: bus.count("commands") >= heard + 2, 5.0, "the speeds were received")
         until(lambda: bus.state()["mode"] == "ready", 5.0, "their timeout is over")
         until(lambda: bus.state()["linear"] == bus.state()["angular"] == 0, 5.0, "at rest")
     for seen in applied.seen:
@@ -168,7 +168,7 @@ def test_no_bad_command_raised_an_exception_in_the_daemon(bus: Bus, shared: Daem
     assert "Traceback" not in shared.stderr
     assert "Error" not in shared.stderr
     assert "panicked" not in shared.stderr
-    until(lambda: bus.state()["mode"] == "ready", 5.0, "nobody commands any more")
+    until(lambda: bus.state()["mode"] == "ready", 5.0, "no program commands any more")
 
 
 @pytest.mark.slow

@@ -137,7 +137,7 @@ def test_the_last_value_of_odometry_is_current(bus: Bus) -> None:
 # the daemon's information about itself
 
 
-def test_info_says_who_the_daemon_is(bus: Bus, shared: Daemon) -> None:
+def test_info_has_the_identity_of_the_daemon(bus: Bus, shared: Daemon) -> None:
     info = bus.get("info")
     assert (info["id"], info["pid"]) == ("acsar", shared.pid)
     assert (info["simulated"], info["rate"]) == (True, 100.0)

@@ -371,7 +371,7 @@ def test_the_simulator_is_calibrated_by_its_true_pose_without_a_person(tmp_path:
 @pytest.mark.soak
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("stalled", ["calibration", "daemon"])
-def test_on_the_simulator_a_process_that_stands_still_does_not_end_the_drive(
+def test_on_the_simulator_a_process_suspended_for_1_5_s_does_not_end_the_calibration(
     tmp_path: Path, stalled: str
 ) -> None:
     with running(tmp_path, config=SKIDDING) as (daemon, bus):

@@ -72,7 +72,7 @@ def tool(shared: Daemon, *words: str) -> Finished:
 # help
 
 
-def test_help_lists_the_verbs_the_exit_codes_and_what_to_try(tmp_path: Path) -> None:
+def test_help_lists_the_verbs_the_exit_codes_and_examples(tmp_path: Path) -> None:
     ended = finish(acsard("--help"), tmp_path)
     assert (ended.code, ended.err) == (0, "")
     for told in (*VERBS, "69", "75", "78", "try:"):
@@ -81,7 +81,7 @@ def test_help_lists_the_verbs_the_exit_codes_and_what_to_try(tmp_path: Path) -> 
 
 
 @each("verb", VERBS)
-def test_every_verb_has_a_help_that_says_what_it_does(verb: str) -> None:
+def test_every_verb_has_a_help_with_its_usage(verb: str) -> None:
     ended = typed(verb, "--help")
     assert (ended.code, ended.err) == (0, "")
     assert ended.out.startswith(f"usage: acsard {verb}")
@@ -304,7 +304,7 @@ def test_a_failure_keeps_its_exit_code_when_the_reader_of_the_output_has_left(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_echo_ends_at_once_by_a_signal(shared: Daemon, bus: Bus, number: signal.Signals) -> None:
+def test_a_signal_ends_echo_within_2_s(shared: Daemon, bus: Bus, number: signal.Signals) -> None:
     words = acsard("echo", "odom", "--config", str(shared.config))
     with Program(words, shared.config.parent) as echo:
         echo.says("header")
@@ -493,7 +493,7 @@ def test_set_changes_the_robot_that_runs_and_with_write_the_file(
         assert tool(shared, "set", "rates.state", "10", "log.level", "info").code == 0
 
 
-def test_set_alone_lists_what_can_be_set_and_when(shared: Daemon, bus: Bus) -> None:
+def test_set_without_arguments_lists_the_settings_and_when_they_can_change(shared: Daemon, bus: Bus) -> None:
     told = tool(shared, "set")
     assert told.code == 0
     assert "highest speed, forwards and backwards: a number from 0 to 10 m/s" in told.out
@@ -579,7 +579,7 @@ def test_a_simulator_does_not_remove_the_link_of_the_one_that_replaced_it(tmp_pa
 # get
 
 
-def test_get_prints_what_a_query_key_answers_on_one_line_of_json(shared: Daemon) -> None:
+def test_get_prints_the_answer_of_a_query_key_on_one_line_of_json(shared: Daemon) -> None:
     ended = tool(shared, "get", "info")
     assert (ended.code, ended.err) == (0, "")
     (line,) = ended.out.splitlines()
@@ -774,7 +774,7 @@ def test_arrows_drive_forward_back_left_and_right(shared: Daemon, bus: Bus) -> N
 
 
 @pytest.mark.slow
-def test_speed_keys_change_what_the_next_key_drives(shared: Daemon, bus: Bus) -> None:
+def test_speed_keys_change_the_speed_of_the_next_key(shared: Daemon, bus: Bus) -> None:
     with without_a_screen(shared, "--linear", "0.2") as (terminal, _):
         terminal.press("w")
         until(lambda: "0.22 m/s" in terminal.screen, 3.0, "the new speed on the screen")

@@ -359,7 +359,7 @@ class Visitor:
         fooled = fleet.fooled()
         if done:
             fleet.restored()
-            assert not fooled, f"heard by others: {rows}"
+            assert not fooled, f"received by others: {rows}"
         return done or fooled
 
     def asked(self, rows: Sequence[Try]) -> dict[str, bool]:
@@ -536,7 +536,7 @@ def test_on_a_robot_that_is_a_peer_programs_need_no_router_and_reach_no_other_ro
 
 def test_each_robot_reports_that_its_router_was_found(fleet: Fleet) -> None:
     for daemon in fleet.daemons:
-        until(partial(daemon.events, "router_found"), 5.0, "it is told")
+        until(partial(daemon.events, "router_found"), 5.0, "the router is reported")
         assert daemon.events("router_missing") == []
 
 

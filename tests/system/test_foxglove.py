@@ -363,9 +363,9 @@ def test_a_key_is_subscribed_only_while_a_viewer_shows_it(viewer: Viewer, bus: B
 
     until(lambda: not listened(), 5.0, "no program listens at first")
     looked = viewer.show("/tf")
-    until(listened, 5.0, "somebody listens")
+    until(listened, 5.0, "a subscriber listens")
     looked.hide()
-    until(lambda: not listened(), 5.0, "nobody listens any more")
+    until(lambda: not listened(), 5.0, "no subscriber listens any more")
     publisher.undeclare()
 
 

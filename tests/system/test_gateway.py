@@ -82,7 +82,7 @@ def test_a_gateway_that_is_killed_is_restarted_and_counted(robot: Open) -> None:
     assert robot.lets_in()
     first = robot.gateway()
     with Bus(robot.daemon.endpoint) as bus:
-        until(lambda: bus.count("gateway_opened") == 1, 5.0, "it has told that it is open")
+        until(lambda: bus.count("gateway_opened") == 1, 5.0, "the gateway has reported that it is open")
     os.kill(first, signal.SIGKILL)
     robot.daemon.gateway_opens(times=2)
     assert robot.lets_in()
@@ -163,7 +163,7 @@ def test_a_gateway_that_was_suspended_for_two_seconds_is_not_restarted(robot: Op
 def test_forged_gateway_reports_are_ignored(robot: Open) -> None:
     huge = b'{"opened": 1, "connections": 0, "full": 1' + b"0" * 400 + b"}"
     with Bus(robot.daemon.endpoint) as bus:
-        until(lambda: bus.count("gateway_opened") == 1, 5.0, "it has told that it is open")
+        until(lambda: bus.count("gateway_opened") == 1, 5.0, "the gateway has reported that it is open")
         for payload in (b"", b"{}", b"\xff", huge):
             bus.session.put("acsard/acsar/gateway", payload)
         assert bus.ask("info")
@@ -212,7 +212,7 @@ def test_a_gateway_ends_if_its_connected_daemon_answers_no_queries(
             assert "gateway_lost_daemon" in gateway.stdout + gateway.stderr
 
 
-def test_a_gateway_whose_daemon_ended_without_reading_its_signs_of_life_ends_in_order(
+def test_a_gateway_ends_in_order_if_its_daemon_ended_without_reading_signs_of_life(
     tmp_path: Path, certificates: Certificates
 ) -> None:
     """The kernel then reports a reset connection in place of its end."""

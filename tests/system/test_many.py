@@ -156,7 +156,7 @@ def test_a_stop_to_all_reaches_each_robot_without_discovery(robots: Robots) -> N
         robots.tool("call", "clear", who=name)
 
 
-def test_fleet_is_a_line_for_each_robot_with_what_it_does_and_why(robots: Robots) -> None:
+def test_fleet_prints_a_line_for_each_robot_with_its_mode_and_reason(robots: Robots) -> None:
     ended = robots.tool("fleet", "--once")
     assert (ended.code, ended.err) == (
         0,
@@ -191,7 +191,7 @@ def test_a_table_for_a_pipe_does_not_wait_for_the_connection_to_be_closed(
     assert b"ready" in told[-1]
 
 
-def test_named_robots_are_not_waited_for_once_each_is_reported(robots: Robots) -> None:
+def test_fleet_stops_waiting_when_each_named_robot_has_reported(robots: Robots) -> None:
     both, missing = (robots.tool("fleet", "--once", who=f"{ONE},{o}") for o in (TWO, "robot9"))
     assert 1.5 * both.seconds < missing.seconds
     assert len(re.findall(r"^robot\d +ready .* waiting for a command", both.out, re.M)) == 2

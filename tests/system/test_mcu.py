@@ -149,7 +149,7 @@ def checked(where: Path, name: str) -> tuple[int, dict[str, Any], str]:
 @pytest.mark.soak
 @pytest.mark.network
 @pytest.mark.timeout(3 * CHECK_S)
-def test_each_planted_fault_is_found_on_a_pty_and_the_good_one_passes(tmp_path: Path) -> None:
+def test_each_planted_fault_is_found_on_a_pty_and_a_good_board_passes(tmp_path: Path) -> None:
     """The check finds the fault, or does not judge it because this machine was late.
 
     A test in virtual time shows that this is the only reason for not judging it.

@@ -377,7 +377,7 @@ def test_a_page_disconnects_when_it_is_left_and_reconnects_after_going_back(
     assert viewers(page) == 1
     left = time.monotonic()
     browser.open("about:blank")
-    until(lambda: viewers(page) == 0, 5.0, "nobody looks")
+    until(lambda: viewers(page) == 0, 5.0, "no page is open")
     assert time.monotonic() - left < HEARTBEAT_S, "the server had to find out"
     browser.js("history.back()")
     page.shows("age", "live")
@@ -452,7 +452,7 @@ def test_a_stop_that_fails_raises_the_alarm_in_every_view(page: Phone) -> None:
 
 
 @alone
-def test_a_stop_into_a_connection_that_is_dead_and_does_not_know_it_is_sent_again(
+def test_a_stop_into_a_dead_connection_is_sent_again(
     page: Phone, tmp_path: Path
 ) -> None:
     page.server.signal(signal.SIGSTOP)
@@ -462,7 +462,7 @@ def test_a_stop_into_a_connection_that_is_dead_and_does_not_know_it_is_sent_agai
     address = page.server.here
     with Page(page.daemon, tmp_path, "--address", address):
         begun = time.monotonic()
-        until(lambda: page.bus.state()["mode"] == "stopped", 1.0, "it is told again")
+        until(lambda: page.bus.state()["mode"] == "stopped", 1.0, "the stop is sent again")
         took = time.monotonic() - begun
         assert took - 4 * lost(begun, begun + took) < 1.0  # it is sent every 0.3 s
         until(lambda: page.browser.text("alarm") == "", 5.0, "and says so")
@@ -777,7 +777,7 @@ def test_the_map_turns_with_the_robot_and_back(page: Phone) -> None:
     until(lambda: browser.js(DRAWN) == before, 5.0, "as before")
 
 
-def test_the_dials_say_command_and_measurement_in_one_line_and_offer_degrees(page: Phone) -> None:
+def test_the_dials_show_command_and_measurement_in_one_line_and_offer_degrees(page: Phone) -> None:
     browser = page.browser
     page.browser.push(0, 0, "Start")
     page.browser.push(-80, 0)
@@ -819,7 +819,7 @@ PERSON = """import('/page/words.js').then(({person}) => [
     person('session 0123456789abcdef [laptop]'), person('0b5d (rmw)')])"""
 
 
-def test_a_sender_has_the_name_that_a_person_knows(page: Phone) -> None:
+def test_a_sender_is_shown_by_a_name_that_a_person_knows(page: Phone) -> None:
     assert page.browser.js(PERSON) == [
         "you",
         "another page on the robot itself",
@@ -845,17 +845,17 @@ def test_a_refusal_of_a_button_disappears_when_the_mode_changes(page: Phone) -> 
 def test_another_client_that_drives_is_named(page: Phone) -> None:
     with page.bus.commanding(0.1, source="teleop"):
         page.browser.tap("tab-status")
-        until(lambda: "drives" in row(page, "teleop"), 5.0, "who drives is in the table")
+        until(lambda: "drives" in row(page, "teleop"), 5.0, "the driver is in the table")
         assert row(page, "app").endswith("a command")  # the command for which it waits
         page.browser.tap("tab-drive")
-        until(lambda: page.browser.text("who") not in ("–", "nobody", "you"), 5.0, "who drives")
+        until(lambda: page.browser.text("who") not in ("–", "nobody", "you"), 5.0, "the driver is named")
         assert re.search(HEX, page.browser.text("who")) is None
         page.shows("hint", "drives: you can drive when they stop.")
     page.shows("reason", "Nobody drives.")
     page.shows("hint", "Hold and push to drive")
 
 
-async def test_a_second_driver_is_told_at_once_who_drives_and_the_stick_is_grey(
+async def test_a_second_page_names_the_driver_and_its_stick_is_grey(
     page: Phone,
 ) -> None:
     def look() -> None:
@@ -975,7 +975,7 @@ def test_every_control_is_large_enough_for_a_finger(page: Phone) -> None:
         assert page.browser.too_small() == [], (size, view)
 
 
-def test_words_at_the_stick_say_how_to_drive_while_nobody_holds_it(page: Phone) -> None:
+def test_words_at_the_stick_say_how_to_drive_while_it_is_released(page: Phone) -> None:
     seen = "getComputedStyle(document.getElementById('hint')).visibility"
     page.shows("hint", "Hold and push to drive; release to stop.")
     assert page.browser.js(seen) == "visible"
@@ -1444,7 +1444,7 @@ def test_the_plots_begin_with_the_minute_before_and_say_which_data_is_missing(
     """A client drove the robot before any page was open, then while one was. It stands now."""
     browser, bus = page.browser, page.bus
     browser.open("about:blank")
-    until(lambda: viewers(page) == 0, 5.0, "nobody looks")
+    until(lambda: viewers(page) == 0, 5.0, "no page is open")
     with bus.commanding(0.4, 0.0):
         until(lambda: bus.state()["x"] > 1.5, 10.0, "for some seconds")
     bus.at_rest()
@@ -1487,7 +1487,7 @@ SEEN = """(() => {
 
 
 @pytest.mark.parametrize("size", [PHONE, DESKTOP])
-def test_the_signs_of_the_map_are_explained(page: Phone, size: tuple[int, int]) -> None:
+def test_each_button_of_the_map_has_a_label_and_a_title(page: Phone, size: tuple[int, int]) -> None:
     page.browser.size(*size, touch=size == PHONE)
     words = {"recentre": "Center map", "turns": "Rotate map", "erase": "Erase path"}
     for name, word in words.items():

@@ -101,7 +101,7 @@ def test_an_invalid_invitation_is_reported_and_the_page_stops_connecting(
     assert stranger.browser.js("location.hash") == ""
 
 
-def test_a_token_that_has_ended_is_reported_as_such_and_a_new_link_in_its_tab_lets_in(
+def test_a_revoked_token_is_reported_and_a_new_link_in_its_tab_gives_access(
     stranger: Stranger,
 ) -> None:
     stranger.opens(stranger.server.invite("viewer", "lent"))

@@ -90,7 +90,7 @@ TELEOP = "{name: 'teleop', priority: 50}"
         ("ready", "", "{name: 'safety', priority: 60}", ""),
     ],
 )
-def test_the_stick_is_grey_while_a_source_that_comes_before_it_drives(
+def test_the_stick_is_grey_while_a_source_with_higher_priority_drives(
     page: Page, browser: Browser, mode: str, source: str, others: str, words: str
 ) -> None:
     asked = STILL.replace("MODE", repr(mode)).replace("SOURCES", f"[{TELEOP}, {others}]")
@@ -469,7 +469,7 @@ SHOWN = "!!document.getElementById({!r}).checkVisibility()"
 
 
 @pytest.mark.nightly
-def test_a_pressed_emergency_stop_or_bumper_and_a_low_battery_have_signs_with_the_mend_at_the_stick(
+def test_a_pressed_emergency_stop_or_bumper_and_a_low_battery_are_shown_with_the_remedy(
     tmp_path: Path, browser: Browser
 ) -> None:
     """Release STOP is refused while the button is pressed, and the page says what to do first."""
@@ -519,7 +519,7 @@ def test_a_pressed_emergency_stop_or_bumper_and_a_low_battery_have_signs_with_th
 
 
 @pytest.mark.nightly
-def test_a_viewer_is_told_who_switches_on_and_an_ended_invitation_ends_stop_and_camera(
+def test_a_viewer_reads_who_can_activate_and_a_revoked_token_ends_stop_and_camera(
     tmp_path: Path, browser: Browser
 ) -> None:
     stream = Stream()

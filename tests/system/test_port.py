@@ -63,7 +63,7 @@ def line() -> Iterator[Line]:
     os.close(device)
 
 
-async def test_a_line_made_before_the_process_stood_still_does_not_leave_after_it(
+async def test_a_line_made_before_the_process_was_suspended_is_not_sent_after_it(
     line: Line,
 ) -> None:
     """The step was suspended before it wrote, and goes on later. A stop is never too old."""
@@ -180,7 +180,7 @@ async def test_a_line_sent_right_after_the_device_hung_up_is_lost_without_an_err
 
 
 @pytest.mark.parametrize("name", ["tcgetattr", "tcsetattr", "tcflush"])
-async def test_a_device_that_vanishes_while_it_is_opened_is_waited_for(
+async def test_a_device_that_vanishes_while_it_is_opened_is_opened_later(
     line: Line, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     """Suspend each call of the opening in turn until one succeeds. No attempt ends the daemon."""

@@ -69,7 +69,7 @@ def test_without_permission_the_daemon_runs_without_real_time_and_logs_one_line(
 
 
 @needs_permission
-def test_real_time_scheduling_that_systemd_granted_is_not_requested_again(tmp_path: Path) -> None:
+def test_real_time_scheduling_present_at_the_start_is_not_requested_again(tmp_path: Path) -> None:
     as_a_service = ["chrt", "--fifo", "--reset-on-fork", "5"]
     without = ["setpriv", "--bounding-set", "-sys_nice,-ipc_lock"]
     with Daemon(tmp_path, before=[*as_a_service, *without]) as daemon:

@@ -141,7 +141,7 @@ def test_an_address_in_use_is_reported_and_retried(where: Path) -> None:
         socket.create_server((host, int(port))) as other,
         watched_router(where, endpoint) as router,
     ):
-        until(lambda: "ended with exit code 75" in router.stderr, 10.0, "it tells")
+        until(lambda: "ended with exit code 75" in router.stderr, 10.0, "the exit is reported")
         assert f"cannot listen on {endpoint}" in router.stderr
         other.close()
         listens(router)

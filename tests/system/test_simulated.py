@@ -155,9 +155,9 @@ def test_a_ros_imu_is_received_on_either_transport(real: Bus) -> None:
     rmw = rmw_key(0, "/imu/data", "sensor_msgs/msg/Imu")
     attachment = Attachment(1, 10**18, bytes(range(16))).pack()
     real.session.put("imu/data", encode(sample, "cdr"))
-    until(lambda: real.count("imu_out_of_range") == 1, 5.0, "the bridge's is heard")
+    until(lambda: real.count("imu_out_of_range") == 1, 5.0, "the bridge's sample is received")
     real.session.put(rmw, encode(sample, "cdr"), attachment=attachment)
-    until(lambda: real.count("imu_out_of_range") == 2, 5.0, "rmw_zenoh's is heard")
+    until(lambda: real.count("imu_out_of_range") == 2, 5.0, "rmw_zenoh's sample is received")
 
 
 # faults that the file names

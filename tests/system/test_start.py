@@ -229,7 +229,7 @@ def unprivileged() -> list[str]:
 
 
 @pytest.mark.slow
-def test_a_port_without_permission_ends_with_77_and_the_mend(tmp_path: Path, peer: Peer) -> None:
+def test_a_port_without_permission_ends_with_77_and_the_remedy(tmp_path: Path, peer: Peer) -> None:
     drop = unprivileged()
     device = os.path.realpath(peer.path)
     os.chmod(device, 0o000)  # not even for the owner, who is root here but without root's rights

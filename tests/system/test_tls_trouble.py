@@ -82,7 +82,7 @@ def test_a_client_with_a_valid_certificate_connects(tls: Path, robot: str) -> No
     client_session(robot, str(tls / "client")).close()
 
 
-def test_connecting_without_a_certificate_directory_asks_for_one() -> None:
+def test_connecting_without_a_certificate_directory_asks_for_the_option_tls() -> None:
     error = told("tls/no.such.host.invalid:7449", "")
     assert isinstance(error, CertificateError)
     assert "--tls DIRECTORY" in str(error)

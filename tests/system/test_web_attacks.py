@@ -560,7 +560,7 @@ async def test_a_client_that_pipelines_requests_without_end_is_delayed_and_not_r
     assert answers.total() <= rate.most + (rate.hz + clients / HOLD_S) * lasts_s
 
 
-async def test_a_stop_beyond_the_rate_is_sent_at_once_and_only_its_answer_waits(
+async def test_a_stop_beyond_the_rate_is_sent_immediately_and_only_its_answer_waits(
     page: Page, bus: Bus, tokens: dict[str, str]
 ) -> None:
     async with page.client(tokens["viewer"]) as session:
@@ -595,7 +595,7 @@ async def test_a_stop_beyond_the_rate_is_sent_at_once_and_only_its_answer_waits(
             one.cancel()
 
 
-async def test_handshakes_of_one_network_wait_beyond_their_rate(table: Table, bus: Bus) -> None:
+async def test_handshakes_from_one_network_are_delayed_beyond_their_rate(table: Table, bus: Bus) -> None:
     place, lasts_s, done = URL(table.page.away), 3.0, 0
 
     async def shakes(end: float) -> None:

@@ -158,7 +158,7 @@ async def test_a_link_with_fewer_permissions_replaces_a_cookie_only_if_asked_to(
         assert await opens("operator") == (303, "operator")
 
 
-async def test_two_pages_on_one_host_leave_each_other_s_phones_in(
+async def test_a_phone_can_use_two_pages_on_one_host_with_its_two_tokens(
     page: Page, daemon: Daemon, tmp_path: Path
 ) -> None:
     """A browser's cookies do not depend on ports."""
@@ -324,7 +324,7 @@ def test_refusals_are_logged_once_a_second_by_reason_and_without_tokens(
                     assert answer.status in (401, 429)
 
     run(story)
-    until(lambda: counted("bad token") + counted("too fast") >= before + 5, 10.0, "all are told")
+    until(lambda: counted("bad token") + counted("too fast") >= before + 5, 10.0, "all refusals are logged")
     assert " from 127.0.0.1" in lines()[-1]["text"]
     assert len(lines()) - told <= time.monotonic() - begun + 1.0
     assert "guessed" not in page.stderr

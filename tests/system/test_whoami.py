@@ -194,7 +194,7 @@ def test_a_certificate_that_ends_while_a_client_follows_is_reported(
 
 
 @pytest.mark.slow
-def test_a_drive_by_a_certificate_of_no_list_says_so(robot: Robot) -> None:
+def test_a_drive_with_an_unlisted_certificate_says_that_it_is_unlisted(robot: Robot) -> None:
     with (
         connect(robot.tls, tls=robot.own("unlisted")) as client,
         pytest.raises(NoAnswerError, match=SILENCE),

@@ -121,7 +121,7 @@ print(answer.read().decode())
 def test_the_page_runs_within_its_limits_and_its_end_does_not_end_the_daemon(bare: Container) -> None:
     bare.write(CONFIGURATION, "")  # the simulator
     assert bare.run(ACSARD, "service", "install").code == 0
-    until(lambda: '"mode"' in asks(bare, "/api/state"), 20.0, "the page tells the state")
+    until(lambda: '"mode"' in asks(bare, "/api/state"), 20.0, "the page answers the state")
     assert "stopped and latched" in asks(bare, "/api/srv/stop", "POST")
     assert bare.show("MemoryMax", PAGE) == str(256 << 20)
     daemon, first = bare.main_pid(), bare.main_pid(PAGE)

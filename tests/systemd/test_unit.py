@@ -215,7 +215,7 @@ def test_a_forbidden_port_ends_the_unit_with_77_and_it_stays_down(
     assert container.show("NRestarts") == "0"
 
 
-def test_a_missing_port_is_waited_for(container: Container, driver: Driver) -> None:
+def test_the_unit_waits_for_a_missing_port(container: Container, driver: Driver) -> None:
     assert container.start().code == 0
     status = until(lambda: container.show("StatusText"), 3.0, "a status")
     print(f"status without a board: {status!r}")

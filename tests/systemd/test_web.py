@@ -170,7 +170,7 @@ def test_an_invited_phone_drives_and_stops_the_installed_robot_until_it_is_revok
         SERVED_S,
         "the robot stands",
     )
-    assert stands["mode"] != "stopped", "nobody has stopped it: who drove is gone"
+    assert stands["mode"] != "stopped", "no client has stopped it: the driver is gone"
 
 
 def test_a_client_without_a_token_gets_only_the_empty_page(
