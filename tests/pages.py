@@ -152,11 +152,15 @@ IN_ONE_VIEW = Elsewhere(
     "tests/system/test_many.py", "test_the_two_robots_of_the_fleet_page_are_in_one_view"
 )
 BROKEN = Elsewhere(HERE, "test_the_broken_board_of_the_firmware_page_is_found_broken")
-CABLE = Elsewhere(HERE, "test_the_robot_of_the_first_page_waits_after_its_cable_is_pulled_until_it_is_back")
+CABLE = Elsewhere(
+    HERE, "test_the_robot_of_the_first_page_waits_after_its_cable_is_pulled_until_it_is_back"
+)
 DRIVE = Elsewhere(
     "tests/system/test_cli.py", "test_a_held_key_drives_and_its_release_stops_the_robot"
 )
-INSTALLED = Elsewhere(SERVICE, "test_the_service_runs_after_install_and_leaves_no_file_after_uninstall")
+INSTALLED = Elsewhere(
+    SERVICE, "test_the_service_runs_after_install_and_leaves_no_file_after_uninstall"
+)
 OPENED = Elsewhere(SERVICE, "test_after_lan_init_the_service_listens_on_the_network")
 LAUNCH = Elsewhere(
     "tests/test_deploy_ros2.py",
@@ -227,7 +231,9 @@ COMMANDS: dict[str, How] = {
     ".venv/bin/ruff check .": InCi(".venv/bin/ruff check ."),
     ".venv/bin/ruff format --check .": InCi(".venv/bin/ruff format --check ."),
     ".venv/bin/mypy": InCi(".venv/bin/mypy"),
-    ".venv/bin/lint-imports": Elsewhere("tests/test_shape.py", "test_the_import_contracts_are_kept"),
+    ".venv/bin/lint-imports": Elsewhere(
+        "tests/test_shape.py", "test_the_import_contracts_are_kept"
+    ),
     ".venv/bin/pytest tests/unit tests/scenarios": PYTEST,
     ".venv/bin/pre-commit install": Elsewhere(
         "tests/test_pre_commit.py", "test_a_commit_of_code_or_of_the_contract_runs_every_check"
@@ -318,11 +324,14 @@ COMMANDS: dict[str, How] = {
     ),
     "ssh -N -L 8765:127.0.0.1:8765 USER@ROBOT": TWO_MACHINES,
     "acsard foxglove --drive --connect tls/robot.local:7449 --tls clients/viewer": Elsewhere(
-        "tests/system/test_whoami.py", "test_foxglove_with_a_viewer_s_certificate_shows_its_permissions"
+        "tests/system/test_whoami.py",
+        "test_foxglove_with_a_viewer_s_certificate_shows_its_permissions",
     ),
     # deploy/firmware
     "sudo apt install make gcc-avr avr-libc binutils-avr avrdude": InCi("gcc-avr"),
-    "make": Elsewhere("tests/firmware/test_board.py", "test_the_board_boots_stopped_and_sends_its_identity"),
+    "make": Elsewhere(
+        "tests/firmware/test_board.py", "test_the_board_boots_stopped_and_sends_its_identity"
+    ),
     "make flash PORT=/dev/ttyACM0": Elsewhere(
         HERE,
         "test_the_flash_of_the_firmware_page_calls_avrdude_with_its_port",
@@ -512,7 +521,9 @@ COMMANDS: dict[str, How] = {
     "sudo install -o zenohd -m 0400 ca.pem certificate.pem key.pem /etc/zenohd/tls/": PLACES,
     "sudo install -m 0644 router.json5 /etc/zenohd/": PLACES,
     "acsard router /etc/zenohd/router.json5": Elsewhere(
-        ROUTER, "test_a_signal_ends_the_router_and_its_child_process", "with the file's addresses and certificates changed"
+        ROUTER,
+        "test_a_signal_ends_the_router_and_its_child_process",
+        "with the file's addresses and certificates changed",
     ),
     "zenohd -c /etc/zenohd/router.json5": Elsewhere(
         FLEET,

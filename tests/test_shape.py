@@ -78,9 +78,7 @@ def test_the_import_contracts_are_kept() -> None:
         "def f():\n    import random",
     ],
 )
-def test_every_notation_of_an_impure_import_in_the_core_is_found(
-    tmp_path: Path, line: str
-) -> None:
+def test_every_notation_of_an_impure_import_in_the_core_is_found(tmp_path: Path, line: str) -> None:
     for module in MODULES:
         copy = tmp_path / "acsard" / module
         copy.parent.mkdir(parents=True, exist_ok=True)

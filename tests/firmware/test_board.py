@@ -98,7 +98,9 @@ def test_the_board_boots_stopped_and_sends_its_identity(board: Board, host: Host
     assert stays_off(board, 400).on_ns == 0, "since power on"
 
 
-def test_the_board_answers_its_identity_and_still_stops_after_its_watchdog_time(board: Board, host: Host) -> None:
+def test_the_board_answers_its_identity_and_still_stops_after_its_watchdog_time(
+    board: Board, host: Host
+) -> None:
     host.drive(DRIVE, 0.3)
     fed = board.status().heard_ns
     asked = 0
@@ -138,7 +140,9 @@ def test_an_integral_wound_up_before_a_stop_does_not_drive_after_it(
     assert board.status().on_ns == status.on_ns, "not for a moment"
 
 
-def test_a_reset_while_driving_stops_the_board_until_a_stop_and_a_valid_line(board: Board, host: Host) -> None:
+def test_a_reset_while_driving_stops_the_board_until_a_stop_and_a_valid_line(
+    board: Board, host: Host
+) -> None:
     host.drive(DRIVE, 0.3)
     assert board.status().running
     board.command("reset")
@@ -192,7 +196,11 @@ def test_garbage_changes_no_speed_and_is_not_answered(board: Board, host: Host) 
         host.send(line)
     last = checked(speeds_line(DRIVE), 1)
     host.send(last[:-1] + (b"0" if last[-1:] != b"0" else b"1"))
-    until(lambda: board.status().to_board.last.startswith("ap10.00,bn05.00"), 3.0, "all lines received")
+    until(
+        lambda: board.status().to_board.last.startswith("ap10.00,bn05.00"),
+        3.0,
+        "all lines received",
+    )
     assert stays_off(board, 100).on_ns == 0
     assert host.lines() == []
 
@@ -311,7 +319,9 @@ def test_a_bridge_changes_direction_only_at_zero_duty(board: Board, host: Host) 
     assert all(motor.flip_duty == 0.0 for motor in motors)
 
 
-def test_a_cut_removes_the_voltage_before_it_changes_the_direction(board: Board, host: Host) -> None:
+def test_a_cut_removes_the_voltage_before_it_changes_the_direction(
+    board: Board, host: Host
+) -> None:
     """For a driver with one direction input, low means reverse."""
     for _ in range(3):
         host.drive((30.0, -30.0, 20.0, -40.0), 0.25)
@@ -360,7 +370,9 @@ DIALECTS = [
 
 @pytest.mark.parametrize("line", DIALECTS)
 @pytest.mark.parametrize("end", [b"\r\n", b"\n"])
-def test_every_accepted_form_of_a_line_drives(board: Board, host: Host, line: bytes, end: bytes) -> None:
+def test_every_accepted_form_of_a_line_drives(
+    board: Board, host: Host, line: bytes, end: bytes
+) -> None:
     def there() -> bool:
         host.send(line, end)
         host.lines(0.01)
@@ -500,7 +512,9 @@ def test_a_host_that_never_pauses_is_answered_and_controlled(board: Board, host:
 
 @pytest.mark.parametrize("speed", [20.0, 40.0, 60.0])
 @pytest.mark.nightly
-def test_the_board_counts_every_edge_of_fast_wheels(runner: Path, firmware: Path, speed: float) -> None:
+def test_the_board_counts_every_edge_of_fast_wheels(
+    runner: Path, firmware: Path, speed: float
+) -> None:
     with Board(runner, firmware, "--free-speed", "70,70,70,70") as board, Host(board.path) as host:
         host.drive((speed, -speed, speed, -speed), 1.0)
         before = board.status()
@@ -525,7 +539,9 @@ def test_an_overflow_of_the_receive_buffer_does_not_damage_the_next_line(
     with Board(runner, hanging_firmware) as board, Host(board.path) as host:
         lines = b"".join(checked(ZERO, i) + b"\r\n" for i in range(12))
         host.write(b"!p\r\n" + lines)
-        until(lambda: board.status().to_board.bytes == 4 + len(lines), 5.0, "all bytes are received")
+        until(
+            lambda: board.status().to_board.bytes == 4 + len(lines), 5.0, "all bytes are received"
+        )
         host.says(b"#00")
         host.send(checked(ZERO, 99))
         host.says(b"#63")

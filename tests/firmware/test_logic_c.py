@@ -307,7 +307,9 @@ def test_a_quick_start_after_a_long_rest_is_measured_without_delay(logic: ctypes
         assert said[-1][1] >= 4 * PITCH / 0.005 * 0.999
 
 
-def test_the_first_edge_after_a_rest_longer_than_the_clock_gives_no_high_speed(logic: ctypes.CDLL) -> None:
+def test_the_first_edge_after_a_rest_longer_than_the_clock_gives_no_high_speed(
+    logic: ctypes.CDLL,
+) -> None:
     """Its 32 bits wrap in 36 minutes; then an edge long ago would look recent."""
     rests = [2**32 // 32] * 32
     far = sum(rests)
@@ -327,7 +329,9 @@ def test_speeds_in_hundredths_are_rounded_and_clamped(logic: ctypes.CDLL, value:
 # control
 
 
-def test_the_speed_loop_settles_without_overshoot_and_recovers_from_a_jam(logic: ctypes.CDLL) -> None:
+def test_the_speed_loop_settles_without_overshoot_and_recovers_from_a_jam(
+    logic: ctypes.CDLL,
+) -> None:
     pi = PiC()
     at = ctypes.addressof(pi)
     logic.pi_reset(at)

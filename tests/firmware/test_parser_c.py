@@ -292,7 +292,9 @@ BEFORE_CHECK = [
 
 
 @each("suffix", BEFORE_CHECK)
-def test_a_line_with_a_wrong_form_is_refused_even_if_its_check_is_right(parser: Parser, suffix: bytes) -> None:
+def test_a_line_with_a_wrong_form_is_refused_even_if_its_check_is_right(
+    parser: Parser, suffix: bytes
+) -> None:
     head = ZERO + suffix
     assert parser.parse(head + b"*%04X" % binascii.crc_hqx(head, 0)) is None
 
@@ -398,7 +400,9 @@ def test_the_longest_identity_line_has_126_bytes(parser: Parser) -> None:
     assert len(parser.identity(2**32 - 1, 65535, 65535, 65535, b"brown-out")) == 126
 
 
-def test_counts_configured_as_a_product_are_reported_as_a_number(coarse_library: ctypes.CDLL) -> None:
+def test_counts_configured_as_a_product_are_reported_as_a_number(
+    coarse_library: ctypes.CDLL,
+) -> None:
     assert (
         Parser(coarse_library)
         .identity(0, 0, 0, 0, b"pin")

@@ -97,7 +97,9 @@ def test_firmware_as_delivered_never_sends_a_status_line(library: ctypes.CDLL) -
 
 
 @pytest.mark.parametrize("bit", range(5))
-def test_each_contact_is_reported_within_four_samples_in_its_own_field(inputs: Inputs, bit: int) -> None:
+def test_each_contact_is_reported_within_four_samples_in_its_own_field(
+    inputs: Inputs, bit: int
+) -> None:
     inputs.boot()
     assert inputs.lines(CLOSED, 500)[-1] == BoardStatus(estop=False, bumpers=(False,) * 4)
     bumpers = tuple(number == bit - 1 for number in range(4))
@@ -196,9 +198,7 @@ def test_bumpers_open_or_close_when_pressed(
 
 
 @pytest.mark.parametrize("length_ms", [3, 40, 500])
-def test_even_a_short_driver_fault_is_reported_within_110_ms(
-    build: Build, length_ms: int
-) -> None:
+def test_even_a_short_driver_fault_is_reported_within_110_ms(build: Build, length_ms: int) -> None:
     inputs = build("-DDRIVER_INPUT=1")
     inputs.boot()
     inputs.lines(CLOSED, 1200)

@@ -54,7 +54,9 @@ def sketch(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
     return library
 
 
-def test_the_example_reports_ten_times_a_second_and_a_change_immediately(sketch: ctypes.CDLL) -> None:
+def test_the_example_reports_ten_times_a_second_and_a_change_immediately(
+    sketch: ctypes.CDLL,
+) -> None:
     told = [(at, line) for at in range(1000) if (line := sketch.run(350 <= at < 620, at))]
     pressed = {at for at, line in told if decode_status(line.removesuffix(b"\r\n"), False).estop}
     assert all(line.endswith(b"\r\n") for _, line in told)

@@ -113,7 +113,9 @@ def test_bench_gives_the_daemons_reason_if_no_command_reaches_the_wire() -> None
         ("acsard.bench.far_end", "the simulated microcontroller's process"),
     ],
 )
-def test_bench_names_its_child_process_that_was_killed(tmp_path: Path, words: str, who: str) -> None:
+def test_bench_names_its_child_process_that_was_killed(
+    tmp_path: Path, words: str, who: str
+) -> None:
     with Program(acsard("bench", "--seconds", "30"), tmp_path) as bench:
         pid = until(lambda: next(iter(children(bench.pid, words)), None), 15.0, words)
         os.kill(pid, signal.SIGKILL)
@@ -122,7 +124,9 @@ def test_bench_names_its_child_process_that_was_killed(tmp_path: Path, words: st
 
 
 @pytest.mark.slow
-def test_bench_on_a_port_that_a_daemon_holds_ends_with_75_and_names_the_process(tmp_path: Path, peer: Peer) -> None:
+def test_bench_on_a_port_that_a_daemon_holds_ends_with_75_and_names_the_process(
+    tmp_path: Path, peer: Peer
+) -> None:
     with Daemon(tmp_path, peer.path) as daemon:
         done = finish(acsard("bench", "--port", str(peer.path)), tmp_path)
         assert done.code == 75

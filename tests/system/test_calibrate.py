@@ -299,7 +299,9 @@ def test_a_person_with_a_wall_or_marks_is_guided_to_the_written_file(
 
 
 @pytest.mark.slow
-def test_space_during_a_leg_stops_the_robot_within_the_ramp_and_writes_no_file(tmp_path: Path) -> None:
+def test_space_during_a_leg_stops_the_robot_within_the_ramp_and_writes_no_file(
+    tmp_path: Path,
+) -> None:
     with running(tmp_path, config=SKIDDING) as (daemon, bus):
         before = daemon.config.read_bytes()
         with calibrating(daemon, "--write") as (terminal, program):
@@ -401,7 +403,9 @@ AS_ODOMETRY = {
 }  # fmt: skip
 
 
-def test_positions_of_another_program_are_received_as_both_types_in_every_encoding(free: str) -> None:
+def test_positions_of_another_program_are_received_as_both_types_in_every_encoding(
+    free: str,
+) -> None:
     with router(free) as said, client_session(free, "") as heard:
         for cls, value in ((PoseStamped, AS_POSE), (Odometry, AS_ODOMETRY)):
             message = msgspec.convert(value, cls)

@@ -103,7 +103,9 @@ def test_a_mistyped_command_ends_with_2(words: list[str]) -> None:
     assert "usage: acsard" in ended.err
 
 
-def test_without_a_verb_the_daemon_runs_with_the_options_and_the_local_acsard_toml(tmp_path: Path) -> None:
+def test_without_a_verb_the_daemon_runs_with_the_options_and_the_local_acsard_toml(
+    tmp_path: Path,
+) -> None:
     endpoint = free_endpoint()
     (tmp_path / "acsard.toml").write_text('[robot]\nid = "handy"\n')
     with Program(acsard("--listen", endpoint), tmp_path) as daemon:
@@ -186,7 +188,9 @@ def test_echo_state_says_the_mode_and_why(shared: Daemon, bus: Bus) -> None:
     assert WAITS in state["reason"]
 
 
-def test_echo_tf_static_prints_the_latched_message_without_waiting_for_the_next(shared: Daemon, bus: Bus) -> None:
+def test_echo_tf_static_prints_the_latched_message_without_waiting_for_the_next(
+    shared: Daemon, bus: Bus
+) -> None:
     begun = time.monotonic()
     ended = tool(shared, "echo", "tf_static", "-n", "1")
     assert ended.code == 0
@@ -195,7 +199,9 @@ def test_echo_tf_static_prints_the_latched_message_without_waiting_for_the_next(
 
 
 @pytest.mark.slow
-def test_echo_shows_commands_of_other_programs_also_if_they_are_malformed(shared: Daemon, bus: Bus) -> None:
+def test_echo_shows_commands_of_other_programs_also_if_they_are_malformed(
+    shared: Daemon, bus: Bus
+) -> None:
     words = acsard("echo", "cmd/stranger", "-n", "2", "--config", str(shared.config))
     with Program(words, shared.config.parent) as echo:
         for payload in (b'{"linear": {}, "angular": {}}', b"\xff"):
@@ -381,7 +387,9 @@ def test_echo_for_many_waits_for_each_and_says_which_is_missing(shared: Daemon) 
 
 @each("verb", ["top", "hz", "whoami", "drive", "accuracy", "calibrate"])
 @each("ids", ["*", "robot1,robot2"])
-def test_a_verb_for_one_robot_refuses_several_ids_and_names_the_verb_for_many(shared: Daemon, verb: str, ids: str) -> None:
+def test_a_verb_for_one_robot_refuses_several_ids_and_names_the_verb_for_many(
+    shared: Daemon, verb: str, ids: str
+) -> None:
     words = {"hz": ["odom"]}.get(verb, [])
     ended = tool(shared, verb, *words, "--id", ids)
     assert (ended.code, ended.out) == (2, "")
@@ -493,7 +501,9 @@ def test_set_changes_the_robot_that_runs_and_with_write_the_file(
         assert tool(shared, "set", "rates.state", "10", "log.level", "info").code == 0
 
 
-def test_set_without_arguments_lists_the_settings_and_when_they_can_change(shared: Daemon, bus: Bus) -> None:
+def test_set_without_arguments_lists_the_settings_and_when_they_can_change(
+    shared: Daemon, bus: Bus
+) -> None:
     told = tool(shared, "set")
     assert told.code == 0
     assert "highest speed, forwards and backwards: a number from 0 to 10 m/s" in told.out
@@ -697,7 +707,9 @@ def test_drive_without_a_screen_prints_the_help_and_a_line_a_second_that_fits(
 
 
 @pytest.mark.slow
-def test_drive_without_a_screen_ends_with_a_line_that_the_robot_is_at_rest(shared: Daemon, bus: Bus) -> None:
+def test_drive_without_a_screen_ends_with_a_line_that_the_robot_is_at_rest(
+    shared: Daemon, bus: Bus
+) -> None:
     with without_a_screen(shared) as (terminal, program):
         with held(terminal, "i"):
             until(lambda: (bus.state()["linear"] or 0.0) > 0.2, 5.0, "moving")

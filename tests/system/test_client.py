@@ -308,7 +308,9 @@ def test_a_query_that_the_daemon_refuses_raises_the_daemon_s_reason(shared: Daem
         robot.get("odom?fmt=xml")
 
 
-def test_a_put_on_a_wildcard_is_not_taken_for_a_message_of_the_robot(shared: Daemon, fresh: Bus) -> None:
+def test_a_put_on_a_wildcard_is_not_taken_for_a_message_of_the_robot(
+    shared: Daemon, fresh: Bus
+) -> None:
     with connect(shared.endpoint) as robot:
         states = robot.subscribe("state")
         raw = robot.samples("state", timeout=5.0)
@@ -502,7 +504,9 @@ async def test_an_async_drive_runs_while_odometry_is_followed(shared: Daemon, fr
 
 
 @pytest.mark.slow
-async def test_cancelling_an_async_drive_sends_the_zero_immediately(shared: Daemon, fresh: Bus) -> None:
+async def test_cancelling_an_async_drive_sends_the_zero_immediately(
+    shared: Daemon, fresh: Bus
+) -> None:
     with fresh.follow("cmd/app") as commands:
         async with connect_async(shared.endpoint) as robot:
             driving = asyncio.create_task(robot.drive(0.5, seconds=60.0))

@@ -91,7 +91,9 @@ def test_an_invalid_port_is_a_failure_that_refers_to_acsard_ports(
     assert "acsard ports" in worst(found["port"])["mend"]
 
 
-def test_the_process_that_holds_the_port_is_named_with_its_pid(tmp_path: Path, terminal: str) -> None:
+def test_the_process_that_holds_the_port_is_named_with_its_pid(
+    tmp_path: Path, terminal: str
+) -> None:
     holder = subprocess.Popen(
         [sys.executable, "-c", f"import os, time; os.open({terminal!r}, os.O_RDWR | os.O_NOCTTY)\n"
          "print('held', flush=True); time.sleep(30)"],
@@ -142,7 +144,9 @@ def test_doctor_uses_the_running_daemon_s_values_and_reports_where_the_file_diff
 
 
 @pytest.mark.nightly
-def test_doctor_finds_a_daemon_with_another_endpoint_and_id_by_the_same_options(tmp_path: Path) -> None:
+def test_doctor_finds_a_daemon_with_another_endpoint_and_id_by_the_same_options(
+    tmp_path: Path,
+) -> None:
     where = free_endpoint()
     with Daemon(tmp_path, words=("--listen", where, "--id", "other")) as daemon:
         file = daemon.config.read_text()
@@ -196,7 +200,9 @@ def test_invalid_connect_options_of_doctor_end_with_2_and_one_sentence(
 @pytest.mark.parametrize(
     ("fault", "words"), [("mute", "nothing was received"), ("lost_replies", "answered only")]
 )
-def test_doctor_reports_the_faulty_board_of_a_running_daemon(tmp_path: Path, fault: str, words: str) -> None:
+def test_doctor_reports_the_faulty_board_of_a_running_daemon(
+    tmp_path: Path, fault: str, words: str
+) -> None:
     with Program(acsard("sim", "--fault", fault), tmp_path) as sim:
         port = sim.says("acsard run --port").split()[-1]
         with Daemon(tmp_path, words=("--port", port)) as daemon, Bus(daemon.endpoint) as bus:

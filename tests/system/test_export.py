@@ -122,7 +122,9 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 @pytest.mark.parametrize("topic", ["odom", "tf", "joint_states", "cmd_vel_out"])
-def test_every_exported_message_has_the_bytes_that_a_ros_node_received(topic: str, both: Any) -> None:
+def test_every_exported_message_has_the_bytes_that_a_ros_node_received(
+    topic: str, both: Any
+) -> None:
     seen, _, told = both
     assert len(seen[topic]) > 100
     assert_among(seen[topic], told.data[f"/{topic}"], topic)

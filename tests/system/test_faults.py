@@ -416,7 +416,9 @@ def test_a_board_that_stops_reading_and_answering_is_sent_few_drive_lines_then_z
 
 
 @pytest.mark.slow
-def test_no_line_waits_in_the_daemon_while_the_serial_line_is_full(tmp_path: Path, peer: Peer) -> None:
+def test_no_line_waits_in_the_daemon_while_the_serial_line_is_full(
+    tmp_path: Path, peer: Peer
+) -> None:
     # Feedback goes on, so only the kernel's refusal shows that nothing goes out.
     with (
         Daemon(tmp_path, peer.path) as daemon,

@@ -370,9 +370,7 @@ def test_a_key_is_subscribed_only_while_a_viewer_shows_it(viewer: Viewer, bus: B
 
 
 @SLOW
-def test_without_drive_foxglove_accepts_a_stop_and_no_commands(
-    shared: Daemon, bus: Bus
-) -> None:
+def test_without_drive_foxglove_accepts_a_stop_and_no_commands(shared: Daemon, bus: Bus) -> None:
     with Shows(shared, "--id", "acsar") as own, Viewer(own.port) as viewer:
         assert viewer.info["capabilities"] == ["services"]
         looked = viewer.show("/odom")
@@ -434,7 +432,9 @@ def test_parameters_are_the_live_settings_and_errors_are_reported(viewer: Viewer
 
 @SLOW
 @pytest.mark.parametrize("encoding", ["json", "cdr"])
-def test_a_held_button_drives_and_its_release_stops_the_robot(viewer: Viewer, bus: Bus, encoding: str) -> None:
+def test_a_held_button_drives_and_its_release_stops_the_robot(
+    viewer: Viewer, bus: Bus, encoding: str
+) -> None:
     twist = Twist(Vector3(x=0.4), Vector3())
     data = speed(0.4) if encoding == "json" else encode(twist, "cdr")
     before = bus.state()["x"]
@@ -461,7 +461,9 @@ def test_each_viewer_is_a_sender_of_its_own(viewer: Viewer, shows: Shows, bus: B
 
 
 @SLOW
-def test_a_viewer_whose_commands_do_not_drive_sees_the_reason_until_they_do(viewer: Viewer, bus: Bus) -> None:
+def test_a_viewer_whose_commands_do_not_drive_sees_the_reason_until_they_do(
+    viewer: Viewer, bus: Bus
+) -> None:
     bus.get("srv/stop")
     with Panel(viewer, speed(0.2)):
         told = viewer.status("your commands do not drive the robot: stopped by unnamed (native) at")
@@ -562,7 +564,9 @@ def test_the_robot_ramps_down_if_the_viewer_is_lost_while_it_drives(
 
 
 @SLOW
-def test_commands_that_a_suspended_foxglove_process_held_back_move_no_robot(shared: Daemon, bus: Bus) -> None:
+def test_commands_that_a_suspended_foxglove_process_held_back_move_no_robot(
+    shared: Daemon, bus: Bus
+) -> None:
     with Shows(shared) as own, Viewer(own.port) as viewer, followed(bus) as (asked, _):
         with Panel(viewer, speed(0.4)):
             driving(bus, 0.3)
@@ -615,7 +619,9 @@ def test_a_port_that_is_in_use_ends_with_75_and_the_remedy(shared: Daemon, tmp_p
 
 @SLOW
 @pytest.mark.nightly
-def test_foxglove_without_shown_topics_costs_little_processor_time(shows: Shows, viewer: Viewer, bus: Bus) -> None:
+def test_foxglove_without_shown_topics_costs_little_processor_time(
+    shows: Shows, viewer: Viewer, bus: Bus
+) -> None:
     def cost() -> float:
         """Return the processor time while the daemon publishes 300 odometry messages, s."""
         with bus.follow("odom") as odom:
@@ -631,9 +637,7 @@ def test_foxglove_without_shown_topics_costs_little_processor_time(shows: Shows,
 
 
 @SLOW
-def test_commands_with_old_stamps_move_no_robot(
-    viewer: Viewer, bus: Bus
-) -> None:
+def test_commands_with_old_stamps_move_no_robot(viewer: Viewer, bus: Bus) -> None:
     name = "geometry_msgs/msg/TwistStamped"
     send, _ = viewer.publish_on("/cmd_vel", "json", name)
     twist = json.loads(speed(0.4))

@@ -82,7 +82,11 @@ def test_a_gateway_that_is_killed_is_restarted_and_counted(robot: Open) -> None:
     assert robot.lets_in()
     first = robot.gateway()
     with Bus(robot.daemon.endpoint) as bus:
-        until(lambda: bus.count("gateway_opened") == 1, 5.0, "the gateway has reported that it is open")
+        until(
+            lambda: bus.count("gateway_opened") == 1,
+            5.0,
+            "the gateway has reported that it is open",
+        )
     os.kill(first, signal.SIGKILL)
     robot.daemon.gateway_opens(times=2)
     assert robot.lets_in()
@@ -163,7 +167,11 @@ def test_a_gateway_that_was_suspended_for_two_seconds_is_not_restarted(robot: Op
 def test_forged_gateway_reports_are_ignored(robot: Open) -> None:
     huge = b'{"opened": 1, "connections": 0, "full": 1' + b"0" * 400 + b"}"
     with Bus(robot.daemon.endpoint) as bus:
-        until(lambda: bus.count("gateway_opened") == 1, 5.0, "the gateway has reported that it is open")
+        until(
+            lambda: bus.count("gateway_opened") == 1,
+            5.0,
+            "the gateway has reported that it is open",
+        )
         for payload in (b"", b"{}", b"\xff", huge):
             bus.session.put("acsard/acsar/gateway", payload)
         assert bus.ask("info")

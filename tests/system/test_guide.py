@@ -148,7 +148,9 @@ async def test_a_browser_that_disconnects_during_a_leg_leaves_zeros_and_no_child
     none_left(page)
 
 
-async def test_a_guide_client_that_sends_no_signs_of_life_loses_its_procedure(page: Page, standing: Bus) -> None:
+async def test_a_guide_client_that_sends_no_signs_of_life_loses_its_procedure(
+    page: Page, standing: Bus
+) -> None:
     async with guiding(page, pings=False) as guided:
         for _ in range(4):  # a busy machine may end it before
             await guided.begin("calibrate", method="umbmark")
@@ -286,7 +288,9 @@ def ended(pid: int) -> bool:
 
 
 @pytest.mark.network
-async def test_a_client_without_the_role_maintainer_begins_no_procedure(page: Page, standing: Bus) -> None:
+async def test_a_client_without_the_role_maintainer_begins_no_procedure(
+    page: Page, standing: Bus
+) -> None:
     before = page.refused().get("role", 0)
     for role in ("viewer", "operator"):
         token = page.invite(role, role)

@@ -397,7 +397,9 @@ HOLD_UP = ("publish", "querier", "as_peer")
         for n, form in enumerate(form for form in FORMS if form not in HOLD_UP)
     ],
 )
-def test_an_attack_on_zenohd_does_not_disturb_the_robot_behind_it(tmp_path: Path, form: str) -> None:
+def test_an_attack_on_zenohd_does_not_disturb_the_robot_behind_it(
+    tmp_path: Path, form: str
+) -> None:
     with fleet(tmp_path, zenohd) as network:
         figures = Robot(tmp_path, network).attacked(form, "viewer", 1.5)
     print(f"\n{form} by viewer: {figures}")

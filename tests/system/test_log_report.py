@@ -100,7 +100,9 @@ def test_no_label_of_a_picture_is_cut_on_a_phone_also_after_it_is_turned(tmp_pat
 
 
 @pytest.mark.nightly
-def test_no_part_of_a_report_is_wider_than_the_window_of_a_phone_or_a_desktop(tmp_path: Path) -> None:
+def test_no_part_of_a_report_is_wider_than_the_window_of_a_phone_or_a_desktop(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "new.html"
     course, _ = drive_of_two()
     long = origin(file=f"{'0' * 70}.mcap", robot="robot-" * 12)

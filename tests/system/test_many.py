@@ -320,7 +320,9 @@ def test_stop_of_all_stops_each_robot_and_names_those_that_answered(robots: Robo
     assert set(modes.values()) == {"stopped"}
 
 
-def test_stop_of_several_names_the_robot_that_did_not_answer_and_ends_with_69(robots: Robots) -> None:
+def test_stop_of_several_names_the_robot_that_did_not_answer_and_ends_with_69(
+    robots: Robots,
+) -> None:
     ended = robots.tool("call", "stop", who=f"{ONE},robot9")
     assert ended.code == 69
     assert re.search(rf"^{ONE}: stopped", ended.out, re.M)
@@ -402,7 +404,9 @@ def test_an_empty_network_is_reported_with_69(tmp_path: Path) -> None:
 @pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.network
-def test_over_tls_a_wildcard_finds_no_robot_and_says_why_and_named_robots_are_found(tmp_path: Path) -> None:
+def test_over_tls_a_wildcard_finds_no_robot_and_says_why_and_named_robots_are_found(
+    tmp_path: Path,
+) -> None:
     endpoint = free_tls_endpoint()
     certified(tmp_path, "router.local", ONE, "viewer")
     with router(tmp_path, endpoint) as program:

@@ -272,7 +272,9 @@ def test_a_second_finger_anywhere_releases_the_stick(page: Phone, where: str) ->
     page.bus.at_rest()
 
 
-def test_releasing_the_left_mouse_button_while_another_is_held_releases_the_stick(page: Phone) -> None:
+def test_releasing_the_left_mouse_button_while_another_is_held_releases_the_stick(
+    page: Phone,
+) -> None:
     """The browser sends no pointerup until the last finger is lifted."""
     browser, bus = page.browser, page.bus
     browser.size(*DESKTOP, touch=False)
@@ -327,7 +329,9 @@ JAM = """(() => {
 """A network that accepts nothing for now. The page's writes to it are logged."""
 
 
-def test_the_zero_of_a_released_stick_is_sent_twice_also_over_a_congested_socket(page: Phone) -> None:
+def test_the_zero_of_a_released_stick_is_sent_twice_also_over_a_congested_socket(
+    page: Phone,
+) -> None:
     """A daemon that reads late may drop a zero that closely follows another command."""
     page.hold()
     page.browser.js(JAM)
@@ -407,7 +411,9 @@ def test_a_key_released_while_another_element_has_the_focus_stops_the_robot(page
 
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("other", ["MetaLeft", "menu", "drag"])
-def test_a_key_is_released_if_the_system_may_swallow_its_key_up_event(page: Phone, other: str) -> None:
+def test_a_key_is_released_if_the_system_may_swallow_its_key_up_event(
+    page: Phone, other: str
+) -> None:
     browser, bus = page.browser, page.bus
     browser.key("Down", "KeyW", "w")
     until(lambda: (bus.state()["linear"] or 0.0) > 0.15, 10.0, "forwards")
@@ -452,9 +458,7 @@ def test_a_stop_that_fails_raises_the_alarm_in_every_view(page: Phone) -> None:
 
 
 @alone
-def test_a_stop_into_a_dead_connection_is_sent_again(
-    page: Phone, tmp_path: Path
-) -> None:
+def test_a_stop_into_a_dead_connection_is_sent_again(page: Phone, tmp_path: Path) -> None:
     page.server.signal(signal.SIGSTOP)
     page.browser.tap("stop")
     page.server.process.kill()
@@ -848,7 +852,11 @@ def test_another_client_that_drives_is_named(page: Phone) -> None:
         until(lambda: "drives" in row(page, "teleop"), 5.0, "the driver is in the table")
         assert row(page, "app").endswith("a command")  # the command for which it waits
         page.browser.tap("tab-drive")
-        until(lambda: page.browser.text("who") not in ("–", "nobody", "you"), 5.0, "the driver is named")
+        until(
+            lambda: page.browser.text("who") not in ("–", "nobody", "you"),
+            5.0,
+            "the driver is named",
+        )
         assert re.search(HEX, page.browser.text("who")) is None
         page.shows("hint", "drives: you can drive when they stop.")
     page.shows("reason", "Nobody drives.")

@@ -94,7 +94,9 @@ def some(names: Sequence[str], which: int) -> list[Any]:
 
 
 @pytest.mark.parametrize("name", some(FILES, 0))
-def test_stop_latches_as_soon_as_it_is_red_also_if_one_file_does_not_load(impatient: Robot, name: str) -> None:
+def test_stop_latches_as_soon_as_it_is_red_also_if_one_file_does_not_load(
+    impatient: Robot, name: str
+) -> None:
     with impatient.without(name):
         until(lambda: impatient.mode == "stopped", 5.0, f"stopped without {name}")
 

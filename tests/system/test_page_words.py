@@ -41,7 +41,9 @@ def forgets(browser: Browser, within_s: float) -> None:
     until(lambda: browser.text("complaint") == "", within_s, "the complaint is outdated")
 
 
-def test_a_page_that_has_not_shown_a_stop_does_not_release_it(tmp_path: Path, browser: Browser) -> None:
+def test_a_page_that_has_not_shown_a_stop_does_not_release_it(
+    tmp_path: Path, browser: Browser
+) -> None:
     """Another person may have stopped the robot while this page had no connection."""
     with running(tmp_path) as (daemon, bus):
         with Page(daemon, tmp_path) as page:

@@ -150,7 +150,9 @@ def test_the_broken_board_of_the_firmware_page_is_found_broken(tmp_path: Path) -
 
 
 @pytest.mark.slow
-def test_the_robot_of_the_first_page_waits_after_its_cable_is_pulled_until_it_is_back(tmp_path: Path) -> None:
+def test_the_robot_of_the_first_page_waits_after_its_cable_is_pulled_until_it_is_back(
+    tmp_path: Path,
+) -> None:
     place = with_acsard(tmp_path)
     typed_there = ("acsard sim --link ./mcu", "acsard run --port ./mcu")
     board, run = ([sys.executable, "-m", *command.split()] for command in typed_there)

@@ -59,7 +59,9 @@ def test_real_time_scheduling_can_be_switched_off(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can take root's permissions away")
-def test_without_permission_the_daemon_runs_without_real_time_and_logs_one_line(tmp_path: Path) -> None:
+def test_without_permission_the_daemon_runs_without_real_time_and_logs_one_line(
+    tmp_path: Path,
+) -> None:
     without = ["setpriv", "--bounding-set", "-sys_nice,-ipc_lock"]
     with running(tmp_path, before=without) as (daemon, _):
         assert os.sched_getscheduler(daemon.pid) == os.SCHED_OTHER

@@ -369,7 +369,9 @@ def test_a_command_held_up_on_the_way_is_stale_by_its_attachment(bus: Bus, ros: 
     refused_without_motion(bus, late, "stale", "the network delayed it")
 
 
-def test_a_command_of_a_sender_whose_clock_is_an_hour_off_is_accepted(bus: Bus, ros: RmwClient) -> None:
+def test_a_command_of_a_sender_whose_clock_is_an_hour_off_is_accepted(
+    bus: Bus, ros: RmwClient
+) -> None:
     # Only differences of ages count: clocks need not agree.
     for off in (3600.0, -3600.0):
         other = RmwClient(bus.session)

@@ -125,7 +125,9 @@ def test_a_robot_reports_the_end_of_its_routers_certificate(where: Path) -> None
 
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
-def test_a_signal_ends_the_router_and_its_child_process(where: Path, number: signal.Signals) -> None:
+def test_a_signal_ends_the_router_and_its_child_process(
+    where: Path, number: signal.Signals
+) -> None:
     with watched_router(where, free_tls_endpoint()) as router:
         listens(router)
         inner = the_router(router)

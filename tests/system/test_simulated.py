@@ -35,7 +35,9 @@ def yaw(pose: Any) -> float:
 
 
 @pytest.mark.slow
-def test_the_true_pose_differs_from_odometry_by_the_simulated_track_multiplier(skidding: Bus) -> None:
+def test_the_true_pose_differs_from_odometry_by_the_simulated_track_multiplier(
+    skidding: Bus,
+) -> None:
     with skidding.commanding(0.0, 1.0):
         until(lambda: skidding.state()["yaw"] > 1.6, 10.0, "most of a quarter turn")
     skidding.at_rest()
@@ -106,7 +108,9 @@ def test_calibrate_reads_a_drive_that_echo_recorded_as_csv(tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-def test_a_second_imu_sender_beside_the_simulated_gyro_is_refused_counted_and_logged(tmp_path: Path) -> None:
+def test_a_second_imu_sender_beside_the_simulated_gyro_is_refused_counted_and_logged(
+    tmp_path: Path,
+) -> None:
     tables: dict[str, dict[str, object]] = {"odometry": {"gyro": True}}
     with Daemon(tmp_path, config=tables) as daemon, Bus(daemon.endpoint) as bus:
         bus.linked()

@@ -123,7 +123,9 @@ def test_the_error_says_what_is_wrong_with_the_robot_s_certificate(
         ("ended", "has expired or is not valid yet"),
     ],
 )
-def test_the_error_says_what_is_wrong_with_the_client_s_certificate(tls: Path, robot: str, shown: str, sentence: str) -> None:
+def test_the_error_says_what_is_wrong_with_the_client_s_certificate(
+    tls: Path, robot: str, shown: str, sentence: str
+) -> None:
     assert sentence in str(told(robot, str(tls / shown)))
 
 

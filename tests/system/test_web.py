@@ -43,7 +43,9 @@ def bus(standing: Bus) -> Bus:
     return standing
 
 
-async def test_a_new_connection_gets_the_robot_s_description_and_can_follow_it(page: Page, bus: Bus) -> None:
+async def test_a_new_connection_gets_the_robot_s_description_and_can_follow_it(
+    page: Page, bus: Bus
+) -> None:
     async with hands(page) as ours:
         hello = (await ours.find(lambda said: "hello" in said))["hello"]
         assert (hello["robot"], hello["role"]) == ("acsar", "maintainer")
@@ -251,9 +253,7 @@ async def drawn(session: aiohttp.ClientSession) -> tuple[str, dict[str, Any]]:
 
 
 @pytest.mark.slow
-async def test_a_recording_s_report_is_isolated_from_the_robot_s_page(
-    page: Page, bus: Bus
-) -> None:
+async def test_a_recording_s_report_is_isolated_from_the_robot_s_page(page: Page, bus: Bus) -> None:
     async with aiohttp.ClientSession(page.here) as session:
         name, told = await drawn(session)
         assert told == {"status": 200, "report": "ready", "href": f"report/{name}"}
@@ -361,7 +361,9 @@ def test_a_daemon_in_a_terminal_serves_its_page_at_a_free_port_and_restarts_it(
 
 
 @pytest.mark.slow
-def test_a_daemon_without_a_terminal_or_with_the_page_disabled_serves_no_page(tmp_path: Path) -> None:
+def test_a_daemon_without_a_terminal_or_with_the_page_disabled_serves_no_page(
+    tmp_path: Path,
+) -> None:
     config = write_config(tmp_path / "a.toml", {"web": {"page": False}})
     with Terminal(tmp_path, "--config", str(config)) as told, Daemon(tmp_path) as piped:
         told.shows("link_up")

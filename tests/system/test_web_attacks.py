@@ -420,7 +420,9 @@ def test_a_head_without_an_end_is_cut_off(table: Table, bus: Bus, before: bytes)
 
 @pytest.mark.parametrize("headers", [0, 60])
 @pytest.mark.nightly
-def test_answers_that_no_client_reads_cost_little_memory(table: Table, bus: Bus, headers: int) -> None:
+def test_answers_that_no_client_reads_cost_little_memory(
+    table: Table, bus: Bus, headers: int
+) -> None:
     """Sixty clients without a token send requests without end, and read no answer."""
     page, place = table.page, URL(table.page.away)
     trusting = ssl._create_unverified_context()
@@ -486,7 +488,9 @@ def test_a_slow_or_silent_client_is_disconnected(table: Table, bus: Bus) -> None
     assert time.monotonic() - begun < max(BODY_S, REQUEST_S) + PATIENCE_S
 
 
-def test_a_client_that_does_not_read_its_answers_is_disconnected_soon(table: Table, bus: Bus) -> None:
+def test_a_client_that_does_not_read_its_answers_is_disconnected_soon(
+    table: Table, bus: Bus
+) -> None:
     place = Path(f"/proc/{table.page.pid}/fd")
     with socket.socket() as greedy:
         greedy.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
@@ -595,7 +599,9 @@ async def test_a_stop_beyond_the_rate_is_sent_immediately_and_only_its_answer_wa
             one.cancel()
 
 
-async def test_handshakes_from_one_network_are_delayed_beyond_their_rate(table: Table, bus: Bus) -> None:
+async def test_handshakes_from_one_network_are_delayed_beyond_their_rate(
+    table: Table, bus: Bus
+) -> None:
     place, lasts_s, done = URL(table.page.away), 3.0, 0
 
     async def shakes(end: float) -> None:

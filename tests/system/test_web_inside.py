@@ -76,7 +76,9 @@ async def eventually(look: Callable[[], Any]) -> None:
             await asyncio.sleep(0.01)
 
 
-async def test_a_client_that_must_disconnect_drives_no_more_even_if_it_does_not_read(inside: Inside) -> None:
+async def test_a_client_that_must_disconnect_drives_no_more_even_if_it_does_not_read(
+    inside: Inside,
+) -> None:
     async with inside.hands() as ours:
         await ours.find(lambda said: "hello" in said)
         await ours.drive(0.0)
@@ -186,7 +188,9 @@ async def test_a_client_that_unsubscribes_and_disconnects_leaves_no_subscription
             assert inside.robots.streams.followed("acsar", "odom") is None
 
 
-async def test_a_client_that_pings_without_reading_gets_one_answer_to_all_pings(inside: Inside) -> None:
+async def test_a_client_that_pings_without_reading_gets_one_answer_to_all_pings(
+    inside: Inside,
+) -> None:
     async with inside.hands() as ours:
         await ours.find(lambda said: "hello" in said)
         wire = cast(Any, ours.socket)._response.connection.transport

@@ -91,7 +91,9 @@ TIMES = pytest.mark.parametrize(
 
 @TIMES
 @pytest.mark.parametrize("way", OF_THE_BROWSER, ids=lambda way: way.__name__)
-def test_a_client_that_releases_the_stick_drives_no_more(daemon: Daemon, page: Page, way: Way, times: int) -> None:
+def test_a_client_that_releases_the_stick_drives_no_more(
+    daemon: Daemon, page: Page, way: Way, times: int
+) -> None:
     for _ in range(times):
         let_go(daemon, page, way)
 

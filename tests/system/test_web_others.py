@@ -86,7 +86,9 @@ async def test_a_page_without_a_connection_stops_another_robot_too(two: Two) -> 
     assert two.ours.state()["mode"] == "ready"
 
 
-async def test_a_stop_of_an_absent_robot_or_an_invalid_id_is_answered_with_an_error(two: Two) -> None:
+async def test_a_stop_of_an_absent_robot_or_an_invalid_id_is_answered_with_an_error(
+    two: Two,
+) -> None:
     async with hands(two.page) as ours:
         names = {"robot3": "no answer", "a/**": "not a robot's id"}
         for name, why in names.items():
@@ -96,7 +98,9 @@ async def test_a_stop_of_an_absent_robot_or_an_invalid_id_is_answered_with_an_er
             assert why in answer["text"]
 
 
-async def test_a_page_connected_to_a_daemon_says_why_it_shows_no_other_robots(two: Two, tmp_path: Path) -> None:
+async def test_a_page_connected_to_a_daemon_says_why_it_shows_no_other_robots(
+    two: Two, tmp_path: Path
+) -> None:
     with Page(two.daemon, tmp_path) as beside:
         async with hands(beside) as ours:
             await ours.say(subscribe="fleet")

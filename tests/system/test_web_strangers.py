@@ -324,7 +324,11 @@ def test_refusals_are_logged_once_a_second_by_reason_and_without_tokens(
                     assert answer.status in (401, 429)
 
     run(story)
-    until(lambda: counted("bad token") + counted("too fast") >= before + 5, 10.0, "all refusals are logged")
+    until(
+        lambda: counted("bad token") + counted("too fast") >= before + 5,
+        10.0,
+        "all refusals are logged",
+    )
     assert " from 127.0.0.1" in lines()[-1]["text"]
     assert len(lines()) - told <= time.monotonic() - begun + 1.0
     assert "guessed" not in page.stderr

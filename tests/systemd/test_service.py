@@ -118,7 +118,9 @@ print(answer.read().decode())
 
 
 @pytest.mark.nightly
-def test_the_page_runs_within_its_limits_and_its_end_does_not_end_the_daemon(bare: Container) -> None:
+def test_the_page_runs_within_its_limits_and_its_end_does_not_end_the_daemon(
+    bare: Container,
+) -> None:
     bare.write(CONFIGURATION, "")  # the simulator
     assert bare.run(ACSARD, "service", "install").code == 0
     until(lambda: '"mode"' in asks(bare, "/api/state"), 20.0, "the page answers the state")
@@ -209,7 +211,9 @@ def drawn(container: Container) -> dict[str, object]:
 
 
 @pytest.mark.nightly
-def test_the_service_s_page_lists_serves_and_draws_recordings_and_cannot_change_them(bare: Container) -> None:
+def test_the_service_s_page_lists_serves_and_draws_recordings_and_cannot_change_them(
+    bare: Container,
+) -> None:
     recording = recorded_before(bare)
     bare.write(CONFIGURATION, "")  # the simulator
     done = bare.run(ACSARD, "service", "install")
