@@ -174,7 +174,7 @@ IN_TYPESCRIPT = Elsewhere(
     CLIENTS, "test_the_typescript_example_follows_the_robot_through_the_bridge"
 )
 TYPED = Elsewhere(
-    CLIENTS, "test_types_made_by_datamodel_code_generator_compile_and_read_what_the_daemon_says"
+    CLIENTS, "test_types_made_by_datamodel_code_generator_compile_and_parse_the_daemon_s_messages"
 )
 
 _AWAY = "--tls tls --address https://0.0.0.0:8443"
@@ -283,7 +283,8 @@ COMMANDS: dict[str, How] = {
     ".venv/bin/python -m tests.mutation": Shown("takes long, for changes of the core"),
     ".venv/bin/python -m tests.mutation --safety": Shown("takes long, for the same"),
     ".venv/bin/python -m tests.pictures pictures": Elsewhere(
-        "tests/system/test_page.py", "test_every_view_is_drawn_on_a_phone_both_ways_and_a_desktop"
+        "tests/system/test_page.py",
+        "test_every_view_is_drawn_on_a_phone_in_both_orientations_and_on_a_desktop",
     ),
     "acsard bench": Elsewhere(
         "tests/system/test_bench.py",
@@ -312,7 +313,7 @@ COMMANDS: dict[str, How] = {
     "cd deploy/clients/typescript && npm install && npm run build && npm start": IN_TYPESCRIPT,
     "python deploy/clients/python/schemas.py schemas": TYPED,
     "npx quicktype --lang typescript --src-lang schema --src schemas/*.json -o acsard.ts": (
-        Elsewhere(CLIENTS, "test_types_made_by_quicktype_compile_and_read_what_the_daemon_says")
+        Elsewhere(CLIENTS, "test_types_made_by_quicktype_compile_and_parse_the_daemon_s_messages")
     ),
     "pip install datamodel-code-generator": TYPED,
     "datamodel-codegen --input schemas --input-file-type jsonschema "

@@ -422,7 +422,7 @@ def test_the_bridge_connects_as_a_client_to_the_daemon_s_endpoints() -> None:
     assert bridge_setting("plugins/ros2dds/domain") == RosConfig().domain
 
 
-def test_the_bridge_lets_exactly_our_topics_and_services_pass() -> None:
+def test_the_bridge_passes_exactly_the_topics_and_services_of_the_daemon() -> None:
     allow = bridge_setting("plugins/ros2dds/allow")
     services = {
         f"/{row.name}" for row in ros_names(RosConfig()) if row.direction in ("service", "query")

@@ -87,7 +87,7 @@ BAD = [
 
 
 def refused_without_motion(bus: Bus, *bad: Bad) -> None:
-    """Check that each counts under its reason and is told, and that nothing moves."""
+    """Check that each counts under its reason and is reported, and that nothing moves."""
     # The source may drive: if a bad command were accepted, the robot would move.
     heard = bus.count("commands")
     bus.put("cmd/app", ZERO)

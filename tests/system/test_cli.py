@@ -139,7 +139,7 @@ def test_topics_lists_every_key_with_its_meaning(shared: Daemon) -> None:
     assert any(row.startswith("acsard/acsar/srv/stop ") for row in rows)
 
 
-def test_topics_json_is_what_the_bus_answers(shared: Daemon, bus: Bus) -> None:
+def test_topics_json_prints_the_answer_of_the_topics_key(shared: Daemon, bus: Bus) -> None:
     ended = tool(shared, "topics", "--json")
     assert ended.code == 0
     assert json.loads(ended.out) == bus.get("topics")

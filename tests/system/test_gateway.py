@@ -71,7 +71,7 @@ def robot(tmp_path: Path, certificates: Certificates) -> Iterator[Open]:
 
 
 def gone(pid: int) -> bool:
-    """Return whether the process has ended, even if nobody has reaped it."""
+    """Return whether the process has ended, even if no process has reaped it."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
     except FileNotFoundError:

@@ -20,7 +20,7 @@ class Deaf:
         """Called for a stop."""
 
 
-def test_a_stop_query_counts_although_too_many_others_are_open_for_it_to_be_answered() -> None:
+def test_a_stop_query_counts_even_if_too_many_queries_are_open_to_answer_it() -> None:
     prefix, endpoint = "acsard/acsar/", free_endpoint()
     # The input is never started, so no query is answered, as with clients that read no reply.
     inbox = Inbox(prefix, Replies(prefix), (), Deaf())

@@ -519,7 +519,7 @@ def test_a_gamepad_drives_only_after_a_press_that_begins_while_it_is_connected(
     assert page.browser.js(PADS.replace("PADS", pads).replace("HELD", HELD)) == holds
 
 
-def test_an_idle_gamepad_that_is_lost_and_comes_back_held_between_two_looks_drives_nothing(
+def test_an_idle_gamepad_that_reconnects_with_a_held_button_drives_nothing(
     page: Phone,
 ) -> None:
     pads = "[[0, false]], [[0, true]]"
@@ -746,7 +746,7 @@ def drawing(browser: Browser) -> str:
 
 @pytest.mark.nightly
 @alone
-def test_the_map_is_nearer_and_farther_and_follows_the_robot_again(page: Phone) -> None:
+def test_the_map_zooms_in_and_out_and_can_follow_the_robot_again(page: Phone) -> None:
     """Each button changes the drawing, and the reverse button restores it."""
     browser = page.browser
     begun = drawing(browser)
@@ -1057,7 +1057,9 @@ def test_every_state_is_fit_for_a_screen_reader_and_the_map_keeps_its_buttons() 
 
 
 @pytest.mark.nightly
-def test_every_view_is_drawn_on_a_phone_both_ways_and_a_desktop(tmp_path: Path) -> None:
+def test_every_view_is_drawn_on_a_phone_in_both_orientations_and_on_a_desktop(
+    tmp_path: Path,
+) -> None:
     written = pictures.write(tmp_path / "screens", both=False)
     sizes = [struct.unpack(">II", path.read_bytes()[16:24]) for path in written]
     assert sizes == [one for one in (PHONE, SIDEWAYS, DESKTOP) for _ in VIEWS]

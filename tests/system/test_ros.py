@@ -288,7 +288,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_damaged_bytes_are_counted_and_reported_and_moves_nothing(
+def test_damaged_bytes_are_counted_and_reported_and_move_nothing(
     bus: Bus, zenoh_ros: ZenohClient, name: str
 ) -> None:
     bad = BAD[name]

@@ -74,7 +74,9 @@ def test_a_signal_while_driving_ramps_ends_with_stop_and_exits_0_within_1_s(
 
 
 @pytest.mark.slow
-def test_a_signal_at_rest_ends_with_stop_and_exits_0_at_once(tmp_path: Path, peer: Peer) -> None:
+def test_a_signal_at_rest_ends_with_stop_and_exits_0_without_delay(
+    tmp_path: Path, peer: Peer
+) -> None:
     with running(tmp_path, peer.path) as (daemon, _):
         sent = time.monotonic()
         daemon.signal(signal.SIGTERM)

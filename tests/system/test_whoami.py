@@ -88,7 +88,7 @@ def test_the_verb_whoami_prints_the_role_the_certificate_and_its_permissions(rob
 
 
 @pytest.mark.slow
-def test_a_certificate_in_no_list_is_reported_with_77(robot: Robot) -> None:
+def test_an_unlisted_certificate_is_reported_with_77(robot: Robot) -> None:
     ended = robot.tool("unlisted", "whoami")
     assert ended.code == 77
     assert SILENCE in ended.out
@@ -145,7 +145,7 @@ def test_a_wildcard_with_an_unlisted_certificate_suggests_whoami(
     ids=lambda words: words[0] if isinstance(words, tuple) else "",
 )
 @pytest.mark.nightly
-def test_a_wrong_id_is_asked_about_before_any_list(
+def test_the_error_suggests_a_wrong_id_before_an_unlisted_certificate(
     robot: Robot, words: tuple[str, ...], key: str
 ) -> None:
     ended = robot.tool("operator", *words, "--id", "robot1")
