@@ -89,7 +89,7 @@ def test_a_client_says_that_its_router_went_and_came_back(tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_a_daemon_reports_that_it_is_connected_to_another_daemon_instead_of_a_router(
+def test_two_directly_connected_daemons_report_it_and_a_wildcard_stop_reaches_one(
     tmp_path: Path,
 ) -> None:
     """Neither daemon forwards the other's messages.

@@ -537,7 +537,7 @@ TIMEOUT_S, TICKS_S = 0.25, 0.02
 @pytest.mark.variations(4)
 @SLOW
 @pytest.mark.parametrize("how", ["cut", "withdrawn", "killed", "left"])
-def test_the_robot_ramps_down_if_the_viewer_is_lost_while_it_drives(
+def test_the_robot_ramps_down_if_the_viewer_or_foxglove_ends_while_it_drives(
     shared: Daemon, bus: Bus, how: str
 ) -> None:
     with Shows(shared) as own, Viewer(own.port) as viewer, followed(bus) as (asked, applied):

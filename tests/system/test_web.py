@@ -232,7 +232,7 @@ async def test_no_other_page_can_frame_the_page_or_add_scripts_to_it(page: Page)
                 assert answer.headers["X-Content-Type-Options"] == "nosniff"
 
 
-async def test_recordings_are_listed_and_downloaded_unchanged(page: Page, daemon: Daemon) -> None:
+async def test_recordings_are_listed_and_downloaded_as_mcap(page: Page, daemon: Daemon) -> None:
     async with aiohttp.ClientSession(page.here) as session:
         name = await first_recording(session)
         async with session.get(f"/api/recordings/{name}") as answer:

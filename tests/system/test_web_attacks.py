@@ -480,7 +480,7 @@ def test_a_slow_or_silent_client_is_disconnected(table: Table, bus: Bus) -> None
                     assert drips.recv(4096) == b""
                     break
             else:
-                raise AssertionError("nobody cut it off")
+                raise AssertionError("the server did not cut it off")
         with suppress(ConnectionError):
             assert says_nothing.recv(4096) == b""
         answer = keeps.recv(4096)
