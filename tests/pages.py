@@ -132,31 +132,35 @@ NO_ROS = Shown("needs ROS 2; the page says what was tried with it")
 TWO_MACHINES = Shown("needs a second machine")
 PLACES = Elsewhere(
     "tests/systemd/test_fleet.py",
-    "test_a_router_runs_on_the_places_that_the_page_makes_as_a_user_of_its_own",
+    "test_a_router_runs_as_its_own_user_in_the_directories_that_the_page_creates",
 )
 PYTEST = Collected()
 FIRST = Elsewhere(HERE, "test_the_first_command_of_the_readme_installs_it_and_the_robot_is_up")
 DOWNLOADED = Shown("downloads 44 MB; typed by hand, the venv then runs acsard")
 VENV = Elsewhere(HERE, "test_the_service_s_venv_has_all_that_lan_and_service_need")
 AUTHORITY = Elsewhere(
-    HERE, "test_the_authority_of_the_fleet_page_is_made_by_what_its_first_line_installs"
+    HERE, "test_the_install_line_of_the_fleet_page_suffices_to_make_its_authority"
 )
 TEN = Elsewhere(HERE, "test_one_authority_and_one_file_serve_the_ten_robots_of_the_fleet_page")
 LAPTOP = Elsewhere(HERE, "test_the_laptop_of_the_fleet_page_does_what_its_role_may")
 MANY = Elsewhere(
     "tests/system/test_many.py",
-    "test_by_tls_a_wildcard_sees_nobody_and_is_told_why_and_names_do",
+    "test_over_tls_a_wildcard_finds_no_robot_and_says_why_and_named_robots_are_found",
     "robot2 is not there",
 )
 IN_ONE_VIEW = Elsewhere(
     "tests/system/test_many.py", "test_the_two_robots_of_the_fleet_page_are_in_one_view"
 )
 BROKEN = Elsewhere(HERE, "test_the_broken_board_of_the_firmware_page_is_found_broken")
-CABLE = Elsewhere(HERE, "test_the_first_page_pulls_a_cable_and_the_robot_waits_until_it_is_back")
-DRIVE = Elsewhere(
-    "tests/system/test_cli.py", "test_a_held_key_drives_and_letting_go_stops_by_itself"
+CABLE = Elsewhere(
+    HERE, "test_the_robot_of_the_first_page_waits_after_its_cable_is_pulled_until_it_is_back"
 )
-INSTALLED = Elsewhere(SERVICE, "test_installed_it_runs_and_uninstalled_nothing_is_left")
+DRIVE = Elsewhere(
+    "tests/system/test_cli.py", "test_a_held_key_drives_and_its_release_stops_the_robot"
+)
+INSTALLED = Elsewhere(
+    SERVICE, "test_the_service_runs_after_install_and_leaves_no_file_after_uninstall"
+)
 OPENED = Elsewhere(SERVICE, "test_after_lan_init_the_service_listens_on_the_network")
 LAUNCH = Elsewhere(
     "tests/test_deploy_ros2.py",
@@ -170,11 +174,11 @@ IN_TYPESCRIPT = Elsewhere(
     CLIENTS, "test_the_typescript_example_follows_the_robot_through_the_bridge"
 )
 TYPED = Elsewhere(
-    CLIENTS, "test_types_made_by_datamodel_code_generator_compile_and_read_what_the_daemon_says"
+    CLIENTS, "test_types_made_by_datamodel_code_generator_compile_and_parse_the_daemon_s_messages"
 )
 
 _AWAY = "--tls tls --address https://0.0.0.0:8443"
-INVITED = Elsewhere(WEB, "test_an_invitation_is_a_link_and_a_code_and_lets_in")
+INVITED = Elsewhere(WEB, "test_an_invitation_prints_a_link_and_a_qr_code_that_give_access")
 COOKIE = Elsewhere(WEB, "test_a_token_becomes_a_cookie_that_no_script_reads_and_ends_when_revoked")
 
 BY_THE_SERVICE = Elsewhere(
@@ -218,7 +222,7 @@ COMMANDS: dict[str, How] = {
     "export ACSARD_CONFIG=$PWD/robot.toml": Run(),
     "acsard mcu check --port DEVICE --write": Elsewhere(
         "tests/system/test_mcu.py",
-        "test_what_a_person_at_the_terminal_sees_becomes_the_wheel_map",
+        "test_the_operator_s_answers_become_the_wheel_map",
         "the port is the simulator",
     ),
     "acsard drive --linear 0.2 --angular 0.5": DRIVE._replace(but="at the default speeds"),
@@ -227,7 +231,9 @@ COMMANDS: dict[str, How] = {
     ".venv/bin/ruff check .": InCi(".venv/bin/ruff check ."),
     ".venv/bin/ruff format --check .": InCi(".venv/bin/ruff format --check ."),
     ".venv/bin/mypy": InCi(".venv/bin/mypy"),
-    ".venv/bin/lint-imports": Elsewhere("tests/test_shape.py", "test_the_law_of_imports_is_kept"),
+    ".venv/bin/lint-imports": Elsewhere(
+        "tests/test_shape.py", "test_the_import_contracts_are_kept"
+    ),
     ".venv/bin/pytest tests/unit tests/scenarios": PYTEST,
     ".venv/bin/pre-commit install": Elsewhere(
         "tests/test_pre_commit.py", "test_a_commit_of_code_or_of_the_contract_runs_every_check"
@@ -246,7 +252,7 @@ COMMANDS: dict[str, How] = {
     ".venv/bin/pytest -m soak -s": PYTEST,
     "bash .ci/run": Shown("it is what runs everything here"),
     ".venv/bin/python -m tests.screens": Elsewhere(
-        "tests/test_screens.py", "test_each_screen_fits_its_width_and_says_the_whole_reason"
+        "tests/test_screens.py", "test_each_screen_fits_its_width_and_shows_the_whole_reason"
     ),
     ".venv/bin/python -m tests.pythons python3.12 python3.13": Shown(
         "installs into venvs of other Pythons, for who has them"
@@ -277,11 +283,12 @@ COMMANDS: dict[str, How] = {
     ".venv/bin/python -m tests.mutation": Shown("takes long, for changes of the core"),
     ".venv/bin/python -m tests.mutation --safety": Shown("takes long, for the same"),
     ".venv/bin/python -m tests.pictures pictures": Elsewhere(
-        "tests/system/test_page.py", "test_every_view_is_drawn_on_a_phone_both_ways_and_a_desktop"
+        "tests/system/test_page.py",
+        "test_every_view_is_drawn_on_a_phone_in_both_orientations_and_on_a_desktop",
     ),
     "acsard bench": Elsewhere(
         "tests/system/test_bench.py",
-        "test_it_measures_the_simulator_and_moves_nothing_on_a_real_port",
+        "test_bench_measures_the_simulator_and_moves_nothing_on_a_real_port",
     ),
     # deploy/clients
     "python deploy/clients/python/follow.py": Elsewhere(
@@ -306,7 +313,7 @@ COMMANDS: dict[str, How] = {
     "cd deploy/clients/typescript && npm install && npm run build && npm start": IN_TYPESCRIPT,
     "python deploy/clients/python/schemas.py schemas": TYPED,
     "npx quicktype --lang typescript --src-lang schema --src schemas/*.json -o acsard.ts": (
-        Elsewhere(CLIENTS, "test_types_made_by_quicktype_compile_and_read_what_the_daemon_says")
+        Elsewhere(CLIENTS, "test_types_made_by_quicktype_compile_and_parse_the_daemon_s_messages")
     ),
     "pip install datamodel-code-generator": TYPED,
     "datamodel-codegen --input schemas --input-file-type jsonschema "
@@ -314,15 +321,18 @@ COMMANDS: dict[str, How] = {
     # deploy/foxglove
     ".venv/bin/pip install '.[foxglove]'": Shown("an install with extras is made by other tests"),
     ".venv/bin/acsard foxglove --drive": Elsewhere(
-        FOXGLOVE, "test_a_held_button_drives_and_letting_go_stops"
+        FOXGLOVE, "test_a_held_button_drives_and_its_release_stops_the_robot"
     ),
     "ssh -N -L 8765:127.0.0.1:8765 USER@ROBOT": TWO_MACHINES,
     "acsard foxglove --drive --connect tls/robot.local:7449 --tls clients/viewer": Elsewhere(
-        "tests/system/test_whoami.py", "test_a_viewer_s_foxglove_is_told_what_he_may"
+        "tests/system/test_whoami.py",
+        "test_foxglove_with_a_viewer_s_certificate_shows_its_permissions",
     ),
     # deploy/firmware
     "sudo apt install make gcc-avr avr-libc binutils-avr avrdude": InCi("gcc-avr"),
-    "make": Elsewhere("tests/firmware/test_board.py", "test_it_boots_stopped_and_says_who_it_is"),
+    "make": Elsewhere(
+        "tests/firmware/test_board.py", "test_the_board_boots_stopped_and_sends_its_identity"
+    ),
     "make flash PORT=/dev/ttyACM0": Elsewhere(
         HERE,
         "test_the_flash_of_the_firmware_page_calls_avrdude_with_its_port",
@@ -338,7 +348,7 @@ COMMANDS: dict[str, How] = {
     "acsard mcu check --port ./mcu --yes": BROKEN,
     "acsard echo sim/pose -n 1": Run('"frame_id":"sim"'),
     "acsard echo wheel_states imu --csv > drive.csv": Elsewhere(
-        SIMULATED, "test_a_drive_is_recorded_as_calibrate_reads_it"
+        SIMULATED, "test_calibrate_reads_a_drive_that_echo_recorded_as_csv"
     ),
     "acsard accuracy": Run("based on|stands still"),
     "acsard calibrate": Elsewhere(
@@ -375,7 +385,7 @@ COMMANDS: dict[str, How] = {
     "acsard web --tls tls --address https://0.0.0.0:8443": INVITED,
     "acsard web --connect tcp/127.0.0.1:7447 --id robot1": Elsewhere(
         "tests/system/test_web_others.py",
-        "test_another_robot_is_followed_and_stopped_and_only_that",
+        "test_another_robot_can_be_followed_and_stopped_and_nothing_else",
         "by a router on loopback",
     ),
     "acsard web --tokens": COOKIE,
@@ -411,7 +421,7 @@ COMMANDS: dict[str, How] = {
     ),
     "python3 deploy/ros2/drive.py 0.2 0.0 3": Elsewhere(
         "tests/system/test_ros_drive.py",
-        "test_the_line_of_the_pages_drives",
+        "test_the_command_line_of_the_pages_drives_the_robot",
         "by stand-ins for rclpy and the messages",
     ),
     f"{_RMW_ROUTER} ros2 run rmw_zenoh_cpp rmw_zenohd": NO_ROS,
@@ -453,14 +463,14 @@ COMMANDS: dict[str, How] = {
     "sudo systemctl restart acsard": OPENED,
     "sudo /opt/acsard/venv/bin/acsard doctor --config /etc/acsard/acsard.toml": Elsewhere(
         "tests/system/test_doctor.py",
-        "test_for_people_each_finding_is_a_line_and_its_mend_another",
+        "test_the_text_output_has_a_line_for_each_finding_and_one_for_its_remedy",
     ),
     'sudo sh -c "/opt/acsard/venv/bin/pip install -r deploy/systemd/requirements.lock && '
     "/opt/acsard/venv/bin/pip install --no-deps --no-build-isolation . && "
     "/opt/acsard/venv/bin/acsard service install "
     '--force && systemctl restart acsard"': Elsewhere(
         SERVICE,
-        "test_nothing_of_somebody_else_is_overwritten_or_removed_without_force",
+        "test_a_foreign_file_is_not_overwritten_or_removed_without_force",
         "pip is not called again",
     ),
     "sudo /opt/acsard/venv/bin/acsard recording": Elsewhere(
@@ -486,7 +496,7 @@ COMMANDS: dict[str, How] = {
     ),
     "systemctl status acsard": INSTALLED._replace(but="the status line is asked for alone"),
     "journalctl -u acsard ACSARD_EVENT=link_down": Elsewhere(
-        UNIT, "test_the_journal_can_be_asked_for_an_event", "the event is chosen by the test"
+        UNIT, "test_journal_entries_have_the_event_fields", "the event is chosen by the test"
     ),
     "/opt/acsard/venv/bin/acsard service status": INSTALLED,
     "sudo /opt/acsard/venv/bin/acsard tls init --write /etc/acsard/acsard.toml": OPENED,
@@ -512,11 +522,13 @@ COMMANDS: dict[str, How] = {
     "sudo install -o zenohd -m 0400 ca.pem certificate.pem key.pem /etc/zenohd/tls/": PLACES,
     "sudo install -m 0644 router.json5 /etc/zenohd/": PLACES,
     "acsard router /etc/zenohd/router.json5": Elsewhere(
-        ROUTER, "test_it_goes_whole", "with the file's addresses and certificates changed"
+        ROUTER,
+        "test_a_signal_ends_the_router_and_its_child_process",
+        "with the file's addresses and certificates changed",
     ),
     "zenohd -c /etc/zenohd/router.json5": Elsewhere(
         FLEET,
-        "test_each_may_do_what_the_table_says_and_nothing_else",
+        "test_each_certificate_may_do_exactly_what_the_access_table_allows",
         "by Zenoh's own router mode in the place of the program",
     ),
     "acsard check": Run("effective configuration"),

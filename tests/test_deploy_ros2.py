@@ -91,14 +91,14 @@ def published_names(direction: str) -> set[str]:
 # acsar.urdf
 
 
-def test_the_joints_that_turn_are_the_wheels() -> None:
+def test_the_continuous_joints_are_the_wheels() -> None:
     turning = [j.get("name") for j in urdf().findall("joint") if j.get("type") != "fixed"]
     assert sorted(turning, key=str) == sorted(CONFIG.joints.as_tuple())
     assert {joint(name).get("type") for name in CONFIG.joints.as_tuple()} == {"continuous"}
 
 
 @each("name", CONFIG.joints.as_tuple())
-def test_a_wheel_stands_on_the_floor_where_the_separation_puts_it(name: str) -> None:
+def test_each_wheel_touches_the_floor_at_half_the_wheel_separation(name: str) -> None:
     radius, half = CONFIG.drive.wheel_radius, CONFIG.drive.wheel_separation / 2
     assert one(joint(name), "parent").get("link") == CONFIG.odometry.base_frame
     x, y, z = numbers(one(joint(name), "origin").get("xyz"))
@@ -118,7 +118,7 @@ def test_every_wheel_has_the_radius_and_lies_on_its_side() -> None:
             assert turn == pytest.approx([math.pi / 2, 0, 0])
 
 
-def test_frames_are_acsards() -> None:
+def test_lidar_and_footprint_frames_agree_with_the_configuration() -> None:
     lidar, footprint = CONFIG.lidar, CONFIG.footprint
     for link, xyz, rpy in (
         (
@@ -134,7 +134,7 @@ def test_frames_are_acsards() -> None:
         assert numbers(one(found, "origin").get("rpy")) == rpy
 
 
-def test_the_base_has_no_parent_and_everything_else_one() -> None:
+def test_only_the_base_frame_has_no_parent() -> None:
     links = {link.get("name") for link in urdf().findall("link")}
     children = [one(j, "child").get("link") for j in urdf().findall("joint")]
     parents = {one(j, "parent").get("link") for j in urdf().findall("joint")}
@@ -143,7 +143,7 @@ def test_the_base_has_no_parent_and_everything_else_one() -> None:
     assert parents <= links
 
 
-def test_inertias_are_those_of_bodies() -> None:
+def test_inertias_are_physically_possible() -> None:
     inertias = urdf().findall("link/inertial/inertia")
     assert len(inertias) == 6
     assert urdf().find(f"link[@name='{CONFIG.odometry.base_frame}']/inertial") is None
@@ -172,7 +172,7 @@ def test_ros2_control_has_what_the_topic_hardware_needs() -> None:
 # controllers.yaml
 
 
-def test_the_controller_is_the_robot() -> None:
+def test_the_controller_has_the_dimensions_and_limits_of_the_robot() -> None:
     found = ros_parameters("controllers.yaml", "/**/diff_drive_controller")
     joints, drive, limits = CONFIG.joints, CONFIG.drive, CONFIG.limits
     wanted = {
@@ -382,7 +382,7 @@ def test_the_launch_file_puts_the_namespace_before_every_topic(
 
 
 @SPACES
-def test_the_hardware_of_ros2_control_hears_and_commands_the_robot(
+def test_ros2_control_uses_the_robot_s_joint_topics_in_the_right_direction(
     namespace: str, prefix: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The controller runs inside the process of ros2_control_node, which has its own remappings."""
@@ -412,7 +412,7 @@ def test_rviz_shows_the_robot_in_odom() -> None:
 # zenoh-bridge-ros2dds.json5
 
 
-def test_the_bridge_is_a_client_of_the_daemon_where_it_listens() -> None:
+def test_the_bridge_connects_as_a_client_to_the_daemon_s_endpoints() -> None:
     text = (FILES / "zenoh-bridge-ros2dds.json5").read_text()
     zenoh.Config.from_json5(text)
     assert bridge_setting("mode") == "client"
@@ -422,7 +422,7 @@ def test_the_bridge_is_a_client_of_the_daemon_where_it_listens() -> None:
     assert bridge_setting("plugins/ros2dds/domain") == RosConfig().domain
 
 
-def test_the_bridge_lets_exactly_our_topics_and_services_pass() -> None:
+def test_the_bridge_passes_exactly_the_topics_and_services_of_the_daemon() -> None:
     allow = bridge_setting("plugins/ros2dds/allow")
     services = {
         f"/{row.name}" for row in ros_names(RosConfig()) if row.direction in ("service", "query")
@@ -487,7 +487,7 @@ def test_each_row_of_diagnostics_falls_into_exactly_one_group_of_the_aggregator(
             assert any(name.startswith(start) for name in names), start
 
 
-def test_the_aggregator_calls_no_row_stale_that_comes_at_its_rate() -> None:
+def test_a_diagnostics_row_at_its_normal_rate_is_not_stale_for_the_aggregator() -> None:
     for analyzer in groups().values():
         assert analyzer["type"] == "diagnostic_aggregator/GenericAnalyzer"
         assert analyzer["timeout"] > 2 / CONFIG.rates.diagnostics

@@ -22,7 +22,7 @@ def test_all_combinations_are_run_and_fixtures_are_left_to_pytest() -> None:
     assert seen == [(1, "a", 3), (1, "b", 4), (2, "a", 3), (2, "b", 4)]
 
 
-def test_what_fails_says_with_which_set() -> None:
+def test_a_failure_names_its_parameter_set() -> None:
     @each("value", range(5))
     def test(value: int) -> None:
         assert value < 3
@@ -32,7 +32,7 @@ def test_what_fails_says_with_which_set() -> None:
     assert caught.value.__notes__ == ["with {'value': 3}"]
 
 
-def test_no_sets_at_all_fail() -> None:
+def test_an_empty_list_of_parameter_sets_fails() -> None:
     @each("value", [])
     def test(value: int) -> None:
         """Fail if it is ever run."""

@@ -35,13 +35,13 @@ def named() -> set[str]:
 
 
 @pytest.mark.slow
-def test_each_name_in_the_code_is_in_the_set() -> None:
+def test_each_event_name_in_the_code_is_in_the_set() -> None:
     found = named()
     assert len(found) > 15
     assert found <= set(NAMES)
 
 
-def test_each_name_of_the_set_is_in_the_code() -> None:
+def test_each_event_name_of_the_set_is_in_the_code() -> None:
     code = "".join(
         path.read_text(encoding="utf-8")
         for path in (ROOT / "acsard").rglob("*.py")
@@ -51,7 +51,7 @@ def test_each_name_of_the_set_is_in_the_code() -> None:
     assert not {name for name in plain if f'"{name}"' not in code}
 
 
-def test_the_page_lists_the_set_and_nothing_else() -> None:
+def test_the_page_lists_exactly_the_event_names_of_the_set() -> None:
     page = (ROOT / "deploy/systemd/README.md").read_text(encoding="utf-8")
     table = page.partition("| meaning | event |")[2].partition("\n\n")[0]
     cells = [row.split("|")[2] for row in table.splitlines()[2:]]

@@ -49,7 +49,7 @@ def at(block: Block) -> str:
     return block.where
 
 
-def test_there_is_a_page_beside_each_thing_it_describes() -> None:
+def test_each_part_has_a_page_in_its_own_directory() -> None:
     parts = ("calibration", "clients", "firmware", "foxglove", "ros2", "systemd", "web", "zenoh")
     beside = {f"deploy/{part}/README.md" for part in parts}
     assert set(PAGES) == {
@@ -64,12 +64,12 @@ def test_there_is_a_page_beside_each_thing_it_describes() -> None:
 # commands
 
 
-def test_something_runs_every_command_on_every_page() -> None:
+def test_every_command_on_every_page_is_run_by_a_test() -> None:
     unknown = [f"{block.where}: {text}" for block, text in ON_PAGES if text not in COMMANDS]
     assert not unknown, "say in tests/pages.py what runs these:\n" + "\n".join(unknown)
 
 
-def test_every_command_that_something_runs_is_on_a_page() -> None:
+def test_every_command_of_the_list_is_on_a_page() -> None:
     assert set(COMMANDS) == {command for _, command in ON_PAGES}
 
 
@@ -81,11 +81,11 @@ def named_tests(file: str) -> set[str]:
 
 
 @each("how", sorted({how for how in COMMANDS.values() if isinstance(how, Elsewhere)}))
-def test_what_is_said_to_run_a_command_is_a_test(how: Elsewhere) -> None:
+def test_the_test_named_for_a_command_exists(how: Elsewhere) -> None:
     assert how.test in named_tests(how.file)
 
 
-def test_ci_has_what_it_is_said_to_run() -> None:
+def test_ci_runs_the_commands_that_the_list_assigns_to_it() -> None:
     told = (ROOT / ".ci/run").read_text(encoding="utf-8")
     words = {how.words for how in COMMANDS.values() if isinstance(how, InCi)}
     assert words
@@ -138,7 +138,7 @@ def inline() -> Iterator[tuple[str, list[str]]]:
 
 
 @each(("page", "words"), list(inline()))
-def test_a_verb_in_the_text_has_the_options_it_is_said_to_have(
+def test_a_verb_in_the_text_has_the_options_named_with_it(
     page: str, words: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = [PLACEHOLDERS.get(word, word) for word in words if word not in ("…", "...")]
@@ -171,7 +171,7 @@ def test_an_extra_is_installed_from_a_clone_since_no_index_has_acsard() -> None:
 
 
 @each("arguments", promises())
-def test_what_proves_a_promise_is_there(arguments: list[str]) -> None:
+def test_the_tests_that_prove_a_promise_exist(arguments: list[str]) -> None:
     files: list[Path] = []
     for path in (ROOT / word for word in arguments if word.startswith("tests/")):
         assert path.exists(), path
@@ -202,7 +202,7 @@ def test_settings_for_zenoh_are_accepted(block: Block) -> None:
     zenoh.Config.from_json5(block.text)
 
 
-def test_python_is_on_the_page_whose_examples_are_run() -> None:
+def test_every_python_block_is_on_a_page_whose_examples_are_run() -> None:
     """`test_client.py` and `test_web.py` in `tests/system/` and `tests/unit/cli/test_calibrate.py`
     run these blocks.
     """
@@ -212,7 +212,7 @@ def test_python_is_on_the_page_whose_examples_are_run() -> None:
 
 
 @each("language", ["html", "js"])
-def test_javascript_is_on_the_page_whose_examples_are_run(language: str) -> None:
+def test_every_javascript_block_is_on_a_page_whose_examples_are_run(language: str) -> None:
     """`tests/system/test_web_dashboard.py` runs these blocks."""
     assert {block.page for block in blocks(language)} == {"deploy/web/README.md"}
 
@@ -318,7 +318,7 @@ READS_BAGS = {"calibration/ros_bag_log.py", "deploy/calibration/README.md"}
         ("firmware dialect", "trailing_comma", "core/link/codec.py", set()),
     ],
 )
-def test_a_recipe_names_every_file_that_knows_one_like_it(
+def test_a_recipe_names_every_file_that_must_change(
     part: str, pattern: str, some: str, beyond: set[str]
 ) -> None:
     """Check a recipe's list of files. `beyond` are files that use this one alone."""
@@ -327,7 +327,7 @@ def test_a_recipe_names_every_file_that_knows_one_like_it(
     assert knowing - beyond <= recipe(f"## Add a {part}", "\n## ")
 
 
-def test_the_recipe_for_a_transport_names_every_file_that_knows_one_by_name() -> None:
+def test_the_recipe_for_a_transport_names_every_file_that_names_a_transport() -> None:
     knowing = files_with('"(rmw|bridge)"', "acsard")
     assert {"core/ros/transports.py", "daemon/bus/bus.py"} <= knowing
     assert knowing <= recipe("A third transport", "##")

@@ -28,5 +28,5 @@ def test_every_extra_is_named_on_a_page() -> None:
         assert re.search(rf"`{extra}`|\[(\w+,)*{extra}(,\w+)*\]", pages), extra
 
 
-def test_no_placeholder_waits_for_its_text() -> None:
+def test_the_readme_has_no_placeholder() -> None:
     assert re.findall(r"^[ \t]*([A-Z][A-Z_]{2,})[ \t]*$", README.read_text(), re.M) == []

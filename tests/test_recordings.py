@@ -22,14 +22,14 @@ RECORDINGS = sorted((Path(__file__).parent / "recordings").glob("*.mcap"))
 MOST_BYTES = 100_000
 
 
-def test_there_are_some_and_each_is_small() -> None:
+def test_there_are_at_least_three_recordings_and_each_is_small() -> None:
     assert len(RECORDINGS) >= 3
     sizes = {path.name: path.stat().st_size for path in RECORDINGS}
     assert {name: size for name, size in sizes.items() if size > MOST_BYTES} == {}
 
 
 @each("path", RECORDINGS)
-def test_it_comes_out_as_it_did(path: Path) -> None:
+def test_a_recording_replays_with_the_same_result(path: Path) -> None:
     recording = Recording(path)
     result = replay_file(recording)
     comparison = result.comparison

@@ -32,7 +32,7 @@ def printed() -> dict[tuple[str, int], list[str]]:
 
 @pytest.mark.slow
 @pytest.mark.nightly
-def test_each_screen_fits_its_width_and_says_the_whole_reason() -> None:
+def test_each_screen_fits_its_width_and_shows_the_whole_reason() -> None:
     screens = printed()
     verbs = {verb for verb, _ in screens}
     assert verbs == {"drive", "top", "fleet", LINE_BY_LINE}

@@ -62,7 +62,7 @@ def contracts(cwd: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_the_law_of_imports_is_kept() -> None:
+def test_the_import_contracts_are_kept() -> None:
     done = contracts(ROOT)
     assert done.returncode == 0, done.stdout + done.stderr
 
@@ -78,9 +78,7 @@ def test_the_law_of_imports_is_kept() -> None:
         "def f():\n    import random",
     ],
 )
-def test_an_impure_import_in_the_core_is_seen_however_it_is_written(
-    tmp_path: Path, line: str
-) -> None:
+def test_every_notation_of_an_impure_import_in_the_core_is_found(tmp_path: Path, line: str) -> None:
     for module in MODULES:
         copy = tmp_path / "acsard" / module
         copy.parent.mkdir(parents=True, exist_ok=True)
@@ -138,5 +136,5 @@ def test_the_daemon_does_not_load_numpy() -> None:
 
 
 @each("name", LOUD)
-def test_a_module_that_runs_one_after_the_other_is_a_live_one(name: str) -> None:
+def test_a_module_that_runs_serially_is_in_a_live_directory(name: str) -> None:
     assert [place for place in LIVE if (ROOT / "tests" / place / name).is_file()]

@@ -8,7 +8,7 @@ from tests.tables import FILES, ROOT
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_file_has_what_the_table_of_keys_and_roles_gives(name: str) -> None:
+def test_each_file_agrees_with_the_table_of_keys_and_roles(name: str) -> None:
     """`python -m tests.tables` writes the files again."""
     text = (ROOT / name).read_text()
     assert FILES[name](text) == text

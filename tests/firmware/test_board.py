@@ -91,14 +91,16 @@ def difference(before: int, after: int) -> int:
 # the contract
 
 
-def test_it_boots_stopped_and_says_who_it_is(board: Board, host: Host) -> None:
+def test_the_board_boots_stopped_and_sends_its_identity(board: Board, host: Host) -> None:
     stays_off(board, 400)
     board.command("reset")
     assert host.says(b"acsard") == BY_PIN
     assert stays_off(board, 400).on_ns == 0, "since power on"
 
 
-def test_it_says_who_it_is_when_asked_and_stops_all_the_same(board: Board, host: Host) -> None:
+def test_the_board_answers_its_identity_and_still_stops_after_its_watchdog_time(
+    board: Board, host: Host
+) -> None:
     host.drive(DRIVE, 0.3)
     fed = board.status().heard_ns
     asked = 0
@@ -126,7 +128,7 @@ def test_the_motors_stop_300_ms_after_the_last_line(board: Board, host: Host) ->
     stays_off(board, 500)
 
 
-def test_what_wound_up_before_the_stop_does_not_come_back_with_the_next_line(
+def test_an_integral_wound_up_before_a_stop_does_not_drive_after_it(
     board: Board, host: Host
 ) -> None:
     for motor in "abcd":
@@ -138,7 +140,9 @@ def test_what_wound_up_before_the_stop_does_not_come_back_with_the_next_line(
     assert board.status().on_ns == status.on_ns, "not for a moment"
 
 
-def test_a_reset_while_driving_stops_it_until_a_new_valid_line(board: Board, host: Host) -> None:
+def test_a_reset_while_driving_stops_the_board_until_a_stop_and_a_valid_line(
+    board: Board, host: Host
+) -> None:
     host.drive(DRIVE, 0.3)
     assert board.status().running
     board.command("reset")
@@ -156,7 +160,7 @@ def test_a_reset_while_driving_stops_it_until_a_new_valid_line(board: Board, hos
 @pytest.mark.parametrize(
     ("how", "what"), [("l", "the main loop"), ("i", "all, interrupts off"), ("c", "the clock")]
 )
-def test_the_hardware_watchdog_resets_it_when_something_hangs(
+def test_the_hardware_watchdog_resets_the_board_when_its_program_hangs(
     runner: Path, hanging_firmware: Path, how: str, what: str
 ) -> None:
     with Board(runner, hanging_firmware) as board, Host(board.path) as host:
@@ -187,17 +191,21 @@ BAD_LINES = [
 ]  # fmt: skip
 
 
-def test_garbage_applies_nothing_and_is_not_answered(board: Board, host: Host) -> None:
+def test_garbage_changes_no_speed_and_is_not_answered(board: Board, host: Host) -> None:
     for line in BAD_LINES:
         host.send(line)
     last = checked(speeds_line(DRIVE), 1)
     host.send(last[:-1] + (b"0" if last[-1:] != b"0" else b"1"))
-    until(lambda: board.status().to_board.last.startswith("ap10.00,bn05.00"), 3.0, "all heard")
+    until(
+        lambda: board.status().to_board.last.startswith("ap10.00,bn05.00"),
+        3.0,
+        "all lines received",
+    )
     assert stays_off(board, 100).on_ns == 0
     assert host.lines() == []
 
 
-def test_garbage_does_not_keep_it_going(board: Board, host: Host) -> None:
+def test_garbage_does_not_feed_the_watchdog(board: Board, host: Host) -> None:
     host.drive(DRIVE, 0.3)
     fed = board.status().heard_ns
     while (status := board.status()).running:
@@ -207,7 +215,7 @@ def test_garbage_does_not_keep_it_going(board: Board, host: Host) -> None:
     assert 250 <= (status.off_ns - fed) / MS <= 350
 
 
-def test_after_a_boot_nothing_counts_but_a_stop_until_one_came(board: Board, host: Host) -> None:
+def test_after_a_boot_the_board_refuses_every_line_until_a_stop(board: Board, host: Host) -> None:
     """A host that has not noticed the reset still sends speeds.
 
     The board answers with its identity.
@@ -230,7 +238,7 @@ def test_after_a_boot_nothing_counts_but_a_stop_until_one_came(board: Board, hos
     assert board.status().running
 
 
-def test_it_counts_lines_refusals_and_stops_for_silence(board: Board, host: Host) -> None:
+def test_the_board_counts_lines_refusals_and_watchdog_stops(board: Board, host: Host) -> None:
     assert host.identity() == (3200, 300, 1, 1, 0, 0, 0, 0, "power")
     for line in BAD_LINES[1:]:
         host.send(line)
@@ -292,7 +300,7 @@ def test_at_low_speed_the_report_is_quieter_than_counting_edges(board: Board, ho
         assert noise < counted / 4
 
 
-def test_a_step_has_no_overshoot_to_speak_of(runner: Path, firmware: Path) -> None:
+def test_a_step_has_at_most_5_percent_overshoot(runner: Path, firmware: Path) -> None:
     with Board(runner, firmware) as board, Host(board.path) as host:
         replies = host.drive((20.0, -20.0, 10.0, -10.0), 0.6)
         most = max(reply.speeds[0] for reply in replies)
@@ -311,7 +319,9 @@ def test_a_bridge_changes_direction_only_at_zero_duty(board: Board, host: Host) 
     assert all(motor.flip_duty == 0.0 for motor in motors)
 
 
-def test_a_cut_takes_the_voltage_before_the_direction(board: Board, host: Host) -> None:
+def test_a_cut_removes_the_voltage_before_it_changes_the_direction(
+    board: Board, host: Host
+) -> None:
     """For a driver with one direction input, low means reverse."""
     for _ in range(3):
         host.drive((30.0, -30.0, 20.0, -40.0), 0.25)
@@ -323,7 +333,7 @@ def test_a_cut_takes_the_voltage_before_the_direction(board: Board, host: Host) 
     assert [motor.flip_duty for motor in board.status().motors] == [0.0] * 4
 
 
-def test_a_wheel_that_stands_by_command_gets_no_current(board: Board, host: Host) -> None:
+def test_a_wheel_commanded_to_rest_gets_no_voltage(board: Board, host: Host) -> None:
     host.drive(DRIVE, 0.3)
     host.drive(STOPPED, 0.8)
     status = board.status()
@@ -344,7 +354,7 @@ def test_each_line_is_answered_once_with_its_sequence(board: Board, host: Host) 
     assert wire.bytes - len(POWERED_ON) - 4 == 86 * 41 + 85 * 62 + 85 * 41, "and nothing else"
 
 
-def test_a_plain_line_is_answered_plain(board: Board, host: Host) -> None:
+def test_a_plain_line_gets_a_plain_answer(board: Board, host: Host) -> None:
     host.ask(checked(ZERO, 1, "S"))
     reply = host.ask(ZERO)
     assert (reply.line, reply.sequence) == (ZERO, None)
@@ -360,7 +370,9 @@ DIALECTS = [
 
 @pytest.mark.parametrize("line", DIALECTS)
 @pytest.mark.parametrize("end", [b"\r\n", b"\n"])
-def test_every_dialect_of_a_line_drives(board: Board, host: Host, line: bytes, end: bytes) -> None:
+def test_every_accepted_form_of_a_line_drives(
+    board: Board, host: Host, line: bytes, end: bytes
+) -> None:
     def there() -> bool:
         host.send(line, end)
         host.lines(0.01)
@@ -403,7 +415,7 @@ def test_the_counts_are_the_true_counts(board: Board, host: Host) -> None:
     assert reply.counts == wrapped([motor.since_reset for motor in board.status().motors])
 
 
-def test_counts_and_time_give_the_speed_without_the_jitter_of_the_line(
+def test_counts_and_milliseconds_give_the_speed_without_the_line_s_jitter(
     board: Board, host: Host
 ) -> None:
     replies = reached(board, host, DRIVE)
@@ -425,7 +437,7 @@ def test_counts_and_time_give_the_speed_without_the_jitter_of_the_line(
     assert all(turn == pytest.approx(-30.0, abs=0.8) for turn in turns)
 
 
-def test_the_milliseconds_are_the_board_s(board: Board, host: Host) -> None:
+def test_the_milliseconds_of_a_reply_are_the_board_s_clock(board: Board, host: Host) -> None:
     first, began = host.ask(checked(ZERO, 1, "S")), board.status()
     until(lambda: board.status().virtual_ns > began.virtual_ns + 1000 * MS, 10.0, "a second")
     second, ended = host.ask(checked(ZERO, 2, "S")), board.status()
@@ -500,7 +512,9 @@ def test_a_host_that_never_pauses_is_answered_and_controlled(board: Board, host:
 
 @pytest.mark.parametrize("speed", [20.0, 40.0, 60.0])
 @pytest.mark.nightly
-def test_it_keeps_up_with_fast_wheels(runner: Path, firmware: Path, speed: float) -> None:
+def test_the_board_counts_every_edge_of_fast_wheels(
+    runner: Path, firmware: Path, speed: float
+) -> None:
     with Board(runner, firmware, "--free-speed", "70,70,70,70") as board, Host(board.path) as host:
         host.drive((speed, -speed, speed, -speed), 1.0)
         before = board.status()
@@ -518,14 +532,16 @@ def test_it_keeps_up_with_fast_wheels(runner: Path, firmware: Path, speed: float
         assert reply.counts == wrapped([motor.since_reset for motor in board.status().motors])
 
 
-def test_an_overflow_costs_its_lines_and_spares_the_next(
+def test_an_overflow_of_the_receive_buffer_does_not_damage_the_next_line(
     runner: Path, hanging_firmware: Path
 ) -> None:
     """The main loop pauses for 60 ms, in which twice as many bytes come as the buffer holds."""
     with Board(runner, hanging_firmware) as board, Host(board.path) as host:
         lines = b"".join(checked(ZERO, i) + b"\r\n" for i in range(12))
         host.write(b"!p\r\n" + lines)
-        until(lambda: board.status().to_board.bytes == 4 + len(lines), 5.0, "all is heard")
+        until(
+            lambda: board.status().to_board.bytes == 4 + len(lines), 5.0, "all bytes are received"
+        )
         host.says(b"#00")
         host.send(checked(ZERO, 99))
         host.says(b"#63")
@@ -535,7 +551,7 @@ def test_an_overflow_costs_its_lines_and_spares_the_next(
         assert 0 < answered < 12
 
 
-def test_a_port_that_vanishes_stops_it_and_a_new_one_works(board: Board, host: Host) -> None:
+def test_a_port_that_vanishes_stops_the_board_and_a_new_one_works(board: Board, host: Host) -> None:
     host.drive(DRIVE, 0.3)
     # The board hears the whole last line. Otherwise it might hear a part of it and then nothing.
     passes(board, 30)
@@ -547,7 +563,7 @@ def test_a_port_that_vanishes_stops_it_and_a_new_one_works(board: Board, host: H
         assert board.status().running
 
 
-def test_opening_the_port_resets_a_board_that_is_wired_so(board: Board, host: Host) -> None:
+def test_opening_the_port_resets_a_board_with_auto_reset(board: Board, host: Host) -> None:
     until(lambda: board.status().open, 3.0, "it is seen that the port is open")
     board.command("auto_reset 300")
     with Host(board.path) as another:  # it is open already, so nothing happens
@@ -562,7 +578,7 @@ def test_opening_the_port_resets_a_board_that_is_wired_so(board: Board, host: Ho
         stays_off(board, 100)
 
 
-def test_the_bench_sees_a_speed_that_was_not_asked_for(board: Board, host: Host) -> None:
+def test_the_bench_detects_a_speed_that_was_not_commanded(board: Board, host: Host) -> None:
     """A plain line accepts a digit with a wrong bit as another digit."""
     host.stop()
     board.command("noise to 37")
@@ -629,7 +645,7 @@ def stays_cut(board: Board, host: Host) -> None:
     assert board.status().running, "silence has freed them"
 
 
-def test_a_wheel_with_its_encoder_backwards_is_cut_though_it_shall_stand(
+def test_a_wheel_with_its_encoder_backwards_is_cut_when_it_is_commanded_to_rest(
     board: Board, host: Host
 ) -> None:
     board.command("encoder b swapped")
@@ -744,7 +760,7 @@ def test_at_the_lowest_pwm_frequency_the_duty_rises_to_the_top(
 
 @pytest.mark.parametrize("baud_rate", [9600, 57600])
 @pytest.mark.nightly
-def test_it_speaks_at_other_baud_rates(runner: Path, tmp_path: Path, baud_rate: int) -> None:
+def test_the_board_works_at_other_baud_rates(runner: Path, tmp_path: Path, baud_rate: int) -> None:
     slow = build_firmware(tmp_path, f"-DBAUD_RATE={baud_rate}UL")
     with Board(runner, slow, "--baud", str(baud_rate)) as board, Host(board.path) as host:
         began = board.status().virtual_ns
@@ -757,7 +773,7 @@ def test_it_speaks_at_other_baud_rates(runner: Path, tmp_path: Path, baud_rate: 
         assert replies[-1].speeds == pytest.approx(DRIVE, rel=0.02)
 
 
-def test_with_require_check_a_plain_line_but_a_stop_is_refused_after_a_checked_one(
+def test_with_require_check_plain_lines_except_stops_are_refused_after_a_checked_line(
     runner: Path, tmp_path: Path
 ) -> None:
     strict = build_firmware(tmp_path, "-DREQUIRE_CHECK=1")

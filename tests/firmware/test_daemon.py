@@ -232,7 +232,7 @@ def errors(odom: Following, wheels: Following, true: Status) -> Errors:
 @pytest.mark.parametrize("mcu", [PLAIN, COUNTS], ids=["plain", "counts"])
 @pytest.mark.parametrize("length_s", [8, pytest.param(60, marks=soak)])
 @pytest.mark.timeout(180)
-def test_every_line_is_executed_and_odometry_says_what_the_wheels_did(
+def test_every_line_is_executed_and_odometry_agrees_with_the_wheels(
     board: Board, tmp_path: Path, mcu: Mcu, length_s: int
 ) -> None:
     with running(board, tmp_path, mcu) as (_, daemon, bus):
@@ -370,7 +370,7 @@ MODES = {"off": PLAIN, "auto": COUNTS, "require": STRICT}
 @pytest.mark.parametrize(
     "mode", ["require", pytest.param("off", marks=soak), pytest.param("auto", marks=soak)]
 )
-def test_a_board_that_is_reset_moves_nothing_before_neutral(
+def test_a_board_that_is_reset_does_not_move_before_neutral(
     board: Board, tmp_path: Path, mode: str
 ) -> None:
     with running(board, tmp_path, MODES[mode]) as rig:
@@ -381,7 +381,7 @@ def test_a_board_that_is_reset_moves_nothing_before_neutral(
 @pytest.mark.parametrize(
     "mode", ["off", pytest.param("auto", marks=soak), pytest.param("require", marks=soak)]
 )
-def test_a_reset_that_nobody_heard_of_moves_nothing_before_neutral(
+def test_a_board_with_an_unreported_reset_does_not_move_before_neutral(
     board: Board, tmp_path: Path, mode: str
 ) -> None:
     with running(board, tmp_path, MODES[mode]) as rig:
@@ -391,7 +391,7 @@ def test_a_reset_that_nobody_heard_of_moves_nothing_before_neutral(
 @pytest.mark.parametrize(
     "mode", ["auto", pytest.param("off", marks=soak), pytest.param("require", marks=soak)]
 )
-def test_a_board_that_hangs_moves_nothing_before_neutral(
+def test_a_board_that_hung_does_not_move_before_neutral(
     runner: Path, hanging_firmware: Path, tmp_path: Path, mode: str
 ) -> None:
     with Board(runner, hanging_firmware, "--free-speed", FREE_SPEEDS) as board:
@@ -537,7 +537,7 @@ def rejects(bus: Bus) -> dict[str, int]:
 
 
 @pytest.mark.parametrize("mcu", [pytest.param(PLAIN, marks=soak), STRICT], ids=["plain", "checked"])
-def test_a_lost_line_is_found_again_and_neutral_comes_first(
+def test_a_lost_link_is_restored_and_the_commander_must_be_neutral_first(
     board: Board, tmp_path: Path, mcu: Mcu
 ) -> None:
     """The board falls silent, then its plug is pulled; the commander never stops sending."""
@@ -602,7 +602,7 @@ def test_a_lost_line_is_found_again_and_neutral_comes_first(
 )
 @pytest.mark.timeout(180)
 @pytest.mark.nightly
-def test_by_counts_a_fifth_of_the_lines_lost_loses_no_distance(
+def test_with_counts_the_loss_of_a_fifth_of_the_lines_loses_no_distance(
     board: Board, tmp_path: Path, mcu: Mcu, length_s: int
 ) -> None:
     with running(board, tmp_path, mcu) as (_, daemon, bus):

@@ -92,7 +92,7 @@ def test_the_battery_s_voltage_is_that_at_the_divider(
     assert told.volts == pytest.approx(volts, abs=0.07)
 
 
-def test_the_current_has_its_sign(board: Board, host: Host) -> None:
+def test_the_reported_current_has_the_sign_of_its_direction(board: Board, host: Host) -> None:
     for millivolts, amps in ((2100, -10.0), (2700, 5.0)):
         board.command(f"analog {CURRENT} {millivolts}")
         passes(board, 1000)
@@ -162,7 +162,7 @@ def test_a_restart_reports_no_false_press(board: Board, host: Host) -> None:
 # motors
 
 
-def test_a_press_takes_the_voltage_and_only_a_zero_after_the_release_gives_it_back(
+def test_a_press_removes_the_voltage_until_a_zero_after_the_release(
     board: Board, host: Host
 ) -> None:
     host.send(STOP)
@@ -202,7 +202,7 @@ def test_a_board_that_starts_while_pressed_moves_nothing_until_a_zero_after_the_
     assert board.status().running
 
 
-def test_bumpers_and_the_driver_s_fault_take_no_voltage(board: Board, host: Host) -> None:
+def test_bumpers_and_the_driver_s_fault_do_not_remove_the_voltage(board: Board, host: Host) -> None:
     """The daemon decides what a bumper does."""
     host.send(STOP)
     for pin in BUMPERS:

@@ -118,7 +118,7 @@ def test_the_watchdog_allows_for_300_ms_after_each_feeding_however_the_clock_wra
         assert logic.watchdog_allows(at, now) == (step < 300)
 
 
-def test_a_tripped_watchdog_stays_so_when_the_clock_comes_round(logic: ctypes.CDLL) -> None:
+def test_a_tripped_watchdog_stays_tripped_when_the_clock_wraps(logic: ctypes.CDLL) -> None:
     dog = WatchdogC()
     at = ctypes.addressof(dog)
     logic.watchdog_start(at)
@@ -152,7 +152,7 @@ def readings(
 @each("start", [0, 65530, 2**32 - TICKS])
 @each("speed", [0.05, 0.3, 1.0, 10.0, 60.0, -0.3, -10.0, -60.0])
 @each("every", [0.005, 0.01, 0.02])
-def test_a_steady_speed_is_said_to_a_thousandth(
+def test_a_steady_speed_is_measured_to_a_thousandth(
     logic: ctypes.CDLL, speed: float, every: float, start: int
 ) -> None:
     rate = speed / math.tau * COUNTS_PER_TURN
@@ -164,7 +164,7 @@ def test_a_steady_speed_is_said_to_a_thousandth(
     assert all(one == pytest.approx(speed, rel=1e-3, abs=1e-4) for one in settled)
 
 
-def test_a_wheel_that_stops_is_said_to_be_slower_and_slower_and_then_still(
+def test_the_measured_speed_of_a_wheel_that_stopped_falls_to_zero(
     logic: ctypes.CDLL,
 ) -> None:
     wheel = SpeedC()
@@ -233,7 +233,7 @@ PITCH = math.tau / COUNTS_PER_TURN
     st.lists(st.integers(9_000, 50_000), min_size=1, max_size=200),
     st.integers(0, 2**32 - 1),
 )
-def test_whatever_the_edges_no_more_is_said_than_the_window_allows(
+def test_for_any_edges_the_measured_speed_is_at_most_what_the_window_allows(
     logic: ctypes.CDLL, steps: list[tuple[int, int]], windows: list[int], start: int
 ) -> None:
     """Edges come at random times, some reversing, some microseconds apart."""
@@ -263,7 +263,7 @@ CHATTER = [(9_900 + 20_000 * i + 200 * j, 1 - j) for i in range(40) for j in (0,
     "edges",
     [CHATTER, [(time + 100_000 * (i % 2), count) for i, (time, count) in enumerate(CHATTER[:2])]],
 )
-def test_a_wheel_that_trembles_on_an_edge_is_not_said_to_turn(
+def test_a_wheel_that_trembles_on_an_edge_has_a_measured_speed_of_zero(
     logic: ctypes.CDLL, edges: list[tuple[int, int]]
 ) -> None:
     for window in (10_000, 20_000, 40_000):
@@ -272,7 +272,7 @@ def test_a_wheel_that_trembles_on_an_edge_is_not_said_to_turn(
 
 
 @each(("amplitude", "frequency"), [(0.8, 50), (0.8, 23), (1.5, 37), (3.0, 11)])
-def test_a_wheel_that_trembles_is_not_said_to_race(
+def test_a_trembling_wheel_s_measured_speed_is_bounded_by_its_true_speed(
     logic: ctypes.CDLL, amplitude: float, frequency: int
 ) -> None:
     """The speed is at most the fastest true speed plus one count per window."""
@@ -285,7 +285,7 @@ def test_a_wheel_that_trembles_is_not_said_to_race(
 
 @pytest.mark.slow
 @each("speed", [0.2, 0.3, 0.4, 0.5, 0.6, 0.9, 2.0, -0.2, -0.6])
-def test_a_coarse_encoder_says_its_true_speed_however_slow(
+def test_a_coarse_encoder_measures_the_true_speed_also_at_low_speed(
     coarse: ctypes.CDLL, speed: float
 ) -> None:
     """With 96 counts a turn, 0.2 rad/s gives one count in 330 ms."""
@@ -298,7 +298,7 @@ def test_a_coarse_encoder_says_its_true_speed_however_slow(
         assert max(abs(value) for _, value, _, _ in told) < 1.1 * abs(speed), "at the first edge"
 
 
-def test_a_quick_start_is_not_hidden_by_the_time_waited(logic: ctypes.CDLL) -> None:
+def test_a_quick_start_after_a_long_rest_is_measured_without_delay(logic: ctypes.CDLL) -> None:
     for waited in (0, 40_000, 10_000_000, 2**30 - 4_500):
         last = waited + 20_000
         edges = [(5_000, 1), *((last - 4_000 + 1_000 * i, 2 + i) for i in range(5))]
@@ -307,7 +307,9 @@ def test_a_quick_start_is_not_hidden_by_the_time_waited(logic: ctypes.CDLL) -> N
         assert said[-1][1] >= 4 * PITCH / 0.005 * 0.999
 
 
-def test_after_a_rest_longer_than_the_clock_a_first_edge_is_no_race(logic: ctypes.CDLL) -> None:
+def test_the_first_edge_after_a_rest_longer_than_the_clock_gives_no_high_speed(
+    logic: ctypes.CDLL,
+) -> None:
     """Its 32 bits wrap in 36 minutes; then an edge long ago would look recent."""
     rests = [2**32 // 32] * 32
     far = sum(rests)
@@ -318,7 +320,7 @@ def test_after_a_rest_longer_than_the_clock_a_first_edge_is_no_race(logic: ctype
 
 
 @given(st.floats(-1e6, 1e6))
-def test_hundredths_are_rounded_and_bounded(logic: ctypes.CDLL, value: float) -> None:
+def test_speeds_in_hundredths_are_rounded_and_clamped(logic: ctypes.CDLL, value: float) -> None:
     said = logic.speed_hundredths(value)
     assert abs(said) <= 9999
     assert abs(said - max(-9999.0, min(9999.0, value * 100))) <= 0.51
@@ -327,7 +329,9 @@ def test_hundredths_are_rounded_and_bounded(logic: ctypes.CDLL, value: float) ->
 # control
 
 
-def test_the_loop_settles_without_overshoot_and_forgets_a_jam(logic: ctypes.CDLL) -> None:
+def test_the_speed_loop_settles_without_overshoot_and_recovers_from_a_jam(
+    logic: ctypes.CDLL,
+) -> None:
     pi = PiC()
     at = ctypes.addressof(pi)
     logic.pi_reset(at)
@@ -350,7 +354,7 @@ def test_the_loop_settles_without_overshoot_and_forgets_a_jam(logic: ctypes.CDLL
 
 
 @given(st.lists(st.tuples(st.floats(-99, 99), st.floats(-99, 99), st.booleans()), max_size=50))
-def test_whatever_comes_the_duty_is_a_duty(
+def test_the_duty_stays_within_its_limits_for_any_input(
     logic: ctypes.CDLL, steps: list[tuple[float, float, bool]]
 ) -> None:
     pi = PiC()
@@ -361,7 +365,7 @@ def test_whatever_comes_the_duty_is_a_duty(
         assert -1.0 <= pi.integral <= 1.0
 
 
-def test_at_rest_the_duty_leaks_away(logic: ctypes.CDLL) -> None:
+def test_at_rest_the_duty_decays_to_zero(logic: ctypes.CDLL) -> None:
     pi = PiC(0.8)
     at = ctypes.addressof(pi)
     duties = [logic.pi_step(at, 0.0, 0.0, False) for _ in range(100)]
@@ -374,7 +378,7 @@ def test_at_rest_the_duty_leaks_away(logic: ctypes.CDLL) -> None:
 
 @example([TOP] * 3 + [0, -TOP])
 @given(st.lists(st.one_of(st.integers(-TOP, TOP), st.just(0), st.none()), max_size=200))
-def test_a_bridge_reverses_at_rest_rises_slowly_and_falls_at_once(
+def test_a_bridge_reverses_only_at_rest_and_its_duty_rises_slowly_and_falls_at_any_rate(
     logic: ctypes.CDLL, steps: list[int | None]
 ) -> None:
     """None means off, as by the watchdog, between two ticks and without a tick of its own."""
@@ -402,7 +406,7 @@ def test_a_bridge_reverses_at_rest_rises_slowly_and_falls_at_once(
         driven = bridge.direction if bridge.duty else driven
 
 
-def test_a_bridge_goes_on_the_same_way_without_rest(logic: ctypes.CDLL) -> None:
+def test_a_bridge_that_keeps_its_direction_resumes_without_a_rest(logic: ctypes.CDLL) -> None:
     bridge = BridgeC(0, 0, 0)
     at = ctypes.addressof(bridge)
     for wanted in (TOP, TOP, 0):

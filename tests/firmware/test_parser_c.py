@@ -177,7 +177,7 @@ def said(line: bytes) -> tuple[int, ...] | None:
 
 
 @each(("line", "motors"), ACCEPTED)
-def test_what_the_host_accepts_is_taken_with_the_same_values_or_not_at_all(
+def test_a_line_that_the_host_accepts_gives_the_same_values_or_is_refused(
     parser: Parser, line: bytes, motors: tuple[float, ...]
 ) -> None:
     usual = len(FIGURE.findall(line)) == 4
@@ -186,7 +186,7 @@ def test_what_the_host_accepts_is_taken_with_the_same_values_or_not_at_all(
 
 
 @each("line", [line for line, _ in REFUSED])
-def test_what_the_host_refuses_changes_nothing(parser: Parser, line: bytes) -> None:
+def test_a_line_that_the_host_refuses_is_refused(parser: Parser, line: bytes) -> None:
     assert parser.parse(line) is None
 
 
@@ -208,7 +208,7 @@ def _with(line: bytes, at: int, byte: int) -> bytes:
 
 
 @pytest.mark.slow
-def test_it_reads_the_host_s_language_and_no_other(parser: Parser) -> None:
+def test_mutated_lines_give_the_same_result_as_in_the_host_s_parser(parser: Parser) -> None:
     """Both parsers give the same result for valid lines with one to three changes."""
     rng = random.Random(1)
     taken = 0
@@ -228,7 +228,7 @@ wheels = st.builds(WheelSpeeds, *[st.floats(-101.0, 101.0)] * 4)
 
 
 @given(wheels, st.booleans())
-def test_every_line_the_host_writes_is_taken_with_the_same_value(
+def test_every_line_the_host_writes_is_accepted_with_the_same_value(
     parser: Parser, speeds: WheelSpeeds, comma: bool
 ) -> None:
     line = Codec(WheelMap(), trailing_comma=comma).encode(speeds)
@@ -237,7 +237,7 @@ def test_every_line_the_host_writes_is_taken_with_the_same_value(
 
 
 @given(wheels, st.booleans(), st.integers(0, 255), st.sampled_from(["", "S", "GS", "Z", "SS"]))
-def test_a_checked_line_is_taken_with_its_sequence_and_request(
+def test_a_checked_line_is_accepted_with_its_sequence_and_request(
     parser: Parser, speeds: WheelSpeeds, comma: bool, sequence: int, letters: str
 ) -> None:
     line = Codec(WheelMap(), trailing_comma=comma).encode(speeds).rstrip(b"\r\n")
@@ -246,7 +246,7 @@ def test_a_checked_line_is_taken_with_its_sequence_and_request(
 
 
 @given(st.binary(max_size=300))
-def test_lines_are_cut_as_the_host_cuts_them(parser: Parser, data: bytes) -> None:
+def test_a_stream_is_split_into_lines_as_on_the_host(parser: Parser, data: bytes) -> None:
     data = data.replace(b"\x07", b"\n")  # more of them than by chance
     reader = LineReader()
     parser.stream(b"\n")
@@ -258,13 +258,13 @@ def test_noise_without_a_line_end_is_forgotten_and_the_next_line_counts(parser: 
     assert parser.stream(b" " * (127 - len(ZERO)) + ZERO + b"\r\n") == []
 
 
-def test_lines_too_long_to_be_any_are_counted(parser: Parser) -> None:
+def test_lines_of_128_bytes_or_more_are_counted_as_too_long(parser: Parser) -> None:
     before = parser.too_long
     parser.stream(b"a" * 1000 + b"\n" + ZERO + b"\n" + b"b" * 127 + b"\n" + b"c" * 128 + b"\n")
     assert parser.too_long == before + 2
 
 
-def test_only_a_lone_question_mark_asks(parser: Parser) -> None:
+def test_only_a_lone_question_mark_requests_the_identity(parser: Parser) -> None:
     assert parser.asks(b"?")
     assert not any(parser.asks(line) for line in (b"??", b" ?", b"? ", ZERO + b"?", b"!"))
     assert parser.parse(b"?") is None
@@ -281,7 +281,7 @@ SUFFIXES = [
 
 
 @each("suffix", SUFFIXES)
-def test_a_suffix_that_is_not_whole_spoils_the_line(parser: Parser, suffix: bytes) -> None:
+def test_a_line_with_an_incomplete_suffix_is_refused(parser: Parser, suffix: bytes) -> None:
     assert parser.parse(ZERO + suffix) is None
 
 
@@ -292,7 +292,9 @@ BEFORE_CHECK = [
 
 
 @each("suffix", BEFORE_CHECK)
-def test_a_right_check_does_not_mend_a_wrong_form(parser: Parser, suffix: bytes) -> None:
+def test_a_line_with_a_wrong_form_is_refused_even_if_its_check_is_right(
+    parser: Parser, suffix: bytes
+) -> None:
     head = ZERO + suffix
     assert parser.parse(head + b"*%04X" % binascii.crc_hqx(head, 0)) is None
 
@@ -351,7 +353,7 @@ def test_no_single_bit_error_in_checked_lines_puts_a_wrong_speed_in_force(
     assert plain, "the same errors must be seen in plain lines"
 
 
-def test_a_byte_that_becomes_a_line_end_leaves_no_valid_piece(parser: Parser) -> None:
+def test_no_part_of_a_line_is_valid_after_a_byte_became_a_line_end(parser: Parser) -> None:
     """There is one exception: the start of the check, without which the plain line remains.
 
     It takes two errors or more to turn `#` into a line end.
@@ -367,7 +369,7 @@ def test_a_byte_that_becomes_a_line_end_leaves_no_valid_piece(parser: Parser) ->
                     assert not got, (line, at, end)
 
 
-def test_no_single_bit_error_makes_a_line_end_where_the_rest_is_a_line(parser: Parser) -> None:
+def test_no_single_bit_error_that_makes_a_line_end_leaves_a_valid_line(parser: Parser) -> None:
     for line in (checked(SEED_LINE, 7, "S"), checked(SEED_LINE + b",", 0x2A), SEED_LINE):
         for bit in range(8 * len(line)):
             bad = _with(line, bit // 8, line[bit // 8] ^ (1 << bit % 8))
@@ -382,7 +384,7 @@ counters = st.one_of(st.integers(0, 1100), st.integers(0, 65535))
 
 
 @given(st.integers(0, 2**32 - 1), counters, counters, counters)
-def test_it_says_who_it_is_in_a_line_that_is_no_feedback_and_not_too_long_for_the_host(
+def test_the_identity_line_is_readable_by_the_host_and_not_taken_for_feedback(
     parser: Parser, lines: int, refused: int, trips: int, runaways: int
 ) -> None:
     line = parser.identity(lines, refused, trips, runaways, b"brown-out")
@@ -394,11 +396,13 @@ def test_it_says_who_it_is_in_a_line_that_is_no_feedback_and_not_too_long_for_th
         Codec(WheelMap()).decode(heard)
 
 
-def test_its_longest_line_leaves_room_for_a_finer_encoder(parser: Parser) -> None:
+def test_the_longest_identity_line_has_126_bytes(parser: Parser) -> None:
     assert len(parser.identity(2**32 - 1, 65535, 65535, 65535, b"brown-out")) == 126
 
 
-def test_counts_said_as_a_product_are_told_as_a_number(coarse_library: ctypes.CDLL) -> None:
+def test_counts_configured_as_a_product_are_reported_as_a_number(
+    coarse_library: ctypes.CDLL,
+) -> None:
     assert (
         Parser(coarse_library)
         .identity(0, 0, 0, 0, b"pin")
@@ -406,7 +410,7 @@ def test_counts_said_as_a_product_are_told_as_a_number(coarse_library: ctypes.CD
     )
 
 
-def test_a_counter_that_is_full_stays_so(parser: Parser) -> None:
+def test_a_full_counter_stays_at_its_maximum(parser: Parser) -> None:
     assert [parser.counted_up(count) for count in (0, 65534, 65535)] == [1, 65535, 65535]
 
 
@@ -418,7 +422,7 @@ def test_a_counter_that_is_full_stays_so(parser: Parser) -> None:
     st.lists(st.integers(0, 65535), min_size=4, max_size=4),
     st.integers(0, 65535), st.integers(0, 255), st.booleans(), st.booleans(),
 )  # fmt: skip
-def test_a_reply_says_what_it_was_given(
+def test_a_reply_has_the_values_it_was_given(
     parser: Parser,
     hundredths: list[int],
     counts: list[int],

@@ -97,7 +97,9 @@ def test_firmware_as_delivered_never_sends_a_status_line(library: ctypes.CDLL) -
 
 
 @pytest.mark.parametrize("bit", range(5))
-def test_each_contact_is_reported_at_once_in_its_own_field(inputs: Inputs, bit: int) -> None:
+def test_each_contact_is_reported_within_four_samples_in_its_own_field(
+    inputs: Inputs, bit: int
+) -> None:
     inputs.boot()
     assert inputs.lines(CLOSED, 500)[-1] == BoardStatus(estop=False, bumpers=(False,) * 4)
     bumpers = tuple(number == bit - 1 for number in range(4))
@@ -123,7 +125,7 @@ def test_a_press_is_reported_before_the_fault_of_a_driver_that_lost_its_supply(
     assert told[1].driver_fault
 
 
-def test_nothing_is_reported_before_it_is_known(inputs: Inputs) -> None:
+def test_no_contact_is_reported_before_its_state_is_known(inputs: Inputs) -> None:
     """A false press at a boot would stop the robot until `clear`."""
     inputs.boot()
     assert inputs.lines(CLOSED, 19) == []
@@ -154,7 +156,7 @@ def test_a_contact_is_released_only_by_20_free_samples_and_pressed_by_three(
             assert inputs.stopped == (sum(samples[since:]) >= 3), samples
 
 
-def test_a_bounce_of_two_milliseconds_is_no_release_and_a_disturbance_of_two_no_press(
+def test_a_bounce_of_two_ms_is_no_release_and_a_disturbance_of_two_ms_is_no_press(
     inputs: Inputs,
 ) -> None:
     inputs.boot()
@@ -196,9 +198,7 @@ def test_bumpers_open_or_close_when_pressed(
 
 
 @pytest.mark.parametrize("length_ms", [3, 40, 500])
-def test_a_driver_s_fault_is_reported_soon_however_short_it_is(
-    build: Build, length_ms: int
-) -> None:
+def test_even_a_short_driver_fault_is_reported_within_110_ms(build: Build, length_ms: int) -> None:
     inputs = build("-DDRIVER_INPUT=1")
     inputs.boot()
     inputs.lines(CLOSED, 1200)
@@ -222,7 +222,7 @@ def test_a_press_is_reported_before_the_fault_of_a_driver_that_lost_its_supply_a
 
 @pytest.mark.slow
 @pytest.mark.parametrize("high", [0, 1])
-def test_a_driver_s_fault_is_low_or_high(build: Build, high: int) -> None:
+def test_the_driver_fault_input_can_be_active_low_or_active_high(build: Build, high: int) -> None:
     inputs = build("-DDRIVER_INPUT=1", f"-DDRIVER_FAULT_HIGH={high}")
     fault = 0b100000 if high else 0
     assert inputs.lines(fault ^ 0b100000, 1000) == [BoardStatus(driver_fault=False)]
@@ -252,7 +252,7 @@ def test_the_volts_are_the_mean_of_a_second(build: Build) -> None:
     assert told.volts == pytest.approx(720 * 5 / 1024 * 6.6, abs=0.02)
 
 
-def test_values_beyond_the_line_s_form_stay_at_its_ends(build: Build) -> None:
+def test_values_that_do_not_fit_the_line_are_clamped(build: Build) -> None:
     wide = build("-DBATTERY_TOP_OHM=188000L", "-DCURRENT_UV_PER_A=1000L")
     told = wide.lines(0, 1000, (1023, 1023))[-1]
     assert told.volts == pytest.approx(98.9, abs=0.01)

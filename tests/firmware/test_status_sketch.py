@@ -54,7 +54,9 @@ def sketch(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
     return library
 
 
-def test_the_example_reports_ten_times_a_second_and_a_change_at_once(sketch: ctypes.CDLL) -> None:
+def test_the_example_reports_ten_times_a_second_and_a_change_immediately(
+    sketch: ctypes.CDLL,
+) -> None:
     told = [(at, line) for at in range(1000) if (line := sketch.run(350 <= at < 620, at))]
     pressed = {at for at, line in told if decode_status(line.removesuffix(b"\r\n"), False).estop}
     assert all(line.endswith(b"\r\n") for _, line in told)
@@ -62,7 +64,7 @@ def test_the_example_reports_ten_times_a_second_and_a_change_at_once(sketch: cty
     assert {at for at, _ in told} - pressed == {0, 100, 200, 300, 620, 720, 820, 920}
 
 
-def test_each_status_line_of_the_page_is_one() -> None:
+def test_each_status_line_of_the_page_is_valid() -> None:
     lines = re.findall(r"!status [^`\n]*\*[0-9A-F]{4}", PAGE.read_text(encoding="utf-8"))
     assert len(lines) >= 4
     for line in lines:

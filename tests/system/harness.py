@@ -810,7 +810,7 @@ class Bus:
                     said = time.monotonic()
                 return not neutral and counters.get("commands", 0) > before
 
-            until(heard, 5.0, "the zero was heard")
+            until(heard, 5.0, "the zero was received")
         commander.thread.start()
         try:
             yield commander
@@ -932,7 +932,7 @@ def alive_at(endpoint: str, daemon: Program) -> Iterator[Any]:
         except zenoh.ZError:
             return None
 
-    with until(connect, START_S, f"somebody at {endpoint}") as session:
+    with until(connect, START_S, f"a listener at {endpoint}") as session:
         yield session.liveliness().declare_subscriber(
             "acsard/acsar/alive", zenoh.handlers.FifoChannel(10), history=True
         )

@@ -457,7 +457,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
 @pytest.mark.variations(8)
 @pytest.mark.parametrize("verb", VERBS)
 @pytest.mark.parametrize("who", IDENTITIES)
-def test_each_may_do_what_the_table_says_and_nothing_else(
+def test_each_certificate_may_do_exactly_what_the_access_table_allows(
     robot: Robot, who: Identity, verb: Verb
 ) -> None:
     wrong = [
@@ -468,7 +468,7 @@ def test_each_may_do_what_the_table_says_and_nothing_else(
     assert not wrong
 
 
-def test_what_a_certificate_may_not_put_never_gets_as_far_as_being_refused(robot: Robot) -> None:
+def test_a_put_that_no_certificate_may_send_never_reaches_the_daemon(robot: Robot) -> None:
     before = robot.here.state()["counters"]
     with Visitor(robot, "maintainer") as one:
         assert not one.sent("put", [row for row in ROWS["put"] if not row.who])

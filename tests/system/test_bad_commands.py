@@ -87,11 +87,11 @@ BAD = [
 
 
 def refused_without_motion(bus: Bus, *bad: Bad) -> None:
-    """Check that each counts under its reason and is told, and that nothing moves."""
+    """Check that each counts under its reason and is reported, and that nothing moves."""
     # The source may drive: if a bad command were accepted, the robot would move.
     heard = bus.count("commands")
     bus.put("cmd/app", ZERO)
-    until(lambda: bus.count("commands") > heard, 5.0, "the zero was heard")
+    until(lambda: bus.count("commands") > heard, 5.0, "the zero was received")
     before = state = bus.state()
     for payload, reason, said, key, encoding in bad:
         name, counted = f"command_{reason}", state["counters"].get(f"command_{reason}", 0)
@@ -119,7 +119,7 @@ def refused_without_motion(bus: Bus, *bad: Bad) -> None:
     assert changed == {f"command_{one.reason}" for one in bad}
 
 
-def test_a_bad_command_is_counted_and_said_and_moves_nothing(bus: Bus) -> None:
+def test_a_bad_command_is_counted_and_reported_and_moves_nothing(bus: Bus) -> None:
     refused_without_motion(bus, *BAD)
 
 
@@ -135,7 +135,7 @@ def test_a_command_held_up_on_the_way_is_counted_as_stale(bus: Bus) -> None:
     refused_without_motion(bus, Bad(stamped(1.0), "stale", "the network delayed it"))
 
 
-def test_wheel_speeds_without_end_are_held_to_the_limits(bus: Bus) -> None:
+def test_enormous_wheel_speeds_are_clamped_to_the_limits(bus: Bus) -> None:
     # The value is finite, so it is clamped instead of refused. 1e308 on every wheel must not become
     # NaN on the way.
     with bus.follow("cmd_vel_out") as applied:
@@ -143,9 +143,9 @@ def test_wheel_speeds_without_end_are_held_to_the_limits(bus: Bus) -> None:
         heard = bus.count("commands")
         bus.put("wheel_cmd/app", {"name": ALL_JOINTS, "velocity": [0.0] * 4})
         # A message of an earlier test may still arrive after this point.
-        until(lambda: bus.count("commands") >= heard + 1, 5.0, "the zero was heard")
+        until(lambda: bus.count("commands") >= heard + 1, 5.0, "the zero was received")
         bus.put("wheel_cmd/app", {"name": ALL_JOINTS, "velocity": [1e300, 1e300, -1e300, -1e300]})
-        until(lambda: bus.count("commands") >= heard + 2, 5.0, "so was this")
+        until(lambda: bus.count("commands") >= heard + 2, 5.0, "the speeds were received")
         until(lambda: bus.state()["mode"] == "ready", 5.0, "their timeout is over")
         until(lambda: bus.state()["linear"] == bus.state()["angular"] == 0, 5.0, "at rest")
     for seen in applied.seen:
@@ -153,7 +153,7 @@ def test_wheel_speeds_without_end_are_held_to_the_limits(bus: Bus) -> None:
         assert abs(seen.value["twist"]["angular"]["z"]) <= 4.0
 
 
-def test_a_message_over_the_link_s_size_harms_only_who_sent_it(bus: Bus, shared: Daemon) -> None:
+def test_a_message_over_the_link_s_size_harms_only_its_sender(bus: Bus, shared: Daemon) -> None:
     with Bus(shared.endpoint) as sender:
         sender.session.put("acsard/acsar/cmd/app", GO + b" " * 1_000_000)
         lines = bus.count("lines_sent")
@@ -163,16 +163,16 @@ def test_a_message_over_the_link_s_size_harms_only_who_sent_it(bus: Bus, shared:
         another.linked()
 
 
-def test_nothing_of_this_was_an_exception(bus: Bus, shared: Daemon) -> None:
+def test_no_bad_command_raised_an_exception_in_the_daemon(bus: Bus, shared: Daemon) -> None:
     assert shared.process.poll() is None
     assert "Traceback" not in shared.stderr
     assert "Error" not in shared.stderr
     assert "panicked" not in shared.stderr
-    until(lambda: bus.state()["mode"] == "ready", 5.0, "nobody commands any more")
+    until(lambda: bus.state()["mode"] == "ready", 5.0, "no program commands any more")
 
 
 @pytest.mark.slow
-def test_a_flood_costs_no_periods_and_no_memory_and_a_stop_still_latches_at_once(
+def test_a_flood_costs_no_periods_and_no_memory_and_a_stop_still_latches_immediately(
     tmp_path: Path,
 ) -> None:
     with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus, bus.follow("state") as states:
@@ -280,7 +280,7 @@ def flooded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
 
 @pytest.mark.parametrize("way", ["bridge", "rmw"])
 @pytest.mark.slow
-def test_a_flood_by_ros_is_held_to_a_thousand_commands_a_second_as_any_other(
+def test_a_flood_from_ros_is_limited_to_a_thousand_commands_a_second(
     flooded: Daemon, tmp_path: Path, way: str
 ) -> None:
     key = "cmd_vel" if way == "bridge" else rmw_key("cmd_vel", TWIST)
@@ -311,7 +311,7 @@ def test_a_flood_by_ros_is_held_to_a_thousand_commands_a_second_as_any_other(
 
 
 @pytest.mark.slow
-def test_what_takes_longest_to_read_costs_no_periods_and_a_stop_still_latches_at_once(
+def test_messages_that_are_slow_to_decode_cost_no_periods_and_a_stop_still_latches(
     flooded: Daemon, tmp_path: Path
 ) -> None:
     assert len(EMPTY_JOINTS) == len(EMPTY_NAMES) == 4096

@@ -37,7 +37,7 @@ auto_activate = false
 
 
 @pytest.mark.slow
-def test_it_measures_the_simulator_and_moves_nothing_on_a_real_port(
+def test_bench_measures_the_simulator_and_moves_nothing_on_a_real_port(
     tmp_path: Path, peer: Peer
 ) -> None:
     """Run both at once, since they share nothing."""
@@ -82,21 +82,21 @@ def says_what_it_could_not_see(result: dict[str, Any]) -> None:
         assert result[hidden] is None
 
 
-def test_a_port_that_is_not_there_is_66(tmp_path: Path) -> None:
+def test_bench_on_a_port_that_does_not_exist_ends_with_66(tmp_path: Path) -> None:
     done = typed("bench", "--port", str(tmp_path / "nothing"))
     assert (done.code, done.out) == (66, "")
     assert "does not exist" in done.err
 
 
 @each("what", ["/tmp", "/etc/passwd"])
-def test_a_port_that_is_no_device_is_66_at_once(what: str) -> None:
+def test_bench_on_a_path_that_is_not_a_device_ends_with_66(what: str) -> None:
     done = typed("bench", "--port", what)
     assert (done.code, done.out) == (66, "")
     assert done.err.startswith(f"acsard: {what} is not a serial port")
 
 
 @pytest.mark.slow
-def test_commands_that_never_reach_the_wire_end_it_with_the_daemons_own_reason() -> None:
+def test_bench_gives_the_daemons_reason_if_no_command_reaches_the_wire() -> None:
     config = bench_config(Config(), simulated=True)
     config = replace(config, control=ControlConfig(auto_activate=False))
     with pytest.raises(
@@ -113,7 +113,9 @@ def test_commands_that_never_reach_the_wire_end_it_with_the_daemons_own_reason()
         ("acsard.bench.far_end", "the simulated microcontroller's process"),
     ],
 )
-def test_a_part_of_it_that_is_killed_is_told_in_words(tmp_path: Path, words: str, who: str) -> None:
+def test_bench_names_its_child_process_that_was_killed(
+    tmp_path: Path, words: str, who: str
+) -> None:
     with Program(acsard("bench", "--seconds", "30"), tmp_path) as bench:
         pid = until(lambda: next(iter(children(bench.pid, words)), None), 15.0, words)
         os.kill(pid, signal.SIGKILL)
@@ -122,7 +124,9 @@ def test_a_part_of_it_that_is_killed_is_told_in_words(tmp_path: Path, words: str
 
 
 @pytest.mark.slow
-def test_a_port_that_a_daemon_has_is_75_and_says_whose(tmp_path: Path, peer: Peer) -> None:
+def test_bench_on_a_port_that_a_daemon_holds_ends_with_75_and_names_the_process(
+    tmp_path: Path, peer: Peer
+) -> None:
     with Daemon(tmp_path, peer.path) as daemon:
         done = finish(acsard("bench", "--port", str(peer.path)), tmp_path)
         assert done.code == 75

@@ -126,7 +126,7 @@ def test_a_get_on_a_published_key_answers_with_its_last_value(shared: Daemon, fo
             assert set(getattr(msgspec, form).decode(answer.payload)) == FIELDS[key]
 
 
-def test_a_last_value_is_the_present_one(bus: Bus) -> None:
+def test_the_last_value_of_odometry_is_current(bus: Bus) -> None:
     stamps = [seconds(bus.get("odom")["header"]["stamp"]) for _ in range(2)]
     assert abs(time.time() - stamps[0]) < 0.5
     until(
@@ -137,7 +137,7 @@ def test_a_last_value_is_the_present_one(bus: Bus) -> None:
 # the daemon's information about itself
 
 
-def test_info_says_who_the_daemon_is(bus: Bus, shared: Daemon) -> None:
+def test_info_has_the_identity_of_the_daemon(bus: Bus, shared: Daemon) -> None:
     info = bus.get("info")
     assert (info["id"], info["pid"]) == ("acsar", shared.pid)
     assert (info["simulated"], info["rate"]) == (True, 100.0)
@@ -247,7 +247,7 @@ def test_set_pose_and_reset_odometry_move_the_pose_of_every_key(bus: Bus) -> Non
 
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("payload", [b"", b"now!", b"\xff" * 5000])
-def test_a_put_of_anything_on_stop_latches(bus: Bus, payload: bytes) -> None:
+def test_a_put_with_any_payload_on_stop_latches(bus: Bus, payload: bytes) -> None:
     with restored(bus), bus.follow("state") as states:
         x = bus.state()["x"]
         sent = time.monotonic()
@@ -275,7 +275,7 @@ def test_a_delete_on_stop_is_counted_as_not_a_put_and_latches_nothing(bus: Bus) 
 
 
 @pytest.mark.slow
-def test_a_flood_of_deletes_on_stop_around_a_put_pushes_no_stop_out(
+def test_a_flood_of_deletes_on_the_stop_key_displaces_no_stop(
     bus: Bus, shared: Daemon, tmp_path: Path
 ) -> None:
     def overrun() -> int:
@@ -312,7 +312,7 @@ def test_a_flood_of_deletes_on_stop_around_a_put_pushes_no_stop_out(
 
 
 @pytest.mark.slow
-def test_every_published_key_names_its_encoding_and_is_there_in_json_with_the_same_fields(
+def test_every_published_key_names_its_encoding_and_has_the_same_fields_in_json(
     bus: Bus,
 ) -> None:
     for key, name in PUBLISHED.items():
@@ -327,7 +327,7 @@ def test_every_published_key_names_its_encoding_and_is_there_in_json_with_the_sa
                 assert set(seen.value) == FIELDS[key]
 
 
-def test_events_tell_what_happened_when_and_by_whom_and_how_many_there_were(bus: Bus) -> None:
+def test_an_event_has_its_name_level_count_text_and_client(bus: Bus) -> None:
     before = bus.get("events")
     with bus.follow("events") as messages:
         bus.get("srv/reset_odometry")
@@ -348,7 +348,7 @@ def test_events_tell_what_happened_when_and_by_whom_and_how_many_there_were(bus:
     assert len(seen.value["events"]) <= 20
 
 
-def test_in_json_each_message_is_the_one_on_the_plain_key(bus: Bus) -> None:
+def test_each_json_message_equals_the_message_on_the_plain_key(bus: Bus) -> None:
     with bus.follow("odom") as packed, bus.follow("json/odom") as texts:
         until(lambda: len(packed.seen) > 20 and len(texts.seen) > 20, 5.0, "both")
         told = {seconds(seen.value["header"]["stamp"]): seen.value for seen in list(packed.seen)}
@@ -358,7 +358,7 @@ def test_in_json_each_message_is_the_one_on_the_plain_key(bus: Bus) -> None:
     assert all(value == told[seconds(value["header"]["stamp"])] for value in both)
 
 
-def test_a_key_in_json_answers_by_its_exact_name_and_not_once_more_by_a_wildcard(bus: Bus) -> None:
+def test_a_json_key_answers_its_exact_name_and_no_wildcard(bus: Bus) -> None:
     (answer,) = bus.ask("json/tf_static")
     assert (answer.ok, answer.key) == (True, "json/tf_static")
     assert json.loads(answer.payload) == bus.get("tf_static")
@@ -417,7 +417,7 @@ def test_odom_tf_and_wheel_states_of_one_sample_carry_one_stamp(bus: Bus) -> Non
     assert between[0] == between[1] == between[2]
 
 
-def test_a_late_advanced_subscriber_gets_tf_static_at_once(bus: Bus) -> None:
+def test_a_late_advanced_subscriber_gets_tf_static_within_a_second(bus: Bus) -> None:
     following = Following()
     asked = time.monotonic()
     subscriber = zenoh.ext.declare_advanced_subscriber(
@@ -466,7 +466,7 @@ def test_the_alive_token_is_found_by_a_liveliness_query(bus: Bus) -> None:
 # many at once
 
 
-def test_more_queries_than_are_held_are_answered_or_told_to_ask_again(bus: Bus) -> None:
+def test_queries_beyond_the_limit_are_answered_or_refused_with_ask_again(bus: Bus) -> None:
     handlers = [bus.session.get("acsard/acsar/info", timeout=5.0) for _ in range(400)]
     answered, busy = 0, 0
     for handler in handlers:
@@ -483,7 +483,9 @@ def test_more_queries_than_are_held_are_answered_or_told_to_ask_again(bus: Bus) 
 
 
 @pytest.mark.slow
-def test_a_stop_query_behind_more_queries_than_are_held_stops(bus: Bus, shared: Daemon) -> None:
+def test_a_stop_query_after_more_queries_than_the_limit_stops_the_robot(
+    bus: Bus, shared: Daemon
+) -> None:
     # A get on every key is dozens of queries. `test_inbox.py` covers queries that are dropped
     # unanswered.
     unanswered = 0
@@ -499,7 +501,7 @@ def test_a_stop_query_behind_more_queries_than_are_held_stops(bus: Bus, shared: 
     print(f"{unanswered} of 3 stops came with 512 queries open; all of them stopped")
 
 
-def test_two_clients_hear_the_same_odometry(bus: Bus, shared: Daemon) -> None:
+def test_two_clients_receive_the_same_odometry(bus: Bus, shared: Daemon) -> None:
     with zenoh.open(client_config(shared.endpoint)) as other, bus.follow("odom") as mine:
         theirs = Following()
         subscriber = other.declare_subscriber("acsard/*/odom", theirs.add)
@@ -520,6 +522,6 @@ def test_a_late_plain_subscriber_gets_tf_static_within_6_s(late: Late) -> None:
     assert seen.value["transforms"][0]["child_frame_id"] == "lidar_link"
 
 
-def test_none_of_this_was_a_bug(shared: Daemon) -> None:
+def test_no_request_of_this_module_raised_an_exception_in_the_daemon(shared: Daemon) -> None:
     assert "Traceback" not in shared.stderr
     assert shared.process.poll() is None

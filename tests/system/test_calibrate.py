@@ -299,7 +299,9 @@ def test_a_person_with_a_wall_or_marks_is_guided_to_the_written_file(
 
 
 @pytest.mark.slow
-def test_space_while_it_drives_stops_within_the_ramp_and_writes_nothing(tmp_path: Path) -> None:
+def test_space_during_a_leg_stops_the_robot_within_the_ramp_and_writes_no_file(
+    tmp_path: Path,
+) -> None:
     with running(tmp_path, config=SKIDDING) as (daemon, bus):
         before = daemon.config.read_bytes()
         with calibrating(daemon, "--write") as (terminal, program):
@@ -322,7 +324,7 @@ def test_space_while_it_drives_stops_within_the_ramp_and_writes_nothing(tmp_path
     "how",
     ["stop", *(pytest.param(how, marks=pytest.mark.nightly) for how in ("teleop", "interrupt"))],
 )
-def test_whatever_else_ends_a_leg_is_reported(tmp_path: Path, how: str) -> None:
+def test_the_reason_that_ended_a_leg_is_reported(tmp_path: Path, how: str) -> None:
     with (
         running(tmp_path, config=SKIDDING) as (daemon, bus),
         calibrating(daemon) as (terminal, program),
@@ -371,7 +373,7 @@ def test_the_simulator_is_calibrated_by_its_true_pose_without_a_person(tmp_path:
 @pytest.mark.soak
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("stalled", ["calibration", "daemon"])
-def test_on_the_simulator_a_process_that_stands_still_does_not_end_the_drive(
+def test_on_the_simulator_a_process_suspended_for_1_5_s_does_not_end_the_calibration(
     tmp_path: Path, stalled: str
 ) -> None:
     with running(tmp_path, config=SKIDDING) as (daemon, bus):
@@ -401,7 +403,9 @@ AS_ODOMETRY = {
 }  # fmt: skip
 
 
-def test_positions_are_heard_from_elsewhere_as_both_types_in_every_encoding(free: str) -> None:
+def test_positions_of_another_program_are_received_as_both_types_in_every_encoding(
+    free: str,
+) -> None:
     with router(free) as said, client_session(free, "") as heard:
         for cls, value in ((PoseStamped, AS_POSE), (Odometry, AS_ODOMETRY)):
             message = msgspec.convert(value, cls)
@@ -436,7 +440,7 @@ def test_positions_that_are_missing_or_of_another_type_are_reported(
 
 
 @pytest.mark.slow
-def test_a_state_that_cannot_be_read_ends_the_leg_and_says_so(free: str) -> None:
+def test_an_unreadable_state_ends_the_leg_with_the_reason(free: str) -> None:
     with router(free) as said, client_session(free, "") as heard:
         client = Client(heard, "acsar", "app")
         ended = threading.Event()
@@ -456,7 +460,7 @@ def test_a_state_that_cannot_be_read_ends_the_leg_and_says_so(free: str) -> None
             publisher.join()
 
 
-def test_nothing_real_moves_without_a_person(tmp_path: Path, peer: Peer) -> None:
+def test_calibrate_moves_no_real_robot_without_a_person(tmp_path: Path, peer: Peer) -> None:
     with running(tmp_path, port=peer.path) as (daemon, _):
         for words, why in ((["--yes"], "this robot is real"), ([], "terminal")):
             ended = typed("calibrate", *words, "--config", str(daemon.config))

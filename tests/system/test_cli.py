@@ -72,7 +72,7 @@ def tool(shared: Daemon, *words: str) -> Finished:
 # help
 
 
-def test_help_lists_the_verbs_the_exit_codes_and_what_to_try(tmp_path: Path) -> None:
+def test_help_lists_the_verbs_the_exit_codes_and_examples(tmp_path: Path) -> None:
     ended = finish(acsard("--help"), tmp_path)
     assert (ended.code, ended.err) == (0, "")
     for told in (*VERBS, "69", "75", "78", "try:"):
@@ -81,14 +81,14 @@ def test_help_lists_the_verbs_the_exit_codes_and_what_to_try(tmp_path: Path) -> 
 
 
 @each("verb", VERBS)
-def test_every_verb_has_a_help_that_says_what_it_does(verb: str) -> None:
+def test_every_verb_has_a_help_with_its_usage(verb: str) -> None:
     ended = typed(verb, "--help")
     assert (ended.code, ended.err) == (0, "")
     assert ended.out.startswith(f"usage: acsard {verb}")
     assert "--config" in ended.out
 
 
-def test_version() -> None:
+def test_version_prints_the_name_and_ends_with_0() -> None:
     ended = typed("--version")
     assert (ended.code, ended.out.split()[0]) == (0, "acsard")
 
@@ -103,7 +103,9 @@ def test_a_mistyped_command_ends_with_2(words: list[str]) -> None:
     assert "usage: acsard" in ended.err
 
 
-def test_without_a_verb_it_runs_by_the_options_and_the_file_at_hand(tmp_path: Path) -> None:
+def test_without_a_verb_the_daemon_runs_with_the_options_and_the_local_acsard_toml(
+    tmp_path: Path,
+) -> None:
     endpoint = free_endpoint()
     (tmp_path / "acsard.toml").write_text('[robot]\nid = "handy"\n')
     with Program(acsard("--listen", endpoint), tmp_path) as daemon:
@@ -137,7 +139,7 @@ def test_topics_lists_every_key_with_its_meaning(shared: Daemon) -> None:
     assert any(row.startswith("acsard/acsar/srv/stop ") for row in rows)
 
 
-def test_topics_json_is_what_the_bus_answers(shared: Daemon, bus: Bus) -> None:
+def test_topics_json_prints_the_answer_of_the_topics_key(shared: Daemon, bus: Bus) -> None:
     ended = tool(shared, "topics", "--json")
     assert ended.code == 0
     assert json.loads(ended.out) == bus.get("topics")
@@ -186,7 +188,9 @@ def test_echo_state_says_the_mode_and_why(shared: Daemon, bus: Bus) -> None:
     assert WAITS in state["reason"]
 
 
-def test_echo_tf_static_prints_the_latched_one_at_once(shared: Daemon, bus: Bus) -> None:
+def test_echo_tf_static_prints_the_latched_message_without_waiting_for_the_next(
+    shared: Daemon, bus: Bus
+) -> None:
     begun = time.monotonic()
     ended = tool(shared, "echo", "tf_static", "-n", "1")
     assert ended.code == 0
@@ -195,7 +199,9 @@ def test_echo_tf_static_prints_the_latched_one_at_once(shared: Daemon, bus: Bus)
 
 
 @pytest.mark.slow
-def test_echo_shows_commands_of_others_whatever_they_send(shared: Daemon, bus: Bus) -> None:
+def test_echo_shows_commands_of_other_programs_also_if_they_are_malformed(
+    shared: Daemon, bus: Bus
+) -> None:
     words = acsard("echo", "cmd/stranger", "-n", "2", "--config", str(shared.config))
     with Program(words, shared.config.parent) as echo:
         for payload in (b'{"linear": {}, "angular": {}}', b"\xff"):
@@ -210,7 +216,7 @@ def test_echo_shows_commands_of_others_whatever_they_send(shared: Daemon, bus: B
     assert json.loads(echo.out[0]) == {"linear": {}, "angular": {}}
 
 
-def test_echo_of_silence_ends_with_1_after_its_timeout(shared: Daemon) -> None:
+def test_echo_of_a_silent_key_ends_with_1_after_its_timeout(shared: Daemon) -> None:
     ended = tool(shared, "echo", "cmd/nobody", "--timeout", "0.3")
     assert (ended.code, ended.out) == (1, "")
     assert "but no program sends on the Zenoh key cmd/nobody now" in ended.err
@@ -239,7 +245,7 @@ def test_echo_of_silence_ends_with_1_after_its_timeout(shared: Daemon) -> None:
     ],
 )
 @pytest.mark.nightly
-def test_who_waits_for_what_does_not_come_is_told_why_once_and_goes_on_waiting(
+def test_a_tool_that_waits_for_a_message_prints_the_reason_once_and_goes_on_waiting(
     shared: Daemon, bus: Bus, words: list[str], why: str
 ) -> None:
     typed = acsard(*words, "--config", str(shared.config))
@@ -255,7 +261,7 @@ def test_who_waits_for_what_does_not_come_is_told_why_once_and_goes_on_waiting(
 
 
 @pytest.mark.slow
-def test_who_waits_sees_that_the_daemon_has_ended(tmp_path: Path) -> None:
+def test_a_waiting_client_notices_that_the_daemon_has_ended(tmp_path: Path) -> None:
     with Daemon(tmp_path) as daemon, connect(daemon.endpoint) as robot:
 
         def seen() -> Presence | None:
@@ -304,7 +310,7 @@ def test_a_failure_keeps_its_exit_code_when_the_reader_of_the_output_has_left(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_echo_ends_at_once_by_a_signal(shared: Daemon, bus: Bus, number: signal.Signals) -> None:
+def test_a_signal_ends_echo_within_2_s(shared: Daemon, bus: Bus, number: signal.Signals) -> None:
     words = acsard("echo", "odom", "--config", str(shared.config))
     with Program(words, shared.config.parent) as echo:
         echo.says("header")
@@ -332,7 +338,7 @@ def test_hz_measures_a_hundred_per_second(shared: Daemon, bus: Bus) -> None:
 
 @pytest.mark.variations(2)
 @pytest.mark.parametrize("words", [["echo", "odom"], ["hz", "odom"], ["top"], ["call", "stop"]])
-def test_without_a_daemon_a_tool_ends_with_69_and_the_mend(
+def test_without_a_daemon_a_tool_ends_with_69_and_suggests_acsard_run(
     shared: Daemon, words: list[str]
 ) -> None:
     endpoint, begun = free_endpoint(), time.monotonic()
@@ -362,7 +368,7 @@ def test_an_address_without_its_port_is_not_taken_for_a_missing_daemon(endpoint:
 
 
 @each("robot_id", ["a/b*", "", "**", "robot 1"])
-def test_what_is_no_id_is_told_as_one_before_anybody_is_asked(
+def test_an_invalid_robot_id_is_refused_with_2_before_any_query(
     shared: Daemon, robot_id: str
 ) -> None:
     for words in (["call", "clear"], ["echo", "odom"], ["hz", "odom"]):
@@ -381,7 +387,9 @@ def test_echo_for_many_waits_for_each_and_says_which_is_missing(shared: Daemon) 
 
 @each("verb", ["top", "hz", "whoami", "drive", "accuracy", "calibrate"])
 @each("ids", ["*", "robot1,robot2"])
-def test_a_verb_for_one_robot_says_which_are_for_many(shared: Daemon, verb: str, ids: str) -> None:
+def test_a_verb_for_one_robot_refuses_several_ids_and_names_the_verb_for_many(
+    shared: Daemon, verb: str, ids: str
+) -> None:
     words = {"hz": ["odom"]}.get(verb, [])
     ended = tool(shared, verb, *words, "--id", ids)
     assert (ended.code, ended.out) == (2, "")
@@ -404,7 +412,7 @@ def test_a_verb_for_one_robot_says_which_are_for_many(shared: Daemon, verb: str,
         (["dirve"], "drive"),
     ],
 )
-def test_a_misspelt_key_service_setting_or_verb_is_asked_about(
+def test_a_misspelt_key_service_setting_or_verb_gets_a_suggestion(
     shared: Daemon, bus: Bus, words: list[str], meant: str
 ) -> None:
     ended = tool(shared, *words)
@@ -412,7 +420,7 @@ def test_a_misspelt_key_service_setting_or_verb_is_asked_about(
     assert ended.code != 0 or words[0] == "hz"
 
 
-def test_a_key_like_no_other_is_told_where_they_are_listed(shared: Daemon) -> None:
+def test_an_unknown_key_without_a_suggestion_names_the_topics_verb(shared: Daemon) -> None:
     ended = tool(shared, "get", "nonsense")
     assert (ended.code, ended.out) == (69, "")
     assert "`acsard topics`" in ended.err
@@ -446,7 +454,7 @@ def test_call_set_pose_sets_it(shared: Daemon, bus: Bus, pose: tuple[str, ...]) 
     assert bus.state()["x"] == 0.0
 
 
-def test_call_set_pose_with_a_pose_that_is_none_is_refused(shared: Daemon, bus: Bus) -> None:
+def test_call_set_pose_with_an_out_of_range_pose_is_refused(shared: Daemon, bus: Bus) -> None:
     before = bus.state()
     ended = tool(shared, "call", "set_pose", "1e7", "0", "0")
     assert ended.code == 1
@@ -456,7 +464,7 @@ def test_call_set_pose_with_a_pose_that_is_none_is_refused(shared: Daemon, bus: 
 @pytest.mark.parametrize(
     "words", [["set_pose"], ["set_pose", "1", "2"], ["stop", "1"], ["set_pose", "1", "2", "east"]]
 )
-def test_call_with_the_wrong_values_ends_with_2_and_the_form(
+def test_call_with_wrong_values_ends_with_2_and_prints_the_usage(
     shared: Daemon, bus: Bus, words: list[str]
 ) -> None:
     ended = tool(shared, "call", *words)
@@ -493,7 +501,9 @@ def test_set_changes_the_robot_that_runs_and_with_write_the_file(
         assert tool(shared, "set", "rates.state", "10", "log.level", "info").code == 0
 
 
-def test_set_alone_lists_what_can_be_set_and_when(shared: Daemon, bus: Bus) -> None:
+def test_set_without_arguments_lists_the_settings_and_when_they_can_change(
+    shared: Daemon, bus: Bus
+) -> None:
     told = tool(shared, "set")
     assert told.code == 0
     assert "highest speed, forwards and backwards: a number from 0 to 10 m/s" in told.out
@@ -513,7 +523,7 @@ def test_set_alone_lists_what_can_be_set_and_when(shared: Daemon, bus: Bus) -> N
         (("--write",), 2, "--write needs a setting"),
     ],
 )
-def test_what_cannot_be_set_is_refused_with_the_reason_and_changes_nothing(
+def test_a_setting_that_cannot_be_set_is_refused_with_the_reason_and_changes_nothing(
     shared: Daemon, bus: Bus, words: tuple[str, ...], code: int, said: str
 ) -> None:
     before, text = bus.get("config"), shared.config.read_text(encoding="utf-8")
@@ -527,7 +537,7 @@ def test_what_cannot_be_set_is_refused_with_the_reason_and_changes_nothing(
 
 
 @pytest.mark.slow
-def test_a_simulator_of_its_own_is_driven_through_the_printed_port(tmp_path: Path) -> None:
+def test_a_separate_simulator_process_is_driven_through_the_printed_port(tmp_path: Path) -> None:
     with Program(acsard("sim", "--link", "mcu"), tmp_path) as sim:
         port = sim.says("acsard run --port").split()[-1]
         assert port == "mcu"
@@ -579,7 +589,7 @@ def test_a_simulator_does_not_remove_the_link_of_the_one_that_replaced_it(tmp_pa
 # get
 
 
-def test_get_prints_what_a_query_key_answers_on_one_line_of_json(shared: Daemon) -> None:
+def test_get_prints_the_answer_of_a_query_key_on_one_line_of_json(shared: Daemon) -> None:
     ended = tool(shared, "get", "info")
     assert (ended.code, ended.err) == (0, "")
     (line,) = ended.out.splitlines()
@@ -681,7 +691,7 @@ def test_a_drive_that_is_suspended_stops_gives_the_terminal_back_and_goes_on(
 
 
 @pytest.mark.slow
-def test_without_a_screen_there_is_news_a_second_the_help_and_no_broken_word(
+def test_drive_without_a_screen_prints_the_help_and_a_line_a_second_that_fits(
     shared: Daemon, bus: Bus
 ) -> None:
     with without_a_screen(shared, columns=50) as (terminal, _):
@@ -697,7 +707,9 @@ def test_without_a_screen_there_is_news_a_second_the_help_and_no_broken_word(
 
 
 @pytest.mark.slow
-def test_the_last_word_without_a_screen_is_of_a_robot_that_stands(shared: Daemon, bus: Bus) -> None:
+def test_drive_without_a_screen_ends_with_a_line_that_the_robot_is_at_rest(
+    shared: Daemon, bus: Bus
+) -> None:
     with without_a_screen(shared) as (terminal, program):
         with held(terminal, "i"):
             until(lambda: (bus.state()["linear"] or 0.0) > 0.2, 5.0, "moving")
@@ -726,7 +738,7 @@ def test_a_terminal_closed_under_a_shell_stops_its_drive_by_a_zero_not_by_silenc
 
 
 @pytest.mark.slow
-def test_a_held_key_drives_and_letting_go_stops_by_itself(shared: Daemon, bus: Bus) -> None:
+def test_a_held_key_drives_and_its_release_stops_the_robot(shared: Daemon, bus: Bus) -> None:
     with without_a_screen(shared) as (terminal, program):
         with held(terminal, "i"):
             until(lambda: bus.state()["linear"] == pytest.approx(0.5, abs=0.01), 5.0, "0.5 m/s")
@@ -741,7 +753,7 @@ def test_a_held_key_drives_and_letting_go_stops_by_itself(shared: Daemon, bus: B
 
 
 @pytest.mark.slow
-def test_space_stops_at_once(shared: Daemon, bus: Bus) -> None:
+def test_space_stops_the_robot_within_the_ramp(shared: Daemon, bus: Bus) -> None:
     with without_a_screen(shared) as (terminal, _):
         with held(terminal, "i"):
             until(lambda: bus.state()["linear"] == pytest.approx(0.5, abs=0.01), 5.0, "0.5 m/s")
@@ -774,7 +786,7 @@ def test_arrows_drive_forward_back_left_and_right(shared: Daemon, bus: Bus) -> N
 
 
 @pytest.mark.slow
-def test_speed_keys_change_what_the_next_key_drives(shared: Daemon, bus: Bus) -> None:
+def test_speed_keys_change_the_speed_of_the_next_key(shared: Daemon, bus: Bus) -> None:
     with without_a_screen(shared, "--linear", "0.2") as (terminal, _):
         terminal.press("w")
         until(lambda: "0.22 m/s" in terminal.screen, 3.0, "the new speed on the screen")

@@ -208,14 +208,14 @@ def test_get_config_and_schema_give_dictionaries(shared: Daemon, fresh: Bus) -> 
         assert robot.get("info").pid == shared.pid
 
 
-def test_get_of_a_key_that_is_not_there_says_so(shared: Daemon) -> None:
+def test_get_of_an_unknown_key_raises_an_error_with_a_suggestion(shared: Daemon) -> None:
     with connect(shared.endpoint) as robot, pytest.raises(NoAnswerError) as error:
         robot.get("odometry")
     assert isinstance(error.value, TimeoutError)
     assert "did you mean odom?" in str(error.value)
 
 
-def test_messages_of_tf_static_yields_the_latched_one_and_ends_after_silence(
+def test_messages_of_tf_static_yields_the_latched_message_and_ends_after_its_timeout(
     shared: Daemon, fresh: Bus
 ) -> None:
     with connect(shared.endpoint) as robot:
@@ -229,14 +229,14 @@ def test_messages_of_tf_static_yields_the_latched_one_and_ends_after_silence(
         assert time.monotonic() - start < 2.0 + lost(start)
 
 
-def test_messages_of_silence_ends_after_its_timeout(shared: Daemon) -> None:
+def test_samples_of_a_silent_key_end_after_the_timeout(shared: Daemon) -> None:
     with connect(shared.endpoint) as robot:
         start = time.monotonic()
         assert list(robot.samples("cmd/nobody", timeout=0.3)) == []
         assert 0.25 < time.monotonic() - start < 1.5 + lost(start)
 
 
-def test_who_says_nothing_means_the_robot_of_the_file_that_the_environment_names(
+def test_connect_without_arguments_uses_the_file_that_the_environment_names(
     shared: Daemon, fresh: Bus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def pid() -> Any:
@@ -248,7 +248,7 @@ def test_who_says_nothing_means_the_robot_of_the_file_that_the_environment_names
         assert robot.get("info").pid == asyncio.run(pid()) == shared.pid
 
 
-def test_connecting_to_nobody_is_a_connection_error_with_the_mend() -> None:
+def test_connecting_without_a_daemon_raises_a_connection_error_with_the_remedy() -> None:
     endpoint = free_endpoint()
     with pytest.raises(UnreachableError) as error, connect(endpoint):
         pass
@@ -257,14 +257,14 @@ def test_connecting_to_nobody_is_a_connection_error_with_the_mend() -> None:
     assert "acsard run" in str(error.value)
 
 
-async def test_connecting_async_to_nobody_is_the_same_error() -> None:
+async def test_connecting_async_without_a_daemon_raises_the_same_error() -> None:
     with pytest.raises(UnreachableError):
         async with connect_async(free_endpoint()):
             pass
 
 
 @pytest.mark.parametrize("robot_id", ["a/b*", "", "robot 1"])
-def test_what_is_no_id_is_a_value_error(robot_id: str) -> None:
+def test_an_invalid_robot_id_raises_a_usage_error(robot_id: str) -> None:
     with (
         pytest.raises(UsageError, match="is not a robot's id"),
         connect(free_endpoint(), robot_id=robot_id),
@@ -272,7 +272,7 @@ def test_what_is_no_id_is_a_value_error(robot_id: str) -> None:
         pass
 
 
-def test_a_question_that_nobody_answers_in_time_is_a_timeout(
+def test_a_call_that_is_not_answered_in_time_raises_no_answer(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(synchronous, "REPLY_TIMEOUT_S", 0.3)
@@ -290,25 +290,27 @@ def test_a_question_that_nobody_answers_in_time_is_a_timeout(
 
 
 @pytest.mark.parametrize("endpoint", ["127.0.0.1:7448", "", "tcp/127.0.0.1", "tcp/[::1]"])
-def test_what_is_no_endpoint_is_a_value_error(endpoint: str) -> None:
+def test_an_invalid_endpoint_raises_a_value_error(endpoint: str) -> None:
     with pytest.raises(UsageError, match="write it like") as error, connect(endpoint):
         pass
     assert isinstance(error.value, ValueError)
 
 
-def test_what_is_no_key_is_a_value_error_that_says_where_the_keys_are(shared: Daemon) -> None:
+def test_an_invalid_key_raises_a_usage_error_that_names_the_topics_verb(shared: Daemon) -> None:
     with connect(shared.endpoint) as robot:
         for use in (robot.get, robot.subscribe, lambda name: next(robot.messages(name))):
             with pytest.raises(UsageError, match="acsard topics"):
                 use("odom//x")
 
 
-def test_a_question_that_cannot_be_answered_raises_what_the_daemon_says(shared: Daemon) -> None:
+def test_a_query_that_the_daemon_refuses_raises_the_daemon_s_reason(shared: Daemon) -> None:
     with connect(shared.endpoint) as robot, pytest.raises(ReplyError, match="fmt=json"):
         robot.get("odom?fmt=xml")
 
 
-def test_a_put_on_a_wildcard_is_no_message_of_the_robot(shared: Daemon, fresh: Bus) -> None:
+def test_a_put_on_a_wildcard_is_not_taken_for_a_message_of_the_robot(
+    shared: Daemon, fresh: Bus
+) -> None:
     with connect(shared.endpoint) as robot:
         states = robot.subscribe("state")
         raw = robot.samples("state", timeout=5.0)
@@ -323,7 +325,7 @@ def test_a_put_on_a_wildcard_is_no_message_of_the_robot(shared: Daemon, fresh: B
     assert set(heard) == {"acsard/acsar/state"}
 
 
-def test_services_answer_in_words(shared: Daemon, fresh: Bus) -> None:
+def test_services_answer_with_success_and_a_message(shared: Daemon, fresh: Bus) -> None:
     with connect(shared.endpoint) as robot:
         assert robot.call("stop").success
         refused = robot.call("activate")
@@ -371,7 +373,7 @@ def test_a_drive_that_is_stopped_on_its_way_raises_and_does_not_go_on(
 
 
 @pytest.mark.slow
-def test_a_drive_behind_another_commander_raises_and_says_who_drives(
+def test_a_drive_raises_and_names_the_sender_while_another_commander_drives(
     shared: Daemon, fresh: Bus
 ) -> None:
     with (
@@ -440,7 +442,7 @@ def test_a_reader_sleeps_between_messages(shared: Daemon, fresh: Bus) -> None:
 
 
 @pytest.mark.slow
-def test_the_first_send_is_a_zero_and_drives_ends_with_one(shared: Daemon, fresh: Bus) -> None:
+def test_a_drive_begins_and_ends_with_a_zero(shared: Daemon, fresh: Bus) -> None:
     with connect(shared.endpoint) as robot, fresh.follow("cmd/app") as commands:
         begun = time.monotonic()
         robot.drive(0.3, 0.1, seconds=0.2)
@@ -461,7 +463,7 @@ def _ended(speeds: list[float]) -> list[float]:
     return speeds if len(speeds) > 2 and speeds[-1] == 0.0 else []
 
 
-def test_a_drive_that_is_interrupted_stops_at_once(shared: Daemon, fresh: Bus) -> None:
+def test_a_drive_that_is_interrupted_sends_a_zero(shared: Daemon, fresh: Bus) -> None:
     class InterruptionError(Exception):
         pass
 
@@ -502,7 +504,9 @@ async def test_an_async_drive_runs_while_odometry_is_followed(shared: Daemon, fr
 
 
 @pytest.mark.slow
-async def test_cancelling_an_async_drive_sends_the_zero_at_once(shared: Daemon, fresh: Bus) -> None:
+async def test_cancelling_an_async_drive_sends_the_zero_immediately(
+    shared: Daemon, fresh: Bus
+) -> None:
     with fresh.follow("cmd/app") as commands:
         async with connect_async(shared.endpoint) as robot:
             driving = asyncio.create_task(robot.drive(0.5, seconds=60.0))
@@ -549,7 +553,7 @@ async def test_an_async_drive_does_not_go_on_after_its_event_loop_was_blocked(
     assert set(speeds) == {0.0}
 
 
-async def test_a_zero_right_behind_a_command_is_heard(shared: Daemon, fresh: Bus) -> None:
+async def test_a_zero_sent_right_after_a_command_is_not_lost(shared: Daemon, fresh: Bus) -> None:
     # A drive may be cancelled just after it sent a command. The bus drops commands of one key that
     # come faster than 1000 Hz, also because the receiver was busy and handles them in a row. Then
     # the robot would drive on for its timeout, so the zero goes out a second time.
@@ -584,7 +588,7 @@ async def test_an_async_call_and_pose_leave_the_loop_running(shared: Daemon, fre
         assert (await robot.pose()).x == pytest.approx(4.0, abs=1e-4)
 
 
-def test_a_daemon_that_is_asked_too_much_is_asked_again_but_no_verb_is_called_again() -> None:
+def test_the_client_repeats_a_query_to_a_busy_daemon_and_never_a_service_call() -> None:
     endpoint, asked = free_endpoint(), list[str]()
 
     def answer(query: zenoh.Query) -> None:
@@ -612,6 +616,6 @@ def test_a_daemon_that_is_asked_too_much_is_asked_again_but_no_verb_is_called_ag
         assert kept
 
 
-def test_nothing_of_this_was_an_exception_in_the_daemon(shared: Daemon) -> None:
+def test_no_client_request_raised_an_exception_in_the_daemon(shared: Daemon) -> None:
     assert "Traceback" not in shared.stderr
     assert shared.process.poll() is None

@@ -103,7 +103,7 @@ def typed_at(daemon: Daemon, words: Sequence[str]) -> list[str]:
 @pytest.mark.variations(4)
 @pytest.mark.parametrize(("words", "text"), SCREENS, ids=[" ".join(one) for one, _ in SCREENS])
 @pytest.mark.nightly
-def test_no_screen_has_a_colour_where_nobody_wants_one(
+def test_no_screen_has_a_colour_if_no_color_is_set(
     shared: Daemon, bus: Bus, tmp_path: Path, words: list[str], text: str
 ) -> None:
     assert colours(shown(typed_at(shared, words), tmp_path, text, NO_COLOR="1")) == []
@@ -112,7 +112,7 @@ def test_no_screen_has_a_colour_where_nobody_wants_one(
 @pytest.mark.variations(4)
 @pytest.mark.slow
 @pytest.mark.parametrize("words", [["drive"], ["top"], ["fleet"], ["doctor"]], ids=" ".join)
-def test_a_screen_has_colours_where_nobody_minds(
+def test_a_screen_has_colours_unless_no_color_is_set(
     shared: Daemon, bus: Bus, tmp_path: Path, words: list[str]
 ) -> None:
     text = next(text for verb, text in SCREENS if verb == words)
@@ -120,7 +120,7 @@ def test_a_screen_has_colours_where_nobody_minds(
 
 
 @pytest.mark.slow
-def test_no_help_and_no_usage_error_at_a_terminal_has_a_colour_then(tmp_path: Path) -> None:
+def test_no_help_and_no_usage_error_has_a_colour_if_no_color_is_set(tmp_path: Path) -> None:
     words = [sys.executable, "-c", EVERY_HELP]
     told = shown(words, tmp_path, "that was all", NO_COLOR="1")
     assert told.count("usage: acsard") >= 2 * len(VERBS)
@@ -140,7 +140,7 @@ def test_no_help_and_no_usage_error_at_a_terminal_has_a_colour_then(tmp_path: Pa
     ids=" ".join,
 )  # fmt: skip
 @pytest.mark.nightly
-def test_nothing_that_goes_into_a_pipe_has_one(shared: Daemon, bus: Bus, words: list[str]) -> None:
+def test_output_into_a_pipe_has_no_colour(shared: Daemon, bus: Bus, words: list[str]) -> None:
     env = environment(TERM="xterm-256color", FORCE_COLOR="1")
     env.pop("NO_COLOR", None)
     done = finish(acsard(*words, "--config", str(shared.config)), shared.config.parent, env=env)
@@ -149,7 +149,7 @@ def test_nothing_that_goes_into_a_pipe_has_one(shared: Daemon, bus: Bus, words: 
 
 
 @pytest.mark.slow
-def test_the_log_of_zenoh_in_a_pipe_has_none(tmp_path: Path) -> None:
+def test_the_log_of_zenoh_in_a_pipe_has_no_colour(tmp_path: Path) -> None:
     env = environment(TERM="xterm-256color", RUST_LOG="zenoh=debug")
     env.pop("NO_COLOR", None)
     words = acsard("run", "--listen", free_endpoint())

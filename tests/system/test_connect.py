@@ -89,7 +89,7 @@ def test_a_client_says_that_its_router_went_and_came_back(tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_two_daemons_that_see_each_other_directly_say_so_and_a_tool_how_many_it_saw(
+def test_two_directly_connected_daemons_report_it_and_a_wildcard_stop_reaches_one(
     tmp_path: Path,
 ) -> None:
     """Neither daemon forwards the other's messages.
@@ -118,7 +118,7 @@ def test_two_daemons_that_see_each_other_directly_say_so_and_a_tool_how_many_it_
             assert bus.state()["mode"] != "stopped"
 
 
-def test_a_daemon_that_connects_to_nobody_says_nothing_of_routers(tmp_path: Path) -> None:
+def test_a_daemon_without_a_connect_endpoint_reports_nothing_about_routers(tmp_path: Path) -> None:
     with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus:
         assert row(bus) is None
         assert daemon.events("router_missing") == []

@@ -13,14 +13,14 @@ from tests.system.cores import Idle, idle, idle_class, taken
 from tests.system.harness import Program
 
 
-def test_where_a_core_was_free_for_a_while_a_failure_counts() -> None:
+def test_a_failure_counts_if_a_core_was_idle_for_a_while() -> None:
     cores = os.cpu_count() or 1
     assert taken(Idle(100.0, 7.0), Idle(110.0, 7.0))
     assert taken(Idle(100.0, 7.0), Idle(110.0, 7.0 + 0.2 * cores))
     assert not taken(Idle(100.0, 7.0), Idle(110.0, 7.0 + 0.4 * cores))
 
 
-def test_it_is_counted_as_the_kernel_counts() -> None:
+def test_the_idle_time_grows_and_is_at_most_the_uptime_of_all_cores() -> None:
     first = idle()
     assert 0.0 <= first.idle_s <= first.at * (os.cpu_count() or 1) * 1.1
     assert idle() >= first

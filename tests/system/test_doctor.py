@@ -82,7 +82,7 @@ def test_every_mistake_in_the_configuration_is_a_failure(tmp_path: Path) -> None
     ("port", "words"),
     [("/dev/acsar_that_is_not", "does not exist"), ("/etc/passwd", "not a serial device")],
 )
-def test_a_port_that_is_none_is_a_failure_with_what_there_is(
+def test_an_invalid_port_is_a_failure_that_refers_to_acsard_ports(
     tmp_path: Path, port: str, words: str
 ) -> None:
     code, found = examined(tmp_path, toml(port))
@@ -91,7 +91,9 @@ def test_a_port_that_is_none_is_a_failure_with_what_there_is(
     assert "acsard ports" in worst(found["port"])["mend"]
 
 
-def test_who_holds_the_port_is_named_with_the_pid(tmp_path: Path, terminal: str) -> None:
+def test_the_process_that_holds_the_port_is_named_with_its_pid(
+    tmp_path: Path, terminal: str
+) -> None:
     holder = subprocess.Popen(
         [sys.executable, "-c", f"import os, time; os.open({terminal!r}, os.O_RDWR | os.O_NOCTTY)\n"
          "print('held', flush=True); time.sleep(30)"],
@@ -110,7 +112,7 @@ def test_who_holds_the_port_is_named_with_the_pid(tmp_path: Path, terminal: str)
     assert f"kill {holder.pid}" in held[0]["mend"]
 
 
-def test_a_daemon_that_runs_is_asked_how_it_is(tmp_path: Path) -> None:
+def test_doctor_reports_the_mode_of_a_running_daemon(tmp_path: Path) -> None:
     with FarPeer(tmp_path) as peer, Daemon(tmp_path, peer.path) as daemon, Bus(daemon.endpoint):
         peer.awaits(b"ap00.00")
         listen = f'[bus]\nlisten = ["{daemon.endpoint}"]\n'
@@ -121,7 +123,7 @@ def test_a_daemon_that_runs_is_asked_how_it_is(tmp_path: Path) -> None:
     assert code in (0, 1)  # the far peer itself holds the pty
 
 
-def test_what_a_daemon_runs_with_counts_and_where_the_file_differs_is_reported(
+def test_doctor_uses_the_running_daemon_s_values_and_reports_where_the_file_differs(
     tmp_path: Path,
 ) -> None:
     with FarPeer(tmp_path) as peer, Daemon(tmp_path, words=("--port", str(peer.path))) as daemon:
@@ -142,7 +144,9 @@ def test_what_a_daemon_runs_with_counts_and_where_the_file_differs_is_reported(
 
 
 @pytest.mark.nightly
-def test_a_daemon_that_was_started_with_listen_and_id_is_asked_by_them(tmp_path: Path) -> None:
+def test_doctor_finds_a_daemon_with_another_endpoint_and_id_by_the_same_options(
+    tmp_path: Path,
+) -> None:
     where = free_endpoint()
     with Daemon(tmp_path, words=("--listen", where, "--id", "other")) as daemon:
         file = daemon.config.read_text()
@@ -160,7 +164,7 @@ def test_a_daemon_that_was_started_with_listen_and_id_is_asked_by_them(tmp_path:
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="makes a process namespace")
-def test_of_a_daemon_on_another_machine_only_what_it_says_of_itself_is_reported(
+def test_doctor_does_not_check_the_local_port_for_a_daemon_on_another_machine(
     tmp_path: Path,
 ) -> None:
     apart = ("unshare", "--pid", "--fork", "--kill-child")
@@ -183,7 +187,7 @@ def test_of_a_daemon_on_another_machine_only_what_it_says_of_itself_is_reported(
         (("--id", "*"), "names several robots"),
     ],
 )
-def test_what_can_be_no_place_of_a_daemon_is_a_sentence(
+def test_invalid_connect_options_of_doctor_end_with_2_and_one_sentence(
     options: tuple[str, ...], words: str
 ) -> None:
     done = typed("doctor", *options)
@@ -196,7 +200,9 @@ def test_what_can_be_no_place_of_a_daemon_is_a_sentence(
 @pytest.mark.parametrize(
     ("fault", "words"), [("mute", "nothing was received"), ("lost_replies", "answered only")]
 )
-def test_a_poor_board_behind_a_daemon_is_named(tmp_path: Path, fault: str, words: str) -> None:
+def test_doctor_reports_the_faulty_board_of_a_running_daemon(
+    tmp_path: Path, fault: str, words: str
+) -> None:
     with Program(acsard("sim", "--fault", fault), tmp_path) as sim:
         port = sim.says("acsard run --port").split()[-1]
         with Daemon(tmp_path, words=("--port", port)) as daemon, Bus(daemon.endpoint) as bus:
@@ -212,7 +218,7 @@ def test_a_poor_board_behind_a_daemon_is_named(tmp_path: Path, fault: str, words
 
 
 @pytest.mark.nightly
-def test_an_address_with_something_else_behind_it_is_a_failure(tmp_path: Path) -> None:
+def test_an_address_at_which_another_program_listens_is_a_failure(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         endpoint = f"tcp/127.0.0.1:{other.getsockname()[1]}"
         began = time.monotonic()
@@ -269,7 +275,7 @@ def test_a_router_on_a_plain_endpoint_is_a_warning(tmp_path: Path) -> None:
     assert "every program that is connected to that router" in worst(found["bus"])["text"]
 
 
-def test_for_people_each_finding_is_a_line_and_its_mend_another(tmp_path: Path) -> None:
+def test_the_text_output_has_a_line_for_each_finding_and_one_for_its_remedy(tmp_path: Path) -> None:
     file = tmp_path / "doctor.toml"
     file.write_text(toml("/dev/acsar_that_is_not"))
     words = [sys.executable, "-m", "acsard", "doctor", "--config", str(file)]
@@ -279,7 +285,7 @@ def test_for_people_each_finding_is_a_line_and_its_mend_another(tmp_path: Path) 
     assert lines[index + 1].startswith("      -> ")
 
 
-def test_ports_lists_what_there_is_or_says_what_to_look_at() -> None:
+def test_ports_lists_the_serial_ports_or_refers_to_dmesg() -> None:
     words = [sys.executable, "-m", "acsard", "ports", "--json"]
     done = subprocess.run(words, capture_output=True, text=True, timeout=30, check=False)
     found: list[dict[str, Any]] = json.loads(done.stdout)

@@ -122,13 +122,15 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 @pytest.mark.parametrize("topic", ["odom", "tf", "joint_states", "cmd_vel_out"])
-def test_every_message_is_to_the_byte_what_a_ros_node_got(topic: str, both: Any) -> None:
+def test_every_exported_message_has_the_bytes_that_a_ros_node_received(
+    topic: str, both: Any
+) -> None:
     seen, _, told = both
     assert len(seen[topic]) > 100
     assert_among(seen[topic], told.data[f"/{topic}"], topic)
 
 
-def test_the_static_transforms_are_those_of_then(both: Any) -> None:
+def test_the_exported_static_transforms_are_those_that_were_published(both: Any) -> None:
     _, static, told = both
     (raw,) = told.data["/tf_static"]
     message = told.decode("/tf_static", raw)
@@ -139,7 +141,7 @@ def test_the_static_transforms_are_those_of_then(both: Any) -> None:
         assert one["transform"]["translation"]["x"] == other.transform.translation.x
 
 
-def test_every_diagnostics_has_the_rows_of_then(both: Any) -> None:
+def test_every_exported_diagnostics_message_has_the_rows_that_were_published(both: Any) -> None:
     seen, _, told = both
 
     def rows(raw: bytes) -> Any:
@@ -172,7 +174,7 @@ ALIKE = (
 )
 
 
-def test_every_state_has_the_values_of_then(both: Any) -> None:
+def test_every_exported_state_has_the_values_that_were_published(both: Any) -> None:
     seen, _, told = both
 
     def of_live(raw: bytes) -> Any:
@@ -194,7 +196,7 @@ def test_every_state_has_the_values_of_then(both: Any) -> None:
     assert_among(live, [of_file(raw) for raw in told.data["/state"]], "state")
 
 
-def test_every_event_of_then_is_in_the_log(both: Any) -> None:
+def test_every_published_event_is_in_the_exported_log(both: Any) -> None:
     seen, _, told = both
     lines = [told.decode("/log", raw) for raw in told.data["/log"]]
     lines = [one for one in lines if one.name not in ADDED]
@@ -205,21 +207,21 @@ def test_every_event_of_then_is_in_the_log(both: Any) -> None:
     assert_among(live, written, "log")
 
 
-def test_what_a_commander_sent_is_there_by_its_source(both: Any) -> None:
+def test_the_export_has_each_command_under_its_source(both: Any) -> None:
     _, _, told = both
     sent = [told.decode("/cmd_vel_in/app", raw) for raw in told.data["/cmd_vel_in/app"]]
     speeds = {(one.twist.linear.x, one.twist.angular.z) for one in sent}
     assert speeds >= {(0.3, 0.2)}
 
 
-def test_times_in_the_file_are_when_it_was_published(both: Any) -> None:
+def test_message_times_in_the_export_are_the_publication_stamps(both: Any) -> None:
     _, _, told = both
     for raw, time_ns in zip(told.data["/cmd_vel_out"], told.times["/cmd_vel_out"], strict=True):
         stamp = told.decode("/cmd_vel_out", raw).header.stamp
         assert stamp.sec * 10**9 + stamp.nanosec == time_ns
 
 
-def test_a_full_disk_is_a_sentence_and_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_an_export_to_a_full_disk_ends_with_one_sentence_and_leaves_no_file(tmp_path: Path) -> None:
     words = acsard("recording", "export", str(RECORDED), "new.mcap")
     full = ["sh", "-c", 'ulimit -f 16; exec "$@"', "sh", *words]  # blocks of 512 bytes per file
     ended = finish(full, tmp_path)

@@ -388,7 +388,7 @@ def test_an_unplug_is_seen_and_a_replug_under_another_name_found_in_time_without
 
 
 @pytest.mark.slow
-def test_a_peer_that_stops_reading_and_answering_finds_at_most_quiet_of_drive_lines(
+def test_a_board_that_stops_reading_and_answering_is_sent_few_drive_lines_then_zeros(
     tmp_path: Path, peer: Peer
 ) -> None:
     with (
@@ -416,7 +416,9 @@ def test_a_peer_that_stops_reading_and_answering_finds_at_most_quiet_of_drive_li
 
 
 @pytest.mark.slow
-def test_a_full_line_holds_no_line_of_ours_back(tmp_path: Path, peer: Peer) -> None:
+def test_no_line_waits_in_the_daemon_while_the_serial_line_is_full(
+    tmp_path: Path, peer: Peer
+) -> None:
     # Feedback goes on, so only the kernel's refusal shows that nothing goes out.
     with (
         Daemon(tmp_path, peer.path) as daemon,

@@ -621,7 +621,7 @@ def test_a_router_that_dies_and_returns_does_not_touch_local_driving(tmp_path: P
 
 @pytest.mark.soak
 @pytest.mark.timeout(600)
-def test_a_router_dies_and_returns_50_times(tmp_path: Path) -> None:
+def test_local_driving_continues_while_a_router_dies_and_returns_50_times(tmp_path: Path) -> None:
     found = rerouted(tmp_path, 50)
     assert statistics.median(found) <= 0.5
     assert max(found) <= 2.0

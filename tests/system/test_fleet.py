@@ -359,7 +359,7 @@ class Visitor:
         fooled = fleet.fooled()
         if done:
             fleet.restored()
-            assert not fooled, f"heard by others: {rows}"
+            assert not fooled, f"received by others: {rows}"
         return done or fooled
 
     def asked(self, rows: Sequence[Try]) -> dict[str, bool]:
@@ -440,7 +440,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
 @pytest.mark.parametrize("verb", get_args(Verb))
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.nightly
-def test_each_may_do_what_the_table_says_and_nothing_else(
+def test_each_certificate_may_do_exactly_what_the_access_table_allows(
     fleet: Fleet, name: str, verb: Verb
 ) -> None:
     found = fleet.tried(name, verb)
@@ -470,7 +470,7 @@ def test_an_operator_drives_one_robot_and_a_viewer_stops_it(fleet: Fleet) -> Non
 
 
 @pytest.mark.parametrize("name", ["operator", "maintainer", "robot1"])
-def test_our_client_drives_through_the_router_under_the_name_of_its_certificate(
+def test_the_python_client_drives_through_the_router_under_its_certificate_s_name(
     fleet: Fleet, name: str
 ) -> None:
     tls = str(fleet.where / name)
@@ -534,13 +534,13 @@ def test_on_a_robot_that_is_a_peer_programs_need_no_router_and_reach_no_other_ro
     two.at_rest()
 
 
-def test_robots_say_that_their_router_is_there_by_whatever_name(fleet: Fleet) -> None:
+def test_each_robot_reports_that_its_router_was_found(fleet: Fleet) -> None:
     for daemon in fleet.daemons:
-        until(partial(daemon.events, "router_found"), 5.0, "it is told")
+        until(partial(daemon.events, "router_found"), 5.0, "the router is reported")
         assert daemon.events("router_missing") == []
 
 
-def test_a_second_robot_with_the_same_id_ends_at_once(fleet: Fleet) -> None:
+def test_a_second_robot_with_the_same_id_ends_with_75(fleet: Fleet) -> None:
     with fleet.robot("robot1", "twin", ready=False) as twin:
         assert twin.ended(10.0) == Exit.IN_USE
     assert "already has the id robot1" in twin.stderr
@@ -555,7 +555,7 @@ def test_the_tools_join_as_the_manual_says(fleet: Fleet) -> None:
 
 
 @pytest.mark.parametrize("name", ["viewer", "robot1"])
-async def test_a_page_by_tls_has_a_card_of_its_own_robot_and_says_why_of_no_other(
+async def test_a_page_over_tls_shows_its_own_robot_and_says_why_it_shows_no_other(
     fleet: Fleet, name: str, tmp_path: Path
 ) -> None:
     by_tls = ["--connect", fleet.endpoint, "--tls", str(fleet.where / name), "--id", "robot1"]
@@ -570,7 +570,7 @@ async def test_a_page_by_tls_has_a_card_of_its_own_robot_and_says_why_of_no_othe
 # the files
 
 
-def test_the_lines_for_a_robot_are_a_configuration_without_surprises() -> None:
+def test_the_robot_configuration_of_the_manual_is_valid_without_warnings() -> None:
     config = parse(ROBOT_FILE.read_bytes())
     assert not warnings(config)
     assert config.bus.mode == "client"
@@ -613,7 +613,7 @@ def test_the_router_names_the_keys_of_the_topic_table_and_the_default_sources(
         assert not found["see"] & (commands | services - {"srv/stop"})
 
 
-def test_no_rule_of_the_router_compares_a_wildcard_with_what_people_send(tmp_path: Path) -> None:
+def test_no_ingress_rule_of_the_router_for_a_person_has_a_wildcard(tmp_path: Path) -> None:
     config = zenoh.Config.from_file(str(for_two(tmp_path)))
     access = json.loads(config.get_json("access_control"))
     rules = {rule["id"]: rule for rule in access["rules"]}

@@ -195,14 +195,14 @@ def test_the_state_shows_what_was_on_the_bus_at_the_time(viewer: Viewer, bus: Bu
     assert [one.name for one in told.sources] == [one["name"] for one in seen.value["sources"]]
 
 
-def test_it_has_the_topics_of_a_recording_and_no_others(viewer: Viewer) -> None:
+def test_foxglove_shows_the_topics_of_a_recording_and_no_others(viewer: Viewer) -> None:
     until(lambda: set(viewer.channels) >= set(TOPICS), 5.0, "all topics")
     types = {topic: one["schemaName"] for topic, one in viewer.channels.items()}
     assert types == {topic: type_name for topic, (type_name, _) in TOPICS.items()}
 
 
 @SLOW
-def test_who_comes_late_gets_tf_static_and_the_last_state(
+def test_a_late_viewer_gets_tf_static_and_the_last_diagnostics(
     viewer: Viewer, shows: Shows, bus: Bus
 ) -> None:
     first = viewer.show("/tf_static").first()[0]
@@ -216,7 +216,7 @@ def test_who_comes_late_gets_tf_static_and_the_last_state(
     viewer.show("/diagnostics").first()
 
 
-def test_what_a_source_commands_is_shown(viewer: Viewer, bus: Bus) -> None:
+def test_a_source_s_command_is_shown_on_its_topic(viewer: Viewer, bus: Bus) -> None:
     looked = viewer.show("/cmd_vel_in/nav")
     # No event shows when a subscription has reached the daemon. A zero moves no robot.
 
@@ -280,7 +280,7 @@ def asked(messages: list[Any]) -> list[tuple[str, float, float]]:
 
 @pytest.mark.nightly
 @SLOW
-def test_whatever_a_source_commands_by_is_shown_as_an_export_has_it(tmp_path: Path) -> None:
+def test_commands_of_every_type_and_transport_are_shown_as_in_an_export(tmp_path: Path) -> None:
     words = ["--record", str(tmp_path / "record")]
     with Daemon(tmp_path, words=words) as daemon, Shows(daemon) as own, Viewer(own.port) as viewer:
         sources = ("teleop", "ros2_control", "dock", "nav")
@@ -330,7 +330,7 @@ def exported(path: Path) -> dict[str, list[Any]]:
 
 @SLOW
 @pytest.mark.nightly
-def test_the_log_tells_the_daemon_s_events_each_once(viewer: Viewer, bus: Bus) -> None:
+def test_the_log_topic_has_each_event_of_the_daemon_once(viewer: Viewer, bus: Bus) -> None:
     looked = viewer.show("/log")
     looked.first()
     assert bus.get("srv/stop")["success"]
@@ -354,7 +354,7 @@ def lines(log: Looked) -> list[str]:
     return [log.read(one.payload).msg for one in list(log.came)]
 
 
-def test_the_bus_is_followed_for_what_is_shown_only(viewer: Viewer, bus: Bus) -> None:
+def test_a_key_is_subscribed_only_while_a_viewer_shows_it(viewer: Viewer, bus: Bus) -> None:
     # Zenoh tells a publisher of a key whether any subscriber listens.
     publisher: Any = bus.session.declare_publisher(f"{bus.root}/tf")
 
@@ -363,16 +363,14 @@ def test_the_bus_is_followed_for_what_is_shown_only(viewer: Viewer, bus: Bus) ->
 
     until(lambda: not listened(), 5.0, "no program listens at first")
     looked = viewer.show("/tf")
-    until(listened, 5.0, "somebody listens")
+    until(listened, 5.0, "a subscriber listens")
     looked.hide()
-    until(lambda: not listened(), 5.0, "nobody listens any more")
+    until(lambda: not listened(), 5.0, "no subscriber listens any more")
     publisher.undeclare()
 
 
 @SLOW
-def test_unless_it_is_to_drive_it_shows_and_stops_and_takes_nothing_else(
-    shared: Daemon, bus: Bus
-) -> None:
+def test_without_drive_foxglove_accepts_a_stop_and_no_commands(shared: Daemon, bus: Bus) -> None:
     with Shows(shared, "--id", "acsar") as own, Viewer(own.port) as viewer:
         assert viewer.info["capabilities"] == ["services"]
         looked = viewer.show("/odom")
@@ -388,7 +386,7 @@ def test_unless_it_is_to_drive_it_shows_and_stops_and_takes_nothing_else(
 
 
 @SLOW
-def test_an_older_viewer_is_turned_away_and_the_terminal_says_why(shows: Shows, bus: Bus) -> None:
+def test_an_older_viewer_is_refused_and_the_terminal_says_why(shows: Shows, bus: Bus) -> None:
     with pytest.raises(InvalidStatus):
         Viewer(shows.port, "foxglove.websocket.v1")
     until(lambda: "as Lichtblick before 2026 is" in shows.stderr, 5.0, shows.stderr)
@@ -434,7 +432,9 @@ def test_parameters_are_the_live_settings_and_errors_are_reported(viewer: Viewer
 
 @SLOW
 @pytest.mark.parametrize("encoding", ["json", "cdr"])
-def test_a_held_button_drives_and_letting_go_stops(viewer: Viewer, bus: Bus, encoding: str) -> None:
+def test_a_held_button_drives_and_its_release_stops_the_robot(
+    viewer: Viewer, bus: Bus, encoding: str
+) -> None:
     twist = Twist(Vector3(x=0.4), Vector3())
     data = speed(0.4) if encoding == "json" else encode(twist, "cdr")
     before = bus.state()["x"]
@@ -461,7 +461,9 @@ def test_each_viewer_is_a_sender_of_its_own(viewer: Viewer, shows: Shows, bus: B
 
 
 @SLOW
-def test_who_drives_in_vain_is_told_why_until_it_is_over(viewer: Viewer, bus: Bus) -> None:
+def test_a_viewer_whose_commands_do_not_drive_sees_the_reason_until_they_do(
+    viewer: Viewer, bus: Bus
+) -> None:
     bus.get("srv/stop")
     with Panel(viewer, speed(0.2)):
         told = viewer.status("your commands do not drive the robot: stopped by unnamed (native) at")
@@ -490,7 +492,7 @@ def test_a_publisher_that_sends_too_seldom_is_reported(viewer: Viewer) -> None:
 
 
 @SLOW
-def test_a_viewer_that_reads_nothing_or_floods_holds_up_nobody(
+def test_a_viewer_that_reads_nothing_or_floods_does_not_delay_other_viewers(
     viewer: Viewer, shows: Shows, bus: Bus
 ) -> None:
     looked = viewer.show("/odom")
@@ -535,7 +537,7 @@ TIMEOUT_S, TICKS_S = 0.25, 0.02
 @pytest.mark.variations(4)
 @SLOW
 @pytest.mark.parametrize("how", ["cut", "withdrawn", "killed", "left"])
-def test_whoever_is_gone_while_driving_leaves_a_robot_that_ramps_down(
+def test_the_robot_ramps_down_if_the_viewer_or_foxglove_ends_while_it_drives(
     shared: Daemon, bus: Bus, how: str
 ) -> None:
     with Shows(shared) as own, Viewer(own.port) as viewer, followed(bus) as (asked, applied):
@@ -562,7 +564,9 @@ def test_whoever_is_gone_while_driving_leaves_a_robot_that_ramps_down(
 
 
 @SLOW
-def test_what_a_process_that_stood_has_held_back_moves_nobody(shared: Daemon, bus: Bus) -> None:
+def test_commands_that_a_suspended_foxglove_process_held_back_move_no_robot(
+    shared: Daemon, bus: Bus
+) -> None:
     with Shows(shared) as own, Viewer(own.port) as viewer, followed(bus) as (asked, _):
         with Panel(viewer, speed(0.4)):
             driving(bus, 0.3)
@@ -599,7 +603,7 @@ def test_a_daemon_that_is_gone_is_reported_and_waited_for(tmp_path: Path) -> Non
 
 
 @SLOW
-def test_a_port_that_is_taken_is_a_sentence(shared: Daemon, tmp_path: Path) -> None:
+def test_a_port_that_is_in_use_ends_with_75_and_the_remedy(shared: Daemon, tmp_path: Path) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -615,7 +619,9 @@ def test_a_port_that_is_taken_is_a_sentence(shared: Daemon, tmp_path: Path) -> N
 
 @SLOW
 @pytest.mark.nightly
-def test_nobody_who_looks_costs_nothing(shows: Shows, viewer: Viewer, bus: Bus) -> None:
+def test_foxglove_without_shown_topics_costs_little_processor_time(
+    shows: Shows, viewer: Viewer, bus: Bus
+) -> None:
     def cost() -> float:
         """Return the processor time while the daemon publishes 300 odometry messages, s."""
         with bus.follow("odom") as odom:
@@ -631,9 +637,7 @@ def test_nobody_who_looks_costs_nothing(shows: Shows, viewer: Viewer, bus: Bus) 
 
 
 @SLOW
-def test_what_a_stamp_says_is_old_moves_nobody_however_it_trickles_in(
-    viewer: Viewer, bus: Bus
-) -> None:
+def test_commands_with_old_stamps_move_no_robot(viewer: Viewer, bus: Bus) -> None:
     name = "geometry_msgs/msg/TwistStamped"
     send, _ = viewer.publish_on("/cmd_vel", "json", name)
     twist = json.loads(speed(0.4))

@@ -71,18 +71,22 @@ def robot(tmp_path: Path, certificates: Certificates) -> Iterator[Open]:
 
 
 def gone(pid: int) -> bool:
-    """Return whether the process has ended, even if nobody has reaped it."""
+    """Return whether the process has ended, even if no process has reaped it."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
     except FileNotFoundError:
         return True
 
 
-def test_a_gateway_that_is_killed_is_opened_anew_and_counted(robot: Open) -> None:
+def test_a_gateway_that_is_killed_is_restarted_and_counted(robot: Open) -> None:
     assert robot.lets_in()
     first = robot.gateway()
     with Bus(robot.daemon.endpoint) as bus:
-        until(lambda: bus.count("gateway_opened") == 1, 5.0, "it has told that it is open")
+        until(
+            lambda: bus.count("gateway_opened") == 1,
+            5.0,
+            "the gateway has reported that it is open",
+        )
     os.kill(first, signal.SIGKILL)
     robot.daemon.gateway_opens(times=2)
     assert robot.lets_in()
@@ -130,7 +134,7 @@ def test_the_gateway_closes_with_the_daemon(robot: Open, number: signal.Signals)
     assert not robot.lets_in()
 
 
-def test_a_gateway_that_hangs_is_left_behind_by_no_daemon(robot: Open) -> None:
+def test_no_gateway_that_hangs_outlives_its_daemon(robot: Open) -> None:
     gateway = robot.gateway()
     os.kill(gateway, signal.SIGSTOP)
     robot.daemon.signal(signal.SIGTERM)
@@ -140,7 +144,7 @@ def test_a_gateway_that_hangs_is_left_behind_by_no_daemon(robot: Open) -> None:
 
 
 @pytest.mark.nightly
-def test_a_gateway_that_is_stopped_is_ended_and_opened_anew(robot: Open) -> None:
+def test_a_gateway_that_is_suspended_is_ended_and_restarted(robot: Open) -> None:
     first = robot.gateway()
     os.kill(first, signal.SIGSTOP)
     robot.daemon.gateway_opens(times=2)
@@ -150,7 +154,7 @@ def test_a_gateway_that_is_stopped_is_ended_and_opened_anew(robot: Open) -> None
     assert "stopped or hung" in line["text"]
 
 
-def test_a_machine_that_stood_still_opens_no_gateway_anew(robot: Open) -> None:
+def test_a_gateway_that_was_suspended_for_two_seconds_is_not_restarted(robot: Open) -> None:
     gateway = robot.gateway()
     os.kill(gateway, signal.SIGSTOP)
     end = time.monotonic() + 2.0
@@ -160,10 +164,14 @@ def test_a_machine_that_stood_still_opens_no_gateway_anew(robot: Open) -> None:
     assert robot.gateway() == gateway
 
 
-def test_what_somebody_at_the_machine_puts_in_the_gateway_s_place_harms_nobody(robot: Open) -> None:
+def test_forged_gateway_reports_are_ignored(robot: Open) -> None:
     huge = b'{"opened": 1, "connections": 0, "full": 1' + b"0" * 400 + b"}"
     with Bus(robot.daemon.endpoint) as bus:
-        until(lambda: bus.count("gateway_opened") == 1, 5.0, "it has told that it is open")
+        until(
+            lambda: bus.count("gateway_opened") == 1,
+            5.0,
+            "the gateway has reported that it is open",
+        )
         for payload in (b"", b"{}", b"\xff", huge):
             bus.session.put("acsard/acsar/gateway", payload)
         assert bus.ask("info")
@@ -187,7 +195,7 @@ def listening(endpoint: str) -> zenoh.Config:
 
 
 @pytest.mark.parametrize("answers", [True, pytest.param(False, marks=pytest.mark.nightly)])
-def test_a_daemon_that_is_connected_and_takes_nothing_in_has_it_opened_anew(
+def test_a_gateway_ends_if_its_connected_daemon_answers_no_queries(
     tmp_path: Path, certificates: Certificates, answers: bool
 ) -> None:
     """Zenoh has been seen to stop reading from a gateway on a machine with much other work."""
@@ -212,7 +220,7 @@ def test_a_daemon_that_is_connected_and_takes_nothing_in_has_it_opened_anew(
             assert "gateway_lost_daemon" in gateway.stdout + gateway.stderr
 
 
-def test_a_gateway_whose_daemon_ended_without_reading_its_signs_of_life_ends_in_order(
+def test_a_gateway_ends_in_order_if_its_daemon_ended_without_reading_signs_of_life(
     tmp_path: Path, certificates: Certificates
 ) -> None:
     """The kernel then reports a reset connection in place of its end."""

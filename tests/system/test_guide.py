@@ -82,7 +82,7 @@ async def test_a_board_is_checked_without_a_daemon_from_the_first_question_to_th
     assert written["port"] == "sim"
 
 
-async def test_a_key_stops_the_leg_and_all_others_see_that_it_goes_on(
+async def test_a_key_stops_the_leg_and_other_clients_see_the_procedure_and_cannot_control_it(
     page: Page, standing: Bus
 ) -> None:
     before = page.refused()
@@ -129,7 +129,7 @@ def left(guided: Guided, page: Page) -> None:
 
 
 @pytest.mark.parametrize("how", [gone, left])
-async def test_a_browser_that_goes_in_the_middle_of_a_drive_leaves_zeros_and_no_child(
+async def test_a_browser_that_disconnects_during_a_leg_leaves_zeros_and_no_child_process(
     page: Page, standing: Bus, how: Callable[[Guided, Page], None]
 ) -> None:
     async with guiding(page) as guided:
@@ -148,7 +148,9 @@ async def test_a_browser_that_goes_in_the_middle_of_a_drive_leaves_zeros_and_no_
     none_left(page)
 
 
-async def test_who_is_not_heard_any_more_drives_no_more(page: Page, standing: Bus) -> None:
+async def test_a_guide_client_that_sends_no_signs_of_life_loses_its_procedure(
+    page: Page, standing: Bus
+) -> None:
     async with guiding(page, pings=False) as guided:
         for _ in range(4):  # a busy machine may end it before
             await guided.begin("calibrate", method="umbmark")
@@ -162,7 +164,7 @@ async def test_who_is_not_heard_any_more_drives_no_more(page: Page, standing: Bu
         await beside(standing.at_rest)
 
 
-async def test_who_falls_silent_in_the_middle_of_a_drive_stops_it_within_a_second(
+async def test_a_client_that_falls_silent_during_a_leg_stops_it_within_a_second(
     page: Page, standing: Bus
 ) -> None:
     async with guiding(page) as guided:
@@ -181,7 +183,7 @@ LINES = 10
 
 
 @pytest.mark.network
-async def test_a_network_that_is_gone_in_the_middle_of_a_drive_stops_it_within_a_second(
+async def test_a_network_that_fails_during_a_leg_stops_it_within_a_second(
     hosts: Hosts, tmp_path: Path
 ) -> None:
     """No connection closes, and no program gets an error."""
@@ -286,7 +288,9 @@ def ended(pid: int) -> bool:
 
 
 @pytest.mark.network
-async def test_who_is_no_maintainer_begins_nothing(page: Page, standing: Bus) -> None:
+async def test_a_client_without_the_role_maintainer_begins_no_procedure(
+    page: Page, standing: Bus
+) -> None:
     before = page.refused().get("role", 0)
     for role in ("viewer", "operator"):
         token = page.invite(role, role)
@@ -310,7 +314,7 @@ INJECTED: list[dict[str, object]] = [
 """The unit tests of `web/guide.py` have all other wishes that are refused."""
 
 
-async def test_nothing_but_what_is_offered_can_be_begun(page: Page) -> None:
+async def test_only_the_offered_procedures_can_begin(page: Page) -> None:
     async with guiding(page) as guided:
         for wish in INJECTED:
             await guided.ours.say(**wish)
@@ -347,7 +351,7 @@ async def test_a_port_that_the_daemon_holds_is_reported_with_the_way_to_end_it(
 
 
 @pytest.mark.nightly
-async def test_a_browser_that_goes_while_a_motor_turns_leaves_zeros_and_the_port(
+async def test_a_browser_that_disconnects_while_a_motor_turns_leaves_zeros_and_a_free_port(
     tmp_path: Path,
 ) -> None:
     with Program(acsard("sim", "--fault", "no_watchdog"), tmp_path) as sim:
@@ -364,7 +368,7 @@ async def test_a_browser_that_goes_while_a_motor_turns_leaves_zeros_and_the_port
             again.says("PASS    motor a", 30.0)
 
 
-async def test_what_may_be_begun_is_listed(page: Page) -> None:
+async def test_the_guide_lists_the_procedures_and_ports_that_it_offers(page: Page) -> None:
     told = json.loads(await text(f"{page.here}/api/guide"))
     assert sorted(told["methods"]) == ["gyro", "positions", "tape", "umbmark", "wall"]
     assert told["method"] == "positions"

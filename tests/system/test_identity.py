@@ -132,7 +132,7 @@ def test_a_stolen_secret_does_not_take_the_robot_under_another_certificate(robot
     assert any(event["by"] == f"{victim.sender} [operator]" for event in events)
 
 
-def test_the_sender_of_a_client_by_tls_has_the_name_of_its_certificate(robot: Robot) -> None:
+def test_the_sender_of_a_client_over_tls_has_the_name_of_its_certificate(robot: Robot) -> None:
     tls = str(robot.certificates.own("operator"))
     with connect(robot.tls, tls=tls) as client, Bus(robot.plain) as bus:
         with bus.follow("state") as states:
@@ -142,7 +142,7 @@ def test_the_sender_of_a_client_by_tls_has_the_name_of_its_certificate(robot: Ro
     assert client.sender.endswith(" [operator]")
 
 
-def test_a_page_whose_server_comes_by_tls_drives_under_the_name_of_its_certificate(
+def test_a_page_server_connected_over_tls_drives_under_its_certificate_s_name(
     robot: Robot, tmp_path: Path
 ) -> None:
     async def story() -> None:

@@ -20,7 +20,7 @@ class Deaf:
         """Called for a stop."""
 
 
-def test_a_stop_query_counts_although_too_many_others_are_open_for_it_to_be_answered() -> None:
+def test_a_stop_query_counts_even_if_too_many_queries_are_open_to_answer_it() -> None:
     prefix, endpoint = "acsard/acsar/", free_endpoint()
     # The input is never started, so no query is answered, as with clients that read no reply.
     inbox = Inbox(prefix, Replies(prefix), (), Deaf())
@@ -36,7 +36,7 @@ def test_a_stop_query_counts_although_too_many_others_are_open_for_it_to_be_answ
         del held, asked
 
 
-def test_of_settings_a_step_takes_one_however_many_are_asked_for() -> None:
+def test_a_step_takes_at_most_one_query_for_settings() -> None:
     prefix, endpoint = "acsard/acsar/", free_endpoint()
     inbox = Inbox(prefix, Replies(prefix), (), Deaf())
     with zenoh.open(client_config(endpoint, "router")) as robot, Bus(endpoint) as bus:
@@ -56,7 +56,7 @@ def test_of_settings_a_step_takes_one_however_many_are_asked_for() -> None:
         del held, asked
 
 
-def test_a_flood_under_certificates_pushes_out_no_command_of_this_machine_nor_of_others() -> None:
+def test_a_flood_under_two_certificates_displaces_no_command_of_other_senders() -> None:
     prefix, endpoint = "acsard/acsar/", free_endpoint()
     inbox = Inbox(prefix, Replies(prefix), ("app", "nav"), Deaf())
     with zenoh.open(client_config(endpoint, "router")) as robot, Bus(endpoint) as bus:

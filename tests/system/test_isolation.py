@@ -357,7 +357,7 @@ def attacks(half_a_minute: Forms, a_moment: Forms) -> list[Any]:
         },
     ),
 )  # fmt: skip
-def test_who_is_let_in_disturbs_neither_the_loop_nor_the_stop_nor_the_others(
+def test_an_admitted_attacker_disturbs_neither_the_loop_nor_a_stop_nor_other_clients(
     tmp_path: Path, gateway: Gateway, form: str, who: Identity, seconds: float
 ) -> None:
     figures = Robot(tmp_path, gateway.network()).attacked(form, who, seconds)
@@ -377,7 +377,7 @@ def test_who_is_let_in_disturbs_neither_the_loop_nor_the_stop_nor_the_others(
     ),
 )
 @pytest.mark.nightly
-def test_who_attacks_the_fleets_router_does_not_disturb_the_robot_behind_it(
+def test_an_attack_on_the_fleets_router_does_not_disturb_the_robot_behind_it(
     tmp_path: Path, form: str, who: Identity, seconds: float
 ) -> None:
     with fleet(tmp_path, watched_router) as network:
@@ -397,7 +397,9 @@ HOLD_UP = ("publish", "querier", "as_peer")
         for n, form in enumerate(form for form in FORMS if form not in HOLD_UP)
     ],
 )
-def test_who_attacks_zenohd_does_not_disturb_the_robot_behind_it(tmp_path: Path, form: str) -> None:
+def test_an_attack_on_zenohd_does_not_disturb_the_robot_behind_it(
+    tmp_path: Path, form: str
+) -> None:
     with fleet(tmp_path, zenohd) as network:
         figures = Robot(tmp_path, network).attacked(form, "viewer", 1.5)
     print(f"\n{form} by viewer: {figures}")
@@ -419,7 +421,7 @@ def test_a_bus_that_is_locked_costs_messages_and_no_period(
 
 
 @pytest.mark.parametrize("form", ["many", pytest.param("subscribe", marks=pytest.mark.nightly)])
-def test_behind_the_gateway_not_even_wildcards_disturb(
+def test_wildcards_of_a_client_do_not_disturb_a_robot_behind_the_gateway(
     tmp_path: Path, gateway: Gateway, form: str
 ) -> None:
     figures = Robot(tmp_path, gateway.network(wildcards=True)).attacked(form, "viewer", 1.5)
@@ -428,7 +430,7 @@ def test_behind_the_gateway_not_even_wildcards_disturb(
     undisturbed(figures, back_s=3 * BACK_S)
 
 
-def test_who_takes_all_connections_is_in_the_log_and_in_the_state(
+def test_a_client_that_takes_all_connections_is_named_in_the_log_and_counted(
     tmp_path: Path, gateway: Gateway
 ) -> None:
     robot = Robot(tmp_path, gateway.network())

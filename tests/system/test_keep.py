@@ -55,7 +55,7 @@ def test_a_kept_setting_survives_a_restart_and_its_comments_stay(tmp_path: Path)
             assert robot.get("config")["limits"]["linear_speed"] == float(VALUE)
 
 
-def test_without_keep_the_file_stays(tmp_path: Path) -> None:
+def test_set_without_keep_does_not_change_the_file(tmp_path: Path) -> None:
     with Daemon(tmp_path, config={"limits": {"linear_speed": 0.5}}) as daemon:
         before = daemon.config.read_bytes()
         assert "; a lowered limit survives a restart" in tool(daemon, KEY, VALUE).out
@@ -63,7 +63,7 @@ def test_without_keep_the_file_stays(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_keep_and_a_refusal_of_the_robot(tmp_path: Path) -> None:
+def test_keep_leaves_the_file_if_the_robot_refuses_the_setting(tmp_path: Path) -> None:
     with Daemon(tmp_path) as daemon:
         before = daemon.config.read_bytes()
         ended = tool(daemon, "limits.linear_sped", "1", "--keep")

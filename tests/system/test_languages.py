@@ -305,7 +305,7 @@ for await (const line of createInterface({ input: process.stdin })) {
 
 @pytest.mark.languages
 @pytest.mark.timeout(600)
-def test_types_made_by_quicktype_compile_and_read_what_the_daemon_says(
+def test_types_made_by_quicktype_compile_and_parse_the_daemon_s_messages(
     schemas: Path, heard: list[Said], kept: Path, npm: str
 ) -> None:
     here = kept / "types"
@@ -341,7 +341,7 @@ for line in sys.stdin:
 
 @pytest.mark.languages
 @pytest.mark.timeout(600)
-def test_types_made_by_datamodel_code_generator_compile_and_read_what_the_daemon_says(
+def test_types_made_by_datamodel_code_generator_compile_and_parse_the_daemon_s_messages(
     schemas: Path, heard: list[Said], kept: Path
 ) -> None:
     install, generate = commands()[-2:]

@@ -25,7 +25,7 @@ def by(daemon: Daemon, name: str) -> list[Any]:
     return [line["by"] for line in daemon.events(name)]
 
 
-def test_who_calls_is_told_by_the_name_he_gives_himself(shared: Daemon, bus: Bus) -> None:
+def test_the_log_names_the_client_of_each_call_by_its_own_name(shared: Daemon, bus: Bus) -> None:
     with connect(shared.endpoint) as robot:
         robot.call("set_pose", x=1.0, y=0.0, yaw=0.0)
         robot.name = "patrol \x1b[2J(native)"
@@ -56,7 +56,7 @@ def test_a_put_on_stop_is_reported_with_the_session_that_stamped_it(
 
 
 @pytest.mark.slow
-def test_a_day_is_described_from_its_start_to_its_totals(tmp_path: Path, peer: Peer) -> None:
+def test_the_log_describes_a_run_from_its_start_to_its_totals(tmp_path: Path, peer: Peer) -> None:
     with running(tmp_path, peer.path) as (daemon, bus):
         bus.put("cmd/app", {"linear": {"x": 0.5}})
         with bus.commanding(0.5):

@@ -33,7 +33,7 @@ QUIETLY = (
 
 
 @pytest.mark.nightly
-def test_it_is_drawn_and_no_strangers_program_runs(tmp_path: Path) -> None:
+def test_a_report_is_drawn_and_an_injected_script_does_not_run(tmp_path: Path) -> None:
     assert BROWSER is not None
     path = tmp_path / "evil.html"
     evil = "<script>document.title = 'taken'</script>"
@@ -100,7 +100,9 @@ def test_no_label_of_a_picture_is_cut_on_a_phone_also_after_it_is_turned(tmp_pat
 
 
 @pytest.mark.nightly
-def test_nothing_is_wider_than_the_window_of_a_phone_or_a_desk(tmp_path: Path) -> None:
+def test_no_part_of_a_report_is_wider_than_the_window_of_a_phone_or_a_desktop(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "new.html"
     course, _ = drive_of_two()
     long = origin(file=f"{'0' * 70}.mcap", robot="robot-" * 12)
@@ -119,7 +121,7 @@ def test_nothing_is_wider_than_the_window_of_a_phone_or_a_desk(tmp_path: Path) -
 
 
 @pytest.mark.nightly
-def test_pictures_of_it_are_as_wide_as_a_phone_and_a_desk_and_as_high_as_it_is(
+def test_report_screenshots_have_the_width_of_the_screen_and_the_height_of_the_page(
     tmp_path: Path,
 ) -> None:
     written = pictures.report(tmp_path)

@@ -82,14 +82,14 @@ def messages(program: Program) -> list[Any]:
     return [json.loads(line) for line in program.out]
 
 
-def test_echo_of_all_robots_says_whose_each_message_is(robots: Robots) -> None:
+def test_echo_of_all_robots_names_the_robot_of_each_message(robots: Robots) -> None:
     with Program(robots.words("echo", "state"), robots.where) as program:
         until(lambda: {one["robot"] for one in messages(program)} >= {ONE, TWO}, 10.0, "both")
     assert all(one["message"]["link"] for one in messages(program))
     assert "following robot1, robot2" in program.stderr
 
 
-def test_get_of_named_robots_says_whose_each_answer_is(robots: Robots) -> None:
+def test_get_of_named_robots_names_the_robot_of_each_answer(robots: Robots) -> None:
     ended = robots.tool("get", "info", who=f"{TWO},{ONE}")
     assert (ended.code, ended.err) == (0, "")
     found = [json.loads(line) for line in ended.out.splitlines()]
@@ -123,7 +123,7 @@ def fake(robots: Robots, answer: bytes | None) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("answer", [b'["x"]', json.dumps({"success": False, "message": HOSTILE})])
-def test_an_answer_of_a_stranger_hides_no_other_and_does_nothing_to_the_terminal(
+def test_a_stranger_s_answer_hides_no_robot_and_sends_no_control_codes_to_the_terminal(
     robots: Robots, answer: str | bytes
 ) -> None:
     with fake(robots, answer if isinstance(answer, bytes) else answer.encode()):
@@ -138,7 +138,7 @@ def test_an_answer_of_a_stranger_hides_no_other_and_does_nothing_to_the_terminal
 
 
 @pytest.mark.slow
-def test_who_gives_no_answer_hides_no_other(robots: Robots) -> None:
+def test_a_robot_that_does_not_answer_hides_no_other_robot(robots: Robots) -> None:
     with fake(robots, None):
         ended = robots.tool("get", "info")
     assert ended.code == 69
@@ -146,7 +146,7 @@ def test_who_gives_no_answer_hides_no_other(robots: Robots) -> None:
     assert ended.err.startswith("fake: NO ANSWER")
 
 
-def test_a_stop_to_all_reaches_each_without_anybody_having_been_found(robots: Robots) -> None:
+def test_a_stop_to_all_reaches_each_robot_without_discovery(robots: Robots) -> None:
     with zenoh.open(client_config(robots.endpoint)) as session:
         stop(session, [ALL], "me")
         for name in (ONE, TWO):
@@ -156,7 +156,7 @@ def test_a_stop_to_all_reaches_each_without_anybody_having_been_found(robots: Ro
         robots.tool("call", "clear", who=name)
 
 
-def test_fleet_is_a_line_for_each_robot_with_what_it_does_and_why(robots: Robots) -> None:
+def test_fleet_prints_a_line_for_each_robot_with_its_mode_and_reason(robots: Robots) -> None:
     ended = robots.tool("fleet", "--once")
     assert (ended.code, ended.err) == (
         0,
@@ -191,14 +191,14 @@ def test_a_table_for_a_pipe_does_not_wait_for_the_connection_to_be_closed(
     assert b"ready" in told[-1]
 
 
-def test_named_robots_are_not_waited_for_once_each_is_reported(robots: Robots) -> None:
+def test_fleet_stops_waiting_when_each_named_robot_has_reported(robots: Robots) -> None:
     both, missing = (robots.tool("fleet", "--once", who=f"{ONE},{o}") for o in (TWO, "robot9"))
     assert 1.5 * both.seconds < missing.seconds
     assert len(re.findall(r"^robot\d +ready .* waiting for a command", both.out, re.M)) == 2
 
 
 @pytest.mark.slow
-def test_fleet_at_a_terminal_is_live_and_says_who_has_gone(robots: Robots) -> None:
+def test_fleet_at_a_terminal_is_live_and_says_which_robot_has_gone(robots: Robots) -> None:
     third: Tables = {
         "robot": {"id": "robot3"},
         "ros": {"namespace": "robot3"},
@@ -305,7 +305,7 @@ def test_a_named_robot_that_is_absent_is_reported(robots: Robots) -> None:
     assert robots.tool("fleet", "--once", who="robot8,robot9").code == 69
 
 
-def test_stop_of_all_stops_each_and_says_who_answered(robots: Robots) -> None:
+def test_stop_of_all_stops_each_robot_and_names_those_that_answered(robots: Robots) -> None:
     ended = robots.tool("call", "stop")
     assert (ended.code, ended.err) == (
         0,
@@ -320,7 +320,9 @@ def test_stop_of_all_stops_each_and_says_who_answered(robots: Robots) -> None:
     assert set(modes.values()) == {"stopped"}
 
 
-def test_stop_of_several_says_who_gave_no_answer_and_ends_with_69(robots: Robots) -> None:
+def test_stop_of_several_names_the_robot_that_did_not_answer_and_ends_with_69(
+    robots: Robots,
+) -> None:
     ended = robots.tool("call", "stop", who=f"{ONE},robot9")
     assert ended.code == 69
     assert re.search(rf"^{ONE}: stopped", ended.out, re.M)
@@ -357,7 +359,7 @@ def test_set_ends_with_1_if_one_robot_refuses_and_with_69_if_one_does_not_answer
     assert re.search(r"^robot9: NO ANSWER: ", ended.out, re.M)
 
 
-def test_nothing_but_stop_goes_to_many(robots: Robots) -> None:
+def test_only_stop_can_be_called_on_many_robots(robots: Robots) -> None:
     for service in ("clear", "activate"):
         ended = robots.tool("call", service)
         assert ended.code == 2
@@ -389,7 +391,7 @@ def test_the_two_robots_of_the_fleet_page_are_in_one_view(tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_nobody_there_is_reported_with_69(tmp_path: Path) -> None:
+def test_an_empty_network_is_reported_with_69(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     with zenoh.open(client_config(endpoint, "router")):
         nobody = Robots(tmp_path, endpoint, {})
@@ -402,7 +404,9 @@ def test_nobody_there_is_reported_with_69(tmp_path: Path) -> None:
 @pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.network
-def test_by_tls_a_wildcard_sees_nobody_and_is_told_why_and_names_do(tmp_path: Path) -> None:
+def test_over_tls_a_wildcard_finds_no_robot_and_says_why_and_named_robots_are_found(
+    tmp_path: Path,
+) -> None:
     endpoint = free_tls_endpoint()
     certified(tmp_path, "router.local", ONE, "viewer")
     with router(tmp_path, endpoint) as program:

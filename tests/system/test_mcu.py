@@ -51,7 +51,7 @@ def test_a_port_that_is_not_there_ends_with_66() -> None:
     assert "acsard ports" in ended.err
 
 
-def test_without_a_terminal_it_refuses_with_2() -> None:
+def test_mcu_check_without_a_terminal_ends_with_2() -> None:
     ended = typed("mcu", "check", "--port", "sim")
     assert (ended.code, ended.out) == (2, "")
     assert "terminal" in ended.err
@@ -84,7 +84,7 @@ def answer_all(terminal: Terminal, wheels: tuple[str, ...], ways: str, within: f
 
 
 @pytest.mark.slow
-def test_what_a_person_at_the_terminal_sees_becomes_the_wheel_map(tmp_path: Path) -> None:
+def test_the_operator_s_answers_become_the_wheel_map(tmp_path: Path) -> None:
     (tmp_path / "acsard.toml").write_text("# mine\n")
     with at_terminal(tmp_path, "mcu", "check", "--port", "sim", "--write") as (terminal, program):
         answer(terminal, 'then type "lifted"', "yes", 1, 10.0)
@@ -100,7 +100,7 @@ def test_what_a_person_at_the_terminal_sees_becomes_the_wheel_map(tmp_path: Path
 
 
 @pytest.mark.slow
-def test_ctrl_c_at_the_first_question_ends_it_with_130(tmp_path: Path) -> None:
+def test_ctrl_c_at_the_first_question_ends_mcu_check_with_130(tmp_path: Path) -> None:
     with at_terminal(tmp_path, "mcu", "check", "--port", "sim") as (terminal, program):
         until(lambda: "lifted" in terminal.screen, 10.0, "the question")
         terminal.press("\x03")
@@ -149,7 +149,7 @@ def checked(where: Path, name: str) -> tuple[int, dict[str, Any], str]:
 @pytest.mark.soak
 @pytest.mark.network
 @pytest.mark.timeout(3 * CHECK_S)
-def test_each_planted_fault_is_found_on_a_pty_and_the_good_one_passes(tmp_path: Path) -> None:
+def test_each_planted_fault_is_found_on_a_pty_and_a_good_board_passes(tmp_path: Path) -> None:
     """The check finds the fault, or does not judge it because this machine was late.
 
     A test in virtual time shows that this is the only reason for not judging it.

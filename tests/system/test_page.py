@@ -160,7 +160,7 @@ def test_a_finger_drives_a_metre_turns_stops_and_clears(page: Phone) -> None:
     assert browser.said == []
 
 
-def test_space_stops_from_every_view_and_who_held_the_stick_drives_no_more(page: Phone) -> None:
+def test_space_stops_from_every_view_and_a_stick_that_is_held_drives_no_more(page: Phone) -> None:
     browser, bus = page.browser, page.bus
     for view in VIEWS:
         browser.tap(f"tab-{view}")
@@ -189,7 +189,7 @@ def test_space_stops_from_every_view_and_who_held_the_stick_drives_no_more(page:
 
 @pytest.mark.nightly
 @alone
-def test_what_a_button_could_not_is_reported_once(page: Phone) -> None:
+def test_a_button_s_failure_is_reported_once(page: Phone) -> None:
     page.browser.tap("tab-set")
     page.browser.js("document.getElementById('reset').click()")
     page.shows("set-told", "pose is x 0")
@@ -246,7 +246,7 @@ def test_keys_drive_after_the_slider_was_set_and_leave_it_where_it_is(page: Phon
 
 
 @pytest.mark.nightly
-def test_who_has_no_mouse_sets_the_slider_by_the_arrows_and_drives_by_letters(page: Phone) -> None:
+def test_arrow_keys_set_the_slider_and_letter_keys_drive_without_a_mouse(page: Phone) -> None:
     browser, bus = page.browser, page.bus
     for _ in range(40):
         if browser.js("document.activeElement.id") == "limit":
@@ -265,14 +265,16 @@ def test_who_has_no_mouse_sets_the_slider_by_the_arrows_and_drives_by_letters(pa
 
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("where", ["map", "limit", "tab-drive"])
-def test_a_second_finger_wherever_lets_go(page: Phone, where: str) -> None:
+def test_a_second_finger_anywhere_releases_the_stick(page: Phone, where: str) -> None:
     page.hold()
     page.browser.tap(where)
     page.shows("told", "use one finger to drive")
     page.bus.at_rest()
 
 
-def test_a_mouse_that_lets_go_of_its_button_beside_another_one_lets_go(page: Phone) -> None:
+def test_releasing_the_left_mouse_button_while_another_is_held_releases_the_stick(
+    page: Phone,
+) -> None:
     """The browser sends no pointerup until the last finger is lifted."""
     browser, bus = page.browser, page.bus
     browser.size(*DESKTOP, touch=False)
@@ -308,7 +310,7 @@ COARSE = """(() => {
 
 
 @alone
-def test_a_browser_whose_clock_stands_for_a_tenth_of_a_second_drives_and_lets_go(
+def test_a_browser_with_a_clock_resolution_of_a_tenth_of_a_second_drives_and_stops(
     page: Phone,
 ) -> None:
     page.browser.js(COARSE)
@@ -327,7 +329,9 @@ JAM = """(() => {
 """A network that accepts nothing for now. The page's writes to it are logged."""
 
 
-def test_the_zero_of_a_finger_that_leaves_goes_twice_also_where_much_waits(page: Phone) -> None:
+def test_the_zero_of_a_released_stick_is_sent_twice_also_over_a_congested_socket(
+    page: Phone,
+) -> None:
     """A daemon that reads late may drop a zero that closely follows another command."""
     page.hold()
     page.browser.js(JAM)
@@ -339,7 +343,7 @@ def test_the_zero_of_a_finger_that_leaves_goes_twice_also_where_much_waits(page:
     assert commands[1]["stamp"] - commands[0]["stamp"] >= 49.0
 
 
-def test_a_page_that_is_frozen_lets_go(page: Phone) -> None:
+def test_a_page_that_is_frozen_releases_the_stick(page: Phone) -> None:
     """A phone freezes a page that was put away.
 
     It hides the page before, so this test sends the event alone.
@@ -350,7 +354,7 @@ def test_a_page_that_is_frozen_lets_go(page: Phone) -> None:
     assert page.browser.js("document.getElementById('stick').matches('.held')") is False
 
 
-def test_a_page_lets_go_when_the_browser_is_about_to_go_elsewhere(page: Phone) -> None:
+def test_a_page_releases_the_stick_before_the_browser_leaves_it(page: Phone) -> None:
     """The test waits for this event alone.
 
     The browser reports the later ones late on a busy machine.
@@ -369,7 +373,7 @@ def viewers(page: Phone) -> int:
 
 @pytest.mark.nightly
 @alone
-def test_a_page_that_is_left_is_gone_at_once_and_there_again_when_somebody_goes_back(
+def test_a_page_disconnects_when_it_is_left_and_reconnects_after_going_back(
     page: Phone,
 ) -> None:
     """The browser keeps the page, asleep, with everything that it has open."""
@@ -377,7 +381,7 @@ def test_a_page_that_is_left_is_gone_at_once_and_there_again_when_somebody_goes_
     assert viewers(page) == 1
     left = time.monotonic()
     browser.open("about:blank")
-    until(lambda: viewers(page) == 0, 5.0, "nobody looks")
+    until(lambda: viewers(page) == 0, 5.0, "no page is open")
     assert time.monotonic() - left < HEARTBEAT_S, "the server had to find out"
     browser.js("history.back()")
     page.shows("age", "live")
@@ -393,7 +397,7 @@ PAD = """navigator.getGamepads = () => [{index: 0, connected: true, axes: AXES,
     buttons: Array.from({length: 16}, (_, n) => ({pressed: n === 5 && HELD}))}]"""
 
 
-def test_a_key_that_is_let_go_elsewhere_is_let_go(page: Phone) -> None:
+def test_a_key_released_while_another_element_has_the_focus_stops_the_robot(page: Phone) -> None:
     browser, bus = page.browser, page.bus
     for leave in ("document.getElementById('limit').focus()", "0"):
         browser.js("document.activeElement.blur()")
@@ -407,7 +411,9 @@ def test_a_key_that_is_let_go_elsewhere_is_let_go(page: Phone) -> None:
 
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("other", ["MetaLeft", "menu", "drag"])
-def test_a_key_whose_end_a_system_may_keep_to_itself_is_let_go(page: Phone, other: str) -> None:
+def test_a_key_is_released_if_the_system_may_swallow_its_key_up_event(
+    page: Phone, other: str
+) -> None:
     browser, bus = page.browser, page.bus
     browser.key("Down", "KeyW", "w")
     until(lambda: (bus.state()["linear"] or 0.0) > 0.15, 10.0, "forwards")
@@ -424,7 +430,7 @@ def test_a_key_whose_end_a_system_may_keep_to_itself_is_let_go(page: Phone, othe
     browser.key("Up", "KeyW", "w")
 
 
-def test_a_key_that_was_pressed_while_nothing_drives_takes_no_part_in_the_next_drive(
+def test_a_key_that_was_pressed_while_driving_was_impossible_does_not_drive_later(
     page: Phone,
 ) -> None:
     """Its release may never be reported, for example while Meta is down."""
@@ -443,7 +449,7 @@ def test_a_key_that_was_pressed_while_nothing_drives_takes_no_part_in_the_next_d
 
 
 @alone
-def test_a_stop_that_fails_is_seen_in_every_view(page: Phone) -> None:
+def test_a_stop_that_fails_raises_the_alarm_in_every_view(page: Phone) -> None:
     page.browser.tap("tab-events")
     page.server.process.kill()
     page.shows("age", "no connection")
@@ -452,9 +458,7 @@ def test_a_stop_that_fails_is_seen_in_every_view(page: Phone) -> None:
 
 
 @alone
-def test_a_stop_into_a_connection_that_is_dead_and_does_not_know_it_is_sent_again(
-    page: Phone, tmp_path: Path
-) -> None:
+def test_a_stop_into_a_dead_connection_is_sent_again(page: Phone, tmp_path: Path) -> None:
     page.server.signal(signal.SIGSTOP)
     page.browser.tap("stop")
     page.server.process.kill()
@@ -462,7 +466,7 @@ def test_a_stop_into_a_connection_that_is_dead_and_does_not_know_it_is_sent_agai
     address = page.server.here
     with Page(page.daemon, tmp_path, "--address", address):
         begun = time.monotonic()
-        until(lambda: page.bus.state()["mode"] == "stopped", 1.0, "it is told again")
+        until(lambda: page.bus.state()["mode"] == "stopped", 1.0, "the stop is sent again")
         took = time.monotonic() - begun
         assert took - 4 * lost(begun, begun + took) < 1.0  # it is sent every 0.3 s
         until(lambda: page.browser.text("alarm") == "", 5.0, "and says so")
@@ -515,7 +519,7 @@ def test_a_gamepad_drives_only_after_a_press_that_begins_while_it_is_connected(
     assert page.browser.js(PADS.replace("PADS", pads).replace("HELD", HELD)) == holds
 
 
-def test_an_idle_gamepad_that_is_lost_and_comes_back_held_between_two_looks_drives_nothing(
+def test_an_idle_gamepad_that_reconnects_with_a_held_button_drives_nothing(
     page: Phone,
 ) -> None:
     pads = "[[0, false]], [[0, true]]"
@@ -524,7 +528,7 @@ def test_an_idle_gamepad_that_is_lost_and_comes_back_held_between_two_looks_driv
     assert page.browser.js(script.replace("navigator.getGamepads =", lost)) == [False, False]
 
 
-def test_a_gamepad_that_is_gone_lets_go(page: Phone) -> None:
+def test_a_gamepad_that_disconnects_releases_the_stick(page: Phone) -> None:
     browser, bus = page.browser, page.bus
     pad = PAD.replace("AXES", "[0, -1, 0, 0]")
     browser.js(pad.replace("HELD", "false") + ";1")
@@ -572,7 +576,7 @@ def test_the_screen_stays_on_while_the_stick_is_held_and_no_longer(page: Phone) 
 
 
 @alone
-def test_what_is_old_is_grey_and_says_so_and_comes_back_by_itself(page: Phone) -> None:
+def test_stale_values_are_grey_and_marked_until_messages_return(page: Phone) -> None:
     page.hold()
     page.shows("mode", "DRIVING")
     page.daemon.signal(signal.SIGSTOP)
@@ -599,7 +603,7 @@ def test_what_is_old_is_grey_and_says_so_and_comes_back_by_itself(page: Phone) -
 
 
 @alone
-def test_a_page_that_comes_when_nothing_is_heard_waits_and_shows_nothing_as_measured(
+def test_a_page_opened_while_the_daemon_is_silent_waits_and_shows_no_measurements(
     page: Phone,
 ) -> None:
     """The page's server still has a state from before."""
@@ -706,7 +710,7 @@ SET = """(() => {
 
 
 @alone
-def test_what_is_set_and_switched_on_the_page_is_so(page: Phone) -> None:
+def test_settings_and_activation_on_the_page_reach_the_robot(page: Phone) -> None:
     browser, bus = page.browser, page.bus
     browser.tap("tab-set")
     until(lambda: browser.js(SET), 5.0, "the setting is there")
@@ -742,7 +746,7 @@ def drawing(browser: Browser) -> str:
 
 @pytest.mark.nightly
 @alone
-def test_the_map_is_nearer_and_farther_and_follows_the_robot_again(page: Phone) -> None:
+def test_the_map_zooms_in_and_out_and_can_follow_the_robot_again(page: Phone) -> None:
     """Each button changes the drawing, and the reverse button restores it."""
     browser = page.browser
     begun = drawing(browser)
@@ -777,7 +781,7 @@ def test_the_map_turns_with_the_robot_and_back(page: Phone) -> None:
     until(lambda: browser.js(DRAWN) == before, 5.0, "as before")
 
 
-def test_the_dials_say_command_and_measurement_in_one_line_and_offer_degrees(page: Phone) -> None:
+def test_the_dials_show_command_and_measurement_in_one_line_and_offer_degrees(page: Phone) -> None:
     browser = page.browser
     page.browser.push(0, 0, "Start")
     page.browser.push(-80, 0)
@@ -806,7 +810,7 @@ FOLDED = """import('/page/views.js').then(({folded}) => folded([
 ]).map(one => [one.text, one.equal]))"""
 
 
-def test_equal_events_in_a_row_are_one_with_a_count(page: Phone) -> None:
+def test_equal_consecutive_events_are_shown_once_with_a_count(page: Phone) -> None:
     assert page.browser.js(FOLDED) == [["a", 2], ["b", 1], ["a", 1]]
 
 
@@ -819,7 +823,7 @@ PERSON = """import('/page/words.js').then(({person}) => [
     person('session 0123456789abcdef [laptop]'), person('0b5d (rmw)')])"""
 
 
-def test_a_sender_has_the_name_that_a_person_knows(page: Phone) -> None:
+def test_a_sender_is_shown_by_a_name_that_a_person_knows(page: Phone) -> None:
     assert page.browser.js(PERSON) == [
         "you",
         "another page on the robot itself",
@@ -842,20 +846,24 @@ def test_a_refusal_of_a_button_disappears_when_the_mode_changes(page: Phone) -> 
     until(lambda: page.browser.text("complaint") == "", 5.0, "the refusal is gone")
 
 
-def test_somebody_else_who_drives_is_named(page: Phone) -> None:
+def test_another_client_that_drives_is_named(page: Phone) -> None:
     with page.bus.commanding(0.1, source="teleop"):
         page.browser.tap("tab-status")
-        until(lambda: "drives" in row(page, "teleop"), 5.0, "who drives is in the table")
+        until(lambda: "drives" in row(page, "teleop"), 5.0, "the driver is in the table")
         assert row(page, "app").endswith("a command")  # the command for which it waits
         page.browser.tap("tab-drive")
-        until(lambda: page.browser.text("who") not in ("–", "nobody", "you"), 5.0, "who drives")
+        until(
+            lambda: page.browser.text("who") not in ("–", "nobody", "you"),
+            5.0,
+            "the driver is named",
+        )
         assert re.search(HEX, page.browser.text("who")) is None
         page.shows("hint", "drives: you can drive when they stop.")
     page.shows("reason", "Nobody drives.")
     page.shows("hint", "Hold and push to drive")
 
 
-async def test_a_second_driver_is_told_at_once_who_drives_and_the_stick_is_grey(
+async def test_a_second_page_names_the_driver_and_its_stick_is_grey(
     page: Phone,
 ) -> None:
     def look() -> None:
@@ -966,7 +974,7 @@ def test_stick_stop_speed_mode_and_path_fit_on_the_screen_beside_each_other(
 
 
 @pytest.mark.nightly
-def test_what_is_pressed_is_large_enough_for_a_finger(page: Phone) -> None:
+def test_every_control_is_large_enough_for_a_finger(page: Phone) -> None:
     page.bus.get("srv/stop")
     page.shows("mode", "STOPPED")  # together with Release
     for size, view in itertools.product((PHONE, SIDEWAYS, SMALL_SIDEWAYS), VIEWS):
@@ -975,7 +983,7 @@ def test_what_is_pressed_is_large_enough_for_a_finger(page: Phone) -> None:
         assert page.browser.too_small() == [], (size, view)
 
 
-def test_words_at_the_stick_say_how_to_drive_while_nobody_holds_it(page: Phone) -> None:
+def test_words_at_the_stick_say_how_to_drive_while_it_is_released(page: Phone) -> None:
     seen = "getComputedStyle(document.getElementById('hint')).visibility"
     page.shows("hint", "Hold and push to drive; release to stop.")
     assert page.browser.js(seen) == "visible"
@@ -987,7 +995,7 @@ def test_words_at_the_stick_say_how_to_drive_while_nobody_holds_it(page: Phone) 
 
 @pytest.mark.nightly
 @alone
-async def test_a_page_that_has_no_place_says_why_and_stops(page: Phone) -> None:
+async def test_a_page_beyond_the_connection_limit_says_why_and_can_still_stop(page: Phone) -> None:
     reading: list[asyncio.Task[None]] = []
 
     async def read(other: Hands) -> None:
@@ -1013,7 +1021,7 @@ async def test_a_page_that_has_no_place_says_why_and_stops(page: Phone) -> None:
 
 
 @pytest.mark.nightly
-def test_nothing_stands_in_the_way_of_a_screen_reader(page: Phone) -> None:
+def test_no_view_has_obstacles_for_a_screen_reader(page: Phone) -> None:
     looked = itertools.product((PHONE, SIDEWAYS, DESKTOP), (False, True), (False, True), VIEWS)
     for size, dark, stopped, view in looked:
         page.browser.size(*size, touch=size != DESKTOP, dark=dark)
@@ -1049,7 +1057,9 @@ def test_every_state_is_fit_for_a_screen_reader_and_the_map_keeps_its_buttons() 
 
 
 @pytest.mark.nightly
-def test_every_view_is_drawn_on_a_phone_both_ways_and_a_desktop(tmp_path: Path) -> None:
+def test_every_view_is_drawn_on_a_phone_in_both_orientations_and_on_a_desktop(
+    tmp_path: Path,
+) -> None:
     written = pictures.write(tmp_path / "screens", both=False)
     sizes = [struct.unpack(">II", path.read_bytes()[16:24]) for path in written]
     assert sizes == [one for one in (PHONE, SIDEWAYS, DESKTOP) for _ in VIEWS]
@@ -1108,7 +1118,7 @@ class Look(NamedTuple):
 
 
 @alone
-def test_a_first_look_is_small_and_the_second_one_smaller(page: Phone, tmp_path: Path) -> None:
+def test_the_first_visit_loads_little_and_the_second_one_less(page: Phone, tmp_path: Path) -> None:
     with Program([sys.executable, "-c", BARE], tmp_path) as bare, browsing() as browser:
         (url,) = re.findall(r"http://\S+:\d+", bare.says("http://"))
         browser.size(*PHONE)
@@ -1223,7 +1233,7 @@ SLOW = """let answer;
         "pressed again before the release is confirmed",
     ],
 )
-def test_a_stop_is_sent_until_it_arrived_and_never_much_later_than_it_was_pressed(
+def test_a_stop_is_repeated_until_it_arrives_and_never_sent_long_after_the_press(
     page: Phone, script: str, then: list[str]
 ) -> None:
     told = list(page.browser.js(STOPPING.replace("SCRIPT", script)))
@@ -1232,7 +1242,7 @@ def test_a_stop_is_sent_until_it_arrived_and_never_much_later_than_it_was_presse
     assert all(one.startswith(begun) for one, begun in zip(told[2:], then, strict=True))
 
 
-def test_a_page_that_is_hidden_says_its_zero_once(page: Phone) -> None:
+def test_a_page_that_is_hidden_sends_its_zero_once(page: Phone) -> None:
     """The page's timers run late while another client may drive."""
     page.hold()
     page.browser.js(JAM)
@@ -1276,7 +1286,7 @@ def test_a_commander_opens_with_zeros_drives_at_20_hz_and_ends_with_one_zero(pag
         ),
     ],
 )
-def test_a_commander_that_is_not_followed_lets_go_and_says_why(
+def test_a_commander_that_is_not_obeyed_sends_a_zero_and_says_why(
     page: Phone, script: str, why: str
 ) -> None:
     told = commanded(page, script)
@@ -1296,12 +1306,12 @@ READ = """import('/page/settings.js').then(({read}) => [
     read('1,2.5, 3', [0, 0, 0]), read('1,,x', [0, 0, 0])])"""
 
 
-def test_what_is_typed_is_a_number_with_a_comma_too_but_between_several(page: Phone) -> None:
+def test_a_typed_comma_is_a_decimal_separator_except_between_several_values(page: Phone) -> None:
     told = page.browser.js(READ)
     assert told == [0.5, -1.5, "fast", "", "info", [1, 2.5, 3], [1, "", "x"]]
 
 
-def test_a_list_of_settings_has_no_space_and_says_why(page: Phone) -> None:
+def test_a_list_setting_is_shown_without_spaces_and_says_why(page: Phone) -> None:
     """Space is STOP, in a text field too."""
     browser = page.browser
     browser.tap("tab-set")
@@ -1318,7 +1328,7 @@ def test_a_list_of_settings_has_no_space_and_says_why(page: Phone) -> None:
 
 
 @alone
-def test_what_strangers_write_is_text(page: Phone) -> None:
+def test_untrusted_text_is_shown_without_being_rendered_as_html(page: Phone) -> None:
     evil = "<img src=x onerror=document.title='owned'>"
     page.bus.put(f"cmd/{'app'}", {"linear": {"x": evil}, "angular": {"z": 0}})
     page.browser.tap("tab-events")
@@ -1332,7 +1342,7 @@ WORDS = """one => one.getAttribute('aria-describedby')?.split(' ')
 """The description of an element for a screen reader."""
 
 
-def test_what_a_viewer_may_not_is_switched_off_and_says_why(tmp_path: Path) -> None:
+def test_controls_that_a_viewer_may_not_use_are_disabled_and_say_why(tmp_path: Path) -> None:
     Authority.make(tmp_path / "tls", "test", 1, [NAME]).issue(tmp_path / "tls", "robot", [NAME], 1)
     settings = {"record": {"directory": str(tmp_path / "record")}}
     with Daemon(tmp_path, config=settings) as daemon, Bus(daemon.endpoint) as bus:
@@ -1405,7 +1415,7 @@ def test_a_recording_is_drawn_when_asked_for_and_its_report_has_neither_cookie_n
 
 @alone
 @pytest.mark.nightly
-def test_curves_that_lie_on_each_other_are_told_apart_and_say_their_values(page: Phone) -> None:
+def test_curves_that_overlap_are_distinguishable_and_show_their_values(page: Phone) -> None:
     browser = page.browser
     browser.size(*DESKTOP, touch=False)
     browser.tap("tab-status")
@@ -1438,13 +1448,13 @@ ABOVE = """(() => {
 
 @alone
 @pytest.mark.nightly
-def test_the_plots_begin_with_the_minute_before_and_say_what_is_not_known_of_it(
+def test_the_plots_begin_with_the_minute_before_and_say_which_data_is_missing(
     page: Phone,
 ) -> None:
     """A client drove the robot before any page was open, then while one was. It stands now."""
     browser, bus = page.browser, page.bus
     browser.open("about:blank")
-    until(lambda: viewers(page) == 0, 5.0, "nobody looks")
+    until(lambda: viewers(page) == 0, 5.0, "no page is open")
     with bus.commanding(0.4, 0.0):
         until(lambda: bus.state()["x"] > 1.5, 10.0, "for some seconds")
     bus.at_rest()
@@ -1487,7 +1497,7 @@ SEEN = """(() => {
 
 
 @pytest.mark.parametrize("size", [PHONE, DESKTOP])
-def test_the_signs_of_the_map_are_explained(page: Phone, size: tuple[int, int]) -> None:
+def test_each_button_of_the_map_has_a_label_and_a_title(page: Phone, size: tuple[int, int]) -> None:
     page.browser.size(*size, touch=size == PHONE)
     words = {"recentre": "Center map", "turns": "Rotate map", "erase": "Erase path"}
     for name, word in words.items():

@@ -86,7 +86,7 @@ def test_the_page_shows_the_camera_with_its_age_and_marks_a_frozen_picture_withi
         wide = "['camera', 'map', 'stick'].map(name => document.getElementById(name).clientWidth)"
         assert min(browser.js(wide)) > 90
         browser.open("about:blank")
-        until(lambda: filmed.stream.clients == 0, 15.0, "nobody reads the stream any more")
+        until(lambda: filmed.stream.clients == 0, 15.0, "no client reads the stream any more")
 
 
 async def test_the_camera_needs_a_token_and_ends_with_it(filmed: Filmed) -> None:
@@ -110,7 +110,7 @@ async def test_the_camera_needs_a_token_and_ends_with_it(filmed: Filmed) -> None
         assert (await got(viewer, url)).status == 401
 
 
-async def test_pictures_that_nobody_reads_cost_little_memory(filmed: Filmed) -> None:
+async def test_pictures_that_no_client_reads_cost_little_memory(filmed: Filmed) -> None:
     """Before, each of these clients cost a picture of its own."""
     server, pid = filmed.server, filmed.server.pid
     filmed.stream.more = 900_000

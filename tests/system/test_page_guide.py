@@ -181,7 +181,7 @@ NIGHTLY = ("a key", "hidden", "the button", "a long press", "escape")
 @pytest.mark.parametrize(
     "way", [*WAYS, *(pytest.param(way, marks=pytest.mark.nightly) for way in NIGHTLY)]
 )
-def test_whatever_a_person_does_while_it_drives_stops_it(
+def test_any_action_of_the_operator_during_a_leg_stops_the_robot(
     browser: Browser, skidding: tuple[Daemon, Bus, Page], way: str
 ) -> None:
     _, bus, server = skidding
@@ -214,7 +214,7 @@ def test_whatever_a_person_does_while_it_drives_stops_it(
     browser.open("about:blank")
 
 
-def test_a_browser_that_stands_still_while_it_drives_stops_it_within_a_second(
+def test_a_browser_that_hangs_during_a_leg_stops_the_robot_within_a_second(
     browser: Browser, skidding: tuple[Daemon, Bus, Page]
 ) -> None:
     """Its connection stays open: the server can notice only the silence."""
@@ -236,7 +236,7 @@ def test_a_browser_that_stands_still_while_it_drives_stops_it_within_a_second(
     browser.open("about:blank")
 
 
-def test_on_the_simulator_the_card_says_which_way_makes_sense_and_has_chosen_it(
+def test_on_the_simulator_the_card_recommends_and_preselects_a_method(
     browser: Browser, skidding: tuple[Daemon, Bus, Page]
 ) -> None:
     _, _, server = skidding

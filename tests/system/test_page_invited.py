@@ -91,7 +91,7 @@ def test_an_invitation_outlives_a_network_that_fails(stranger: Stranger) -> None
     assert browser.js("location.hash") == ""
 
 
-def test_an_invitation_that_is_not_valid_is_reported_and_nobody_knocks_on(
+def test_an_invalid_invitation_is_reported_and_the_page_stops_connecting(
     stranger: Stranger,
 ) -> None:
     before = stranger.tries
@@ -101,7 +101,7 @@ def test_an_invitation_that_is_not_valid_is_reported_and_nobody_knocks_on(
     assert stranger.browser.js("location.hash") == ""
 
 
-def test_a_token_that_has_ended_is_reported_as_such_and_a_new_link_in_its_tab_lets_in(
+def test_a_revoked_token_is_reported_and_a_new_link_in_its_tab_gives_access(
     stranger: Stranger,
 ) -> None:
     stranger.opens(stranger.server.invite("viewer", "lent"))
@@ -116,7 +116,7 @@ def test_a_token_that_has_ended_is_reported_as_such_and_a_new_link_in_its_tab_le
     stranger.shows("role", "operator")
 
 
-def test_who_comes_without_a_token_is_told_once_and_a_press_asks_again(stranger: Stranger) -> None:
+def test_a_page_without_a_token_says_so_and_retries_only_after_a_press(stranger: Stranger) -> None:
     browser = stranger.browser
     before = stranger.tries
     browser.open(stranger.server.away)

@@ -427,7 +427,7 @@ TIMES = pytest.mark.parametrize(
         for way in WAYS
     ],
 )
-def test_whoever_lets_go_in_whatever_way_the_robot_brakes(
+def test_the_robot_brakes_after_every_way_to_release_the_stick(
     field: Field, way: Way, times: int
 ) -> None:
     if way is tab_hidden and not HAS_WINDOWS:
@@ -489,7 +489,7 @@ def goes_on(field: Field, number: int) -> Round:
 
 
 @TIMES
-def test_what_a_program_said_without_a_network_is_not_obeyed_later(
+def test_commands_that_a_program_sent_without_a_network_are_not_obeyed_later(
     field: Field, times: int
 ) -> None:
     if times > 1:

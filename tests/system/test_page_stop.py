@@ -94,13 +94,15 @@ def some(names: Sequence[str], which: int) -> list[Any]:
 
 
 @pytest.mark.parametrize("name", some(FILES, 0))
-def test_stop_latches_as_soon_as_it_is_red_without_this_file(impatient: Robot, name: str) -> None:
+def test_stop_latches_as_soon_as_it_is_red_also_if_one_file_does_not_load(
+    impatient: Robot, name: str
+) -> None:
     with impatient.without(name):
         until(lambda: impatient.mode == "stopped", 5.0, f"stopped without {name}")
 
 
 @pytest.mark.parametrize("name", some(MODULES, 1))
-def test_a_page_without_this_module_says_reload_and_its_stick_is_grey(
+def test_a_page_without_one_of_its_modules_says_reload_and_its_stick_is_grey(
     robot: Robot, name: str
 ) -> None:
     browser = robot.browser

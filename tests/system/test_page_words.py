@@ -41,7 +41,9 @@ def forgets(browser: Browser, within_s: float) -> None:
     until(lambda: browser.text("complaint") == "", within_s, "the complaint is outdated")
 
 
-def test_a_page_that_has_shown_no_stop_releases_none(tmp_path: Path, browser: Browser) -> None:
+def test_a_page_that_has_not_shown_a_stop_does_not_release_it(
+    tmp_path: Path, browser: Browser
+) -> None:
     """Another person may have stopped the robot while this page had no connection."""
     with running(tmp_path) as (daemon, bus):
         with Page(daemon, tmp_path) as page:
@@ -90,7 +92,7 @@ TELEOP = "{name: 'teleop', priority: 50}"
         ("ready", "", "{name: 'safety', priority: 60}", ""),
     ],
 )
-def test_the_stick_is_grey_while_a_source_that_comes_before_it_drives(
+def test_the_stick_is_grey_while_a_source_with_higher_priority_drives(
     page: Page, browser: Browser, mode: str, source: str, others: str, words: str
 ) -> None:
     asked = STILL.replace("MODE", repr(mode)).replace("SOURCES", f"[{TELEOP}, {others}]")
@@ -384,7 +386,7 @@ def test_a_pulled_cable_is_in_the_mode_and_in_the_title_whatever_the_mode(
     shows(browser, "mode", "READY")
 
 
-def test_a_stop_in_a_fault_says_that_it_is_latched_behind_it(
+def test_a_stop_during_a_fault_says_that_it_stays_latched_after_the_fault(
     page: Page, browser: Browser, robot: tuple[Daemon, Bus, Peer, Page]
 ) -> None:
     _, bus, board, _ = robot
@@ -410,7 +412,7 @@ NAMES = """import('/page/words.js').then(({person, named, logged}) => [
     logged('commander/0123456789abcdef -> commander/fedcba9876543210')])"""
 
 
-def test_nobody_reads_a_long_number_for_a_name(page: Page, browser: Browser) -> None:
+def test_the_page_shows_no_session_number_in_place_of_a_name(page: Page, browser: Browser) -> None:
     assert browser.js(NAMES) == [
         "a program without a name",
         "stopped by a program without a name at noon",
@@ -469,7 +471,7 @@ SHOWN = "!!document.getElementById({!r}).checkVisibility()"
 
 
 @pytest.mark.nightly
-def test_a_pressed_emergency_stop_or_bumper_and_a_low_battery_have_signs_with_the_mend_at_the_stick(
+def test_a_pressed_emergency_stop_or_bumper_and_a_low_battery_are_shown_with_the_remedy(
     tmp_path: Path, browser: Browser
 ) -> None:
     """Release STOP is refused while the button is pressed, and the page says what to do first."""
@@ -519,7 +521,7 @@ def test_a_pressed_emergency_stop_or_bumper_and_a_low_battery_have_signs_with_th
 
 
 @pytest.mark.nightly
-def test_a_viewer_is_told_who_switches_on_and_an_ended_invitation_ends_stop_and_camera(
+def test_a_viewer_reads_who_can_activate_and_a_revoked_token_ends_stop_and_camera(
     tmp_path: Path, browser: Browser
 ) -> None:
     stream = Stream()

@@ -88,7 +88,7 @@ def desk(shared: Daemon, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("block", TYPED)
-def test_what_a_page_says_to_type_does_what_it_says(block: Block, desk: Path, bus: Bus) -> None:
+def test_the_commands_on_a_page_do_what_the_page_says(block: Block, desk: Path, bus: Bus) -> None:
     if "tls init" in block.text and Path("/etc/systemd/system/acsard.service").exists():
         pytest.skip("tls init would write the drop-in of the service of this machine")
     for command in block.commands():
@@ -150,7 +150,9 @@ def test_the_broken_board_of_the_firmware_page_is_found_broken(tmp_path: Path) -
 
 
 @pytest.mark.slow
-def test_the_first_page_pulls_a_cable_and_the_robot_waits_until_it_is_back(tmp_path: Path) -> None:
+def test_the_robot_of_the_first_page_waits_after_its_cable_is_pulled_until_it_is_back(
+    tmp_path: Path,
+) -> None:
     place = with_acsard(tmp_path)
     typed_there = ("acsard sim --link ./mcu", "acsard run --port ./mcu")
     board, run = ([sys.executable, "-m", *command.split()] for command in typed_there)
@@ -290,7 +292,7 @@ def test_the_service_s_venv_has_all_that_lan_and_service_need(clone: Path) -> No
 @pytest.mark.network
 @pytest.mark.timeout(2 * INSTALL_S)
 @pytest.mark.nightly
-def test_the_authority_of_the_fleet_page_is_made_by_what_its_first_line_installs(
+def test_the_install_line_of_the_fleet_page_suffices_to_make_its_authority(
     clone: Path,
 ) -> None:
     page = "deploy/zenoh/README.md"

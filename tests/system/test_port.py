@@ -63,7 +63,7 @@ def line() -> Iterator[Line]:
     os.close(device)
 
 
-async def test_a_line_made_before_the_process_stood_still_does_not_leave_after_it(
+async def test_a_line_made_before_the_process_was_suspended_is_not_sent_after_it(
     line: Line,
 ) -> None:
     """The step was suspended before it wrote, and goes on later. A stop is never too old."""
@@ -81,7 +81,7 @@ async def test_a_line_made_before_the_process_stood_still_does_not_leave_after_i
     assert os.read(line.board, 4096).count(GO) == 1
 
 
-async def test_behind_a_suspend_the_port_is_opened_anew(line: Line) -> None:
+async def test_the_port_is_reopened_after_a_suspend(line: Line) -> None:
     """The clock simulates the suspend, because this machine cannot be suspended."""
     slept, told = [0], list[Event]()
     async with line.port(told.append, asleep=Asleep(lambda: slept[0])) as port:
@@ -101,7 +101,7 @@ async def test_behind_a_suspend_the_port_is_opened_anew(line: Line) -> None:
     assert GO not in os.read(line.board, 4096)
 
 
-async def test_a_port_for_which_there_was_no_thread_is_opened_by_the_next_try(line: Line) -> None:
+async def test_a_port_is_opened_by_the_next_try_if_no_thread_could_start(line: Line) -> None:
     told = list[Event]()
     usual = threading.stack_size(1 << 46)  # for which no machine has room
     try:
@@ -118,7 +118,7 @@ async def test_a_port_for_which_there_was_no_thread_is_opened_by_the_next_try(li
     assert "cannot start another thread" in told[0].text
 
 
-async def test_a_step_that_comes_late_reads_what_lies_there_before_it_judges_a_silence(
+async def test_a_late_step_reads_waiting_bytes_before_it_judges_a_silence(
     line: Line,
 ) -> None:
     """After a stall both the clock and the reader are due, in any order."""
@@ -135,7 +135,7 @@ async def test_a_step_that_comes_late_reads_what_lies_there_before_it_judges_a_s
         assert port.take() == ()
 
 
-async def test_a_reader_whose_turn_comes_behind_a_late_step_s_finds_nothing_and_no_hang_up(
+async def test_a_reader_called_after_a_late_step_reports_no_hang_up(
     line: Line,
 ) -> None:
     """The step takes the bytes that were there when the event loop looked.
@@ -158,7 +158,7 @@ async def test_a_reader_whose_turn_comes_behind_a_late_step_s_finds_nothing_and_
         assert (b"".join(taken).count(GO), port.is_open, port.trouble) == (10, True, "")
 
 
-async def test_a_line_right_behind_the_hang_up_of_the_device_is_lost_without_an_error() -> None:
+async def test_a_line_sent_right_after_the_device_hung_up_is_lost_without_an_error() -> None:
     """The reader and the step notice the hang-up in the same round of the event loop."""
     loop, errors, told = asyncio.get_running_loop(), list[str](), list[str]()
     loop.set_exception_handler(lambda _, context: errors.append(str(context)))
@@ -180,7 +180,7 @@ async def test_a_line_right_behind_the_hang_up_of_the_device_is_lost_without_an_
 
 
 @pytest.mark.parametrize("name", ["tcgetattr", "tcsetattr", "tcflush"])
-async def test_a_device_that_vanishes_while_it_is_opened_is_waited_for(
+async def test_a_device_that_vanishes_while_it_is_opened_is_opened_later(
     line: Line, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     """Suspend each call of the opening in turn until one succeeds. No attempt ends the daemon."""
@@ -208,7 +208,7 @@ async def test_a_device_that_vanishes_while_it_is_opened_is_waited_for(
             await asyncio.wait([keeper])
 
 
-async def test_a_port_whose_driver_takes_nothing_is_told_though_it_still_receives(
+async def test_a_port_whose_driver_accepts_no_bytes_is_reported_while_it_still_receives(
     line: Line,
 ) -> None:
     """The far end reports by its own clock and does not read."""

@@ -49,7 +49,7 @@ def test_the_control_loop_alone_is_real_time_and_memory_is_locked(tmp_path: Path
 
 
 @needs_permission
-def test_it_can_be_switched_off(tmp_path: Path) -> None:
+def test_real_time_scheduling_can_be_switched_off(tmp_path: Path) -> None:
     with Daemon(tmp_path, config={"control": {"real_time": False}}) as daemon:
         assert os.sched_getscheduler(daemon.pid) == os.SCHED_OTHER
         assert locked_kb(daemon.pid) == 0
@@ -59,7 +59,9 @@ def test_it_can_be_switched_off(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can take root's permissions away")
-def test_without_permission_it_runs_all_the_same_and_says_so_in_one_line(tmp_path: Path) -> None:
+def test_without_permission_the_daemon_runs_without_real_time_and_logs_one_line(
+    tmp_path: Path,
+) -> None:
     without = ["setpriv", "--bounding-set", "-sys_nice,-ipc_lock"]
     with running(tmp_path, before=without) as (daemon, _):
         assert os.sched_getscheduler(daemon.pid) == os.SCHED_OTHER
@@ -69,7 +71,7 @@ def test_without_permission_it_runs_all_the_same_and_says_so_in_one_line(tmp_pat
 
 
 @needs_permission
-def test_what_it_was_started_with_is_not_asked_for_again(tmp_path: Path) -> None:
+def test_real_time_scheduling_present_at_the_start_is_not_requested_again(tmp_path: Path) -> None:
     as_a_service = ["chrt", "--fifo", "--reset-on-fork", "5"]
     without = ["setpriv", "--bounding-set", "-sys_nice,-ipc_lock"]
     with Daemon(tmp_path, before=[*as_a_service, *without]) as daemon:

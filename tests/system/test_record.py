@@ -125,7 +125,7 @@ def test_a_fault_of_the_daemon_is_reported_and_the_input_of_that_step_is_recorde
 
 @pytest.mark.soak
 @pytest.mark.timeout(1200)
-def test_fifty_kills_cost_little_each(tmp_path: Path) -> None:
+def test_each_of_fifty_kills_costs_little_of_the_recording(tmp_path: Path) -> None:
     for number in range(50):
         where = tmp_path / str(number)
         where.mkdir()
@@ -133,7 +133,7 @@ def test_fifty_kills_cost_little_each(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_an_orderly_end_is_whole_and_only_the_service_and_its_group_read_it(
+def test_a_recording_is_complete_after_an_orderly_end_and_readable_only_by_its_group(
     tmp_path: Path,
 ) -> None:
     with recording(tmp_path, before=["sh", "-c", 'umask 0; exec "$@"', "sh"]) as (daemon, bus):

@@ -219,7 +219,7 @@ def test_a_recording_that_was_cut_on_a_disk_without_room_for_its_end_keeps_every
         assert [row.events for row in rows(path)] == ["cut off: no end marker"]
 
 
-def test_for_want_of_inodes_one_recording_goes_and_no_other_where_that_does_not_help(
+def test_a_lack_of_inodes_deletes_at_most_one_recording_if_that_does_not_help(
     tmp_path: Path,
 ) -> None:
     with disk(tmp_path, "size=1m", "nr_inodes=20") as path:
@@ -259,7 +259,7 @@ def test_a_directory_that_is_read_only_is_reported_and_costs_only_records(tmp_pa
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
 @pytest.mark.nightly
-def test_two_seconds_a_sync_cost_no_period(tmp_path: Path) -> None:
+def test_a_disk_that_syncs_for_two_seconds_costs_no_period(tmp_path: Path) -> None:
     source, library, syncs = (tmp_path / name for name in ("slow.c", "slow.so", "syncs"))
     source.write_text(SLOW)
     words = ["gcc", "-shared", "-fPIC", "-o", str(library), str(source), "-ldl"]

@@ -53,7 +53,9 @@ def test_unplug_and_replug_while_driving_says_so_reconnects_and_sends_nothing_ol
         assert set(peer.session.said()[1:]) == {ZERO_LINE}
 
         commander.wish = ZERO
-        until(lambda: "send a zero first" not in bus.state()["reason"], 5.0, "the zero was heard")
+        until(
+            lambda: "send a zero first" not in bus.state()["reason"], 5.0, "the zero was received"
+        )
         assert set(peer.session.said()[1:]) == {ZERO_LINE}
         zeros = 1
 

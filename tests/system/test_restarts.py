@@ -204,7 +204,7 @@ class End(NamedTuple):
         pytest.param((End("stop", "term"), End("stop", "kill", cut)), marks=pytest.mark.slow),
     ],
 )
-def test_a_latched_robot_stands_after_each_restart_until_it_is_released(
+def test_a_latched_robot_stays_at_rest_after_each_restart_until_it_is_released(
     robot: Robot, ends: tuple[End, ...]
 ) -> None:
     restarted(robot, *ends)
@@ -318,7 +318,7 @@ def test_a_second_daemon_of_the_same_robot_on_another_bus_ends_with_75(
 
 
 @pytest.mark.slow
-def test_the_built_in_simulator_keeps_nothing(tmp_path: Path) -> None:
+def test_the_built_in_simulator_keeps_no_latch_over_a_restart(tmp_path: Path) -> None:
     states = {"control": {"state_directory": str(tmp_path / "states")}}
     with Daemon(tmp_path, config=states) as daemon, Bus(daemon.endpoint) as bus:
         assert bus.get("srv/stop")["success"]

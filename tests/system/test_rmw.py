@@ -217,7 +217,7 @@ def test_an_independent_client_lists_and_gets_parameters(ground: Ground) -> None
     assert nothing["type"] == 0
 
 
-def test_nothing_of_that_was_an_exception(ground: Ground) -> None:
+def test_no_request_of_the_independent_client_raised_an_exception(ground: Ground) -> None:
     unharmed(ground.daemon)
     assert "Traceback" not in ground.sdk.stderr
 
@@ -230,7 +230,7 @@ def ros(bus: Bus) -> RmwClient:
     return RmwClient(bus.session)
 
 
-def test_every_token_has_the_form_the_graph_is_read_by(bus: Bus, ros: RmwClient) -> None:
+def test_every_liveliness_token_has_the_form_of_rmw_zenoh(bus: Bus, ros: RmwClient) -> None:
     (zid,) = map(str, bus.session.info.peers_zid())
     rows = [("MP", name, *row) for name, row in PUBLISHED.items()]
     rows += [("SS", name, kind, 10, False) for name, kind in SERVICES.items()]
@@ -299,7 +299,7 @@ def test_no_message_is_made_while_no_ros_client_listens(tmp_path: Path) -> None:
         print(f"unheard for 50 periods: {again - last - 1} samples made")
 
 
-def test_the_static_transforms_have_the_heartbeat_of_a_late_comer_s_publisher(
+def test_the_static_transforms_have_the_heartbeat_for_late_subscribers(
     tmp_path: Path,
 ) -> None:
     # The transforms are put once, at the start: a subscriber must be there before it.
@@ -369,7 +369,9 @@ def test_a_command_held_up_on_the_way_is_stale_by_its_attachment(bus: Bus, ros: 
     refused_without_motion(bus, late, "stale", "the network delayed it")
 
 
-def test_a_clock_that_is_an_hour_off_harms_no_commander(bus: Bus, ros: RmwClient) -> None:
+def test_a_command_of_a_sender_whose_clock_is_an_hour_off_is_accepted(
+    bus: Bus, ros: RmwClient
+) -> None:
     # Only differences of ages count: clocks need not agree.
     for off in (3600.0, -3600.0):
         other = RmwClient(bus.session)
@@ -385,7 +387,7 @@ def _put(bus: Bus, other: RmwClient, off: float, enough: int) -> bool:
     return bus.count("commands") >= enough
 
 
-def test_a_put_with_another_hash_is_silence(bus: Bus, ros: RmwClient) -> None:
+def test_a_put_with_another_type_hash_is_ignored(bus: Bus, ros: RmwClient) -> None:
     ros.zeros(bus)
     before = bus.state()
     key = ros.key("cmd_vel", TWIST)
@@ -410,7 +412,7 @@ PLAIN: dict[str, tuple[str, Callable[[], bytes]]] = {
 
 
 @pytest.mark.parametrize("name", PLAIN)
-def test_what_is_unusual_but_right_is_taken(bus: Bus, ros: RmwClient, name: str) -> None:
+def test_unusual_but_valid_encodings_are_accepted(bus: Bus, ros: RmwClient, name: str) -> None:
     kind, payload = PLAIN[name]
     before = bus.state()
     ros.heard(bus, "joint_commands" if kind == JOINTS else "cmd_vel", kind, payload)
@@ -462,7 +464,7 @@ def test_a_stop_without_attachment_stops_all_the_same(bus: Bus, ros: RmwClient) 
 @pytest.mark.parametrize(
     "request_bytes", [b"", b"\0\1", b"\0\1\0\0", b"\0\1\0\0\xff\xff\xff\xff", b"\0\7\0\0\0\0\0\0"]
 )
-def test_a_parameter_request_that_is_none_is_counted_and_answered_by_nothing(
+def test_an_invalid_parameter_request_is_counted_and_gets_an_empty_answer(
     bus: Bus, ros: RmwClient, request_bytes: bytes
 ) -> None:
     before = bus.state()
@@ -484,7 +486,7 @@ def test_more_names_than_there_are_parameters_are_answered(ros: RmwClient) -> No
 @pytest.mark.variations(4)
 @pytest.mark.parametrize("count", [100, 300])
 @pytest.mark.parametrize("service", ["acsard/get_parameters", "acsard/reset_odometry"])
-def test_of_many_calls_at_once_every_one_is_answered(
+def test_each_of_many_simultaneous_calls_is_answered(
     bus: Bus, ros: RmwClient, service: str, count: int
 ) -> None:
     names = encode(make("rcl_interfaces/msg/GetRequest", names=["robot.id"]))
@@ -520,7 +522,7 @@ def test_a_topic_of_a_source_that_is_not_listed_is_refused(tmp_path: Path) -> No
             refused_without_motion(bus, send, "unknown_source", said)
 
 
-def test_nothing_of_all_this_was_an_exception(bus: Bus, shared: Daemon) -> None:
+def test_no_ros_client_raised_an_exception_in_the_daemon(bus: Bus, shared: Daemon) -> None:
     unharmed(shared)
     bus.at_rest()
 
@@ -531,7 +533,7 @@ TREES: dict[str, type[ZenohClient]] = {"bridge": BridgeHalf, "rmw": RmwClient}
 
 
 @pytest.mark.parametrize("tree", ["native", "bridge", "rmw"])
-def test_a_command_to_one_robot_is_not_heard_by_the_other(fleet: Fleet, tree: str) -> None:
+def test_a_command_to_one_robot_does_not_reach_the_other(fleet: Fleet, tree: str) -> None:
     driven = fleet.one
     drive: AbstractContextManager[object]
     if tree == "native":
@@ -543,7 +545,7 @@ def test_a_command_to_one_robot_is_not_heard_by_the_other(fleet: Fleet, tree: st
 
 
 @pytest.mark.parametrize("tree", ["native", "bridge", "rmw"])
-def test_a_stop_of_one_robot_is_not_heard_by_the_other(fleet: Fleet, tree: str) -> None:
+def test_a_stop_of_one_robot_does_not_reach_the_other(fleet: Fleet, tree: str) -> None:
     one, two = fleet.one, fleet.two
     if tree == "native":
         assert one.get("srv/stop")["success"]

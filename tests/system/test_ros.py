@@ -126,7 +126,7 @@ def test_the_battery_arrives_with_every_field(bus: Bus, ros: Client) -> None:
     assert (message.location, message.serial_number) == ("", "")
 
 
-def test_a_late_subscriber_gets_the_static_transforms_at_once(ros: Client) -> None:
+def test_a_late_subscriber_gets_the_static_transforms_immediately(ros: Client) -> None:
     for _ in range(2):
         begun = time.monotonic()
         with ros.follow_late("tf_static", TF) as samples:
@@ -217,7 +217,7 @@ def _speed(payload: bytes) -> float:
 
 
 @pytest.mark.usefixtures("restored")
-def test_a_person_at_teleop_is_followed_before_the_navigation(bus: Bus, ros: Client) -> None:
+def test_teleop_commands_have_priority_over_navigation_commands(bus: Bus, ros: Client) -> None:
     def drives(state: Any, source: str, sign: float) -> bool:
         return state["source"] == source and sign * (state["linear"] or 0.0) > 0.1
 
@@ -229,7 +229,7 @@ def test_a_person_at_teleop_is_followed_before_the_navigation(bus: Bus, ros: Cli
         states.find(lambda s: drives(s, "nav", 1.0), 3.0, "nav again", after=released_at)
 
 
-def test_a_stop_drops_a_command_under_way_until_clear(bus: Bus, ros: Client) -> None:
+def test_a_stop_ends_a_drive_and_clear_does_not_resume_it(bus: Bus, ros: Client) -> None:
     with bus.follow("state") as states, ros.driving(bus, "cmd_vel", TWIST, 0.3):
         states.find(lambda s: (s["linear"] or 0.0) > 0.1 and s["source"] == "nav", 3.0, "it drives")
         assert ros.call("acsard/stop").trigger()[0]
@@ -288,7 +288,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_damaged_bytes_are_counted_and_reported_and_moves_nothing(
+def test_damaged_bytes_are_counted_and_reported_and_move_nothing(
     bus: Bus, zenoh_ros: ZenohClient, name: str
 ) -> None:
     bad = BAD[name]
@@ -339,7 +339,7 @@ EMPTY = (b"\0\1\0\0", EMPTY_REQUEST, b"\0\1\0\0\0\0\0\0")
 
 
 @pytest.mark.parametrize("verb", TRIGGERS)
-def test_a_trigger_is_answered_once_whatever_its_empty_request_looks_like(
+def test_a_trigger_is_answered_once_for_every_form_of_an_empty_request(
     bus: Bus, ros: Client, verb: str
 ) -> None:
     forms = EMPTY if isinstance(ros, ZenohClient) else (EMPTY_REQUEST,)
@@ -392,7 +392,7 @@ def _limit(value: float) -> Any:
     return make("rcl_interfaces/msg/Parameter", name="limits.linear_speed", value=double)
 
 
-def test_a_parameter_is_set_as_by_anybody(bus: Bus, ros: Client) -> None:
+def test_a_ros_parameter_sets_the_live_setting_within_its_range(bus: Bus, ros: Client) -> None:
     def ask(value: float) -> Any:
         return asked(ros, "set_parameters", parameters=[_limit(value)]).results[0]
 
@@ -425,6 +425,6 @@ def test_a_query_on_all_keys_stops_nothing(bus: Bus, zenoh_ros: ZenohClient) -> 
 
 @pytest.mark.bridge
 @pytest.mark.network
-def test_nothing_of_all_this_was_an_exception(bus: Bus, shared: Daemon) -> None:
+def test_no_ros_message_raised_an_exception_in_the_daemon(bus: Bus, shared: Daemon) -> None:
     unharmed(shared)
     bus.at_rest()

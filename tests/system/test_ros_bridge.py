@@ -57,7 +57,7 @@ def test_the_odometry_comes_as_plain_cdr(ros: BridgeHalf) -> None:
     assert stamp.sec + stamp.nanosec / 1e9 == pytest.approx(time.time(), abs=5.0)
 
 
-def test_a_twist_has_52_bytes_and_a_stamped_one_more(bus: Bus, ros: BridgeHalf) -> None:
+def test_a_twist_has_52_bytes_and_a_stamped_twist_76(bus: Bus, ros: BridgeHalf) -> None:
     plain = twist(0.0)
     assert (len(plain), len(stamped(0.0))) == (52, 76)
     before = bus.state()
@@ -85,7 +85,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_a_payload_of_no_type_is_counted_and_reported_and_moves_nothing(
+def test_a_payload_of_no_known_type_is_counted_and_reported_and_moves_nothing(
     bus: Bus, ros: BridgeHalf, name: str
 ) -> None:
     topic, payload, reason, said = BAD[name]
@@ -93,7 +93,7 @@ def test_a_payload_of_no_type_is_counted_and_reported_and_moves_nothing(
     refused_without_motion(bus, lambda: ros.session.put(topic, payload), reason, said)
 
 
-def test_an_attachment_means_nothing_here(bus: Bus, ros: BridgeHalf) -> None:
+def test_the_bridge_keys_ignore_an_attachment(bus: Bus, ros: BridgeHalf) -> None:
     before = bus.state()
     for attachment in (b"rqh" + bytes(17), bytes(33), b"\xff" * 60_000):
         heard = bus.count("commands")
@@ -110,7 +110,7 @@ def _more(bus: Bus, before: int) -> None:
     until(lambda: bus.count("commands") > before, 3.0, "one more command")
 
 
-def test_nothing_of_all_this_was_an_exception(bus: Bus, shared: Daemon) -> None:
+def test_no_bridge_message_raised_an_exception_in_the_daemon(bus: Bus, shared: Daemon) -> None:
     unharmed(shared)
     bus.at_rest()
 
@@ -144,7 +144,7 @@ def announced(zid: str, namespace: str, twists: bool) -> set[str]:
 @pytest.mark.parametrize(
     ("namespace", "kind"), [("", "auto"), ("robot1", "twist")], ids=["plain", "named"]
 )
-def test_what_is_announced_is_announced_as_a_bridge_does(
+def test_the_daemon_announces_the_liveliness_tokens_of_a_bridge(
     tmp_path: Path, namespace: str, kind: str
 ) -> None:
     ros = {"announce": True, "namespace": namespace, "cmd_vel_type": kind}
@@ -157,7 +157,7 @@ def test_what_is_announced_is_announced_as_a_bridge_does(
             assert len(tokens) == len(expected)
 
 
-def test_nothing_is_announced_unless_asked_for(tmp_path: Path) -> None:
+def test_no_token_is_announced_unless_ros_announce_is_set(tmp_path: Path) -> None:
     config = {"ros": {"announce": False}}
     with Daemon(tmp_path, config=config) as daemon, session_at(daemon.endpoint) as session:
         with listed(session, "@/*/@ros2_lv/**") as tokens, listed(session, ALIVE) as alive:
@@ -166,7 +166,7 @@ def test_nothing_is_announced_unless_asked_for(tmp_path: Path) -> None:
         BridgeHalf(session).call("acsard/clear").trigger()
 
 
-def test_a_tree_that_is_switched_off_does_not_exist(tmp_path: Path) -> None:
+def test_a_ros_transport_that_is_switched_off_has_no_keys_and_no_tokens(tmp_path: Path) -> None:
     config = {"ros": {"bridge": False, "rmw": False}}
     with running(tmp_path, config=config) as (_, bus):
         before = bus.state()

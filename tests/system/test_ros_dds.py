@@ -101,7 +101,7 @@ def test_a_late_node_gets_the_urdf_that_was_sent_once(tmp_path: Path, dds: NewDo
                 assert decode(STRING, samples.first("it", within=10.0).payload).data == text
 
 
-def test_what_is_announced_has_routes_and_nothing_is_sent_unasked(
+def test_announced_topics_have_routes_and_no_topic_is_sent_without_subscribers(
     tmp_path: Path, dds: NewDomain
 ) -> None:
     announced = {"ros": {"announce": True, "cmd_vel_type": "twist"}}
@@ -200,7 +200,7 @@ def test_two_publishers_are_one_sender_and_the_robot_follows_the_newest_message(
     assert refused == []
 
 
-def test_an_idle_publisher_of_the_other_type_shuts_twist_out_until_both_have_ended(
+def test_an_idle_stamped_publisher_blocks_twist_until_both_publishers_have_ended(
     driven: Bus, domain: DdsDomain
 ) -> None:
     def ignored(node: DdsNode) -> None:
@@ -334,7 +334,7 @@ def test_each_robot_has_all_its_topics_and_its_own_static_transforms(
                 decode(kind, samples.first(name).payload)
 
 
-def test_nothing_of_that_was_an_exception(fleet: tuple[Robot, Robot]) -> None:
+def test_no_dds_node_raised_an_exception_in_a_daemon(fleet: tuple[Robot, Robot]) -> None:
     for robot in fleet:
         unharmed(robot.daemon)
 
@@ -343,7 +343,7 @@ def test_nothing_of_that_was_an_exception(fleet: tuple[Robot, Robot]) -> None:
 
 
 @pytest.mark.parametrize("number", [None, signal.SIGINT], ids=["to its end", "Ctrl-C"])
-def test_the_line_of_the_pages_drives(
+def test_the_command_line_of_the_pages_drives_the_robot(
     tmp_path: Path, dds: NewDomain, number: signal.Signals | None
 ) -> None:
     rclpy_stand_in.write(tmp_path)

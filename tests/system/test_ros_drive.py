@@ -21,7 +21,7 @@ LINE = "python3 deploy/ros2/drive.py 0.2 0.0 3"
 
 
 @pytest.mark.parametrize("way", ["rmw", pytest.param("bridge", marks=pytest.mark.nightly)])
-def test_the_line_of_the_pages_drives(tmp_path: Path, way: str) -> None:
+def test_the_command_line_of_the_pages_drives_the_robot(tmp_path: Path, way: str) -> None:
     rclpy_stand_in.write(tmp_path)
     with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus:
         until(lambda: bus.state()["link"] == "up", 5.0, "the link")
@@ -40,7 +40,7 @@ def test_the_line_of_the_pages_drives(tmp_path: Path, way: str) -> None:
     [("rmw", signal.SIGINT), ("rmw", signal.SIGTERM), ("bridge", signal.SIGINT)],
 )
 @pytest.mark.nightly
-def test_whoever_ends_it_in_the_middle_ends_it_with_zeros(
+def test_the_drive_program_sends_zeros_if_a_signal_ends_it(
     tmp_path: Path, way: str, number: signal.Signals
 ) -> None:
     rclpy_stand_in.write(tmp_path)

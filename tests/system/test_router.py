@@ -54,7 +54,7 @@ def where(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_one_that_is_killed_is_there_again(where: Path) -> None:
+def test_a_router_that_is_killed_is_restarted(where: Path) -> None:
     with watched_router(where, free_tls_endpoint()) as router:
         listens(router)
         first = the_router(router)
@@ -65,7 +65,7 @@ def test_one_that_is_killed_is_there_again(where: Path) -> None:
 
 
 @pytest.mark.nightly
-def test_one_that_is_stopped_is_ended_and_there_again(where: Path) -> None:
+def test_a_router_that_is_suspended_is_ended_and_restarted(where: Path) -> None:
     with watched_router(where, free_tls_endpoint()) as router:
         listens(router)
         first = the_router(router)
@@ -76,7 +76,7 @@ def test_one_that_is_stopped_is_ended_and_there_again(where: Path) -> None:
 
 
 @pytest.mark.nightly
-def test_it_opens_again_with_a_new_certificate(where: Path) -> None:
+def test_the_router_restarts_with_a_new_certificate(where: Path) -> None:
     endpoint = free_tls_endpoint()
     with watched_router(where, endpoint) as router:
         listens(router)
@@ -91,7 +91,7 @@ def test_it_opens_again_with_a_new_certificate(where: Path) -> None:
 
 
 @pytest.mark.nightly
-def test_it_stays_open_if_zenoh_refuses_a_new_certificate(where: Path) -> None:
+def test_the_router_stays_open_if_zenoh_refuses_a_new_certificate(where: Path) -> None:
     endpoint, own = free_tls_endpoint(), where / ITS_NAME
     with watched_router(where, endpoint) as router:
         listens(router)
@@ -125,7 +125,9 @@ def test_a_robot_reports_the_end_of_its_routers_certificate(where: Path) -> None
 
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
-def test_it_goes_whole(where: Path, number: signal.Signals) -> None:
+def test_a_signal_ends_the_router_and_its_child_process(
+    where: Path, number: signal.Signals
+) -> None:
     with watched_router(where, free_tls_endpoint()) as router:
         listens(router)
         inner = the_router(router)
@@ -134,21 +136,21 @@ def test_it_goes_whole(where: Path, number: signal.Signals) -> None:
         until(lambda: gone(inner), 5.0, "nothing of it is left")
 
 
-def test_a_taken_address_is_reported_and_tried_again(where: Path) -> None:
+def test_an_address_in_use_is_reported_and_retried(where: Path) -> None:
     endpoint = free_tls_endpoint()
     host, _, port = endpoint.removeprefix("tls/").rpartition(":")
     with (
         socket.create_server((host, int(port))) as other,
         watched_router(where, endpoint) as router,
     ):
-        until(lambda: "ended with exit code 75" in router.stderr, 10.0, "it tells")
+        until(lambda: "ended with exit code 75" in router.stderr, 10.0, "the exit is reported")
         assert f"cannot listen on {endpoint}" in router.stderr
         other.close()
         listens(router)
 
 
 @pytest.mark.parametrize("text", ["{ mode", '{ mode: "peer" }'])
-def test_what_is_no_routers_file_is_refused_at_once(tmp_path: Path, text: str) -> None:
+def test_an_invalid_router_file_ends_with_78(tmp_path: Path, text: str) -> None:
     (tmp_path / "zenoh.json5").write_text(text)
     done = finish(acsard("router", "zenoh.json5"), tmp_path)
     assert done.code == 78
@@ -156,7 +158,7 @@ def test_what_is_no_routers_file_is_refused_at_once(tmp_path: Path, text: str) -
     assert "Traceback" not in done.err
 
 
-def test_one_that_lacks_its_certificates_ends_with_a_sentence(where: Path) -> None:
+def test_a_router_without_its_key_ends_with_78_and_one_sentence(where: Path) -> None:
     (where / ITS_NAME / "key.pem").unlink()
     with watched_router(where, free_tls_endpoint()) as router:
         assert router.ended(10.0) == 78

@@ -74,7 +74,9 @@ def test_a_signal_while_driving_ramps_ends_with_stop_and_exits_0_within_1_s(
 
 
 @pytest.mark.slow
-def test_a_signal_at_rest_ends_with_stop_and_exits_0_at_once(tmp_path: Path, peer: Peer) -> None:
+def test_a_signal_at_rest_ends_with_stop_and_exits_0_without_delay(
+    tmp_path: Path, peer: Peer
+) -> None:
     with running(tmp_path, peer.path) as (daemon, _):
         sent = time.monotonic()
         daemon.signal(signal.SIGTERM)
@@ -227,7 +229,9 @@ def test_a_signal_while_a_bus_client_is_stopped_still_ends_within_1_s(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rounds", [1, pytest.param(8, marks=pytest.mark.soak)])
-def test_many_that_are_ended_right_after_the_start_all_exit_0(tmp_path: Path, rounds: int) -> None:
+def test_daemons_that_are_ended_right_after_the_start_all_exit_0(
+    tmp_path: Path, rounds: int
+) -> None:
     # All start at once, so that each is interrupted at a random point. A thread left running at the
     # interpreter's end made one in ten of them abort on a busy machine.
     for _ in range(rounds):

@@ -35,7 +35,9 @@ def yaw(pose: Any) -> float:
 
 
 @pytest.mark.slow
-def test_the_truth_is_another_than_odometry_by_what_the_robot_truly_is(skidding: Bus) -> None:
+def test_the_true_pose_differs_from_odometry_by_the_simulated_track_multiplier(
+    skidding: Bus,
+) -> None:
     with skidding.commanding(0.0, 1.0):
         until(lambda: skidding.state()["yaw"] > 1.6, 10.0, "most of a quarter turn")
     skidding.at_rest()
@@ -44,7 +46,7 @@ def test_the_truth_is_another_than_odometry_by_what_the_robot_truly_is(skidding:
 
 
 @pytest.mark.slow
-def test_the_truth_comes_a_hundred_times_a_second_with_the_time_of_each_look(
+def test_the_true_pose_is_published_at_100_hz_with_the_stamp_of_each_sample(
     skidding: Bus,
 ) -> None:
     with skidding.follow("sim/pose") as poses:
@@ -68,7 +70,7 @@ def real(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bus]:
         yield bus
 
 
-def test_where_there_is_a_real_port_nobody_has_the_truth(real: Bus) -> None:
+def test_a_daemon_on_a_real_port_publishes_no_true_pose(real: Bus) -> None:
     assert real.ask("sim/pose") == []
     assert not [row for row in real.get("topics")["topics"] if "sim" in row["key"]]
 
@@ -77,7 +79,7 @@ def test_where_there_is_a_real_port_nobody_has_the_truth(real: Bus) -> None:
 
 
 @pytest.mark.slow
-def test_the_simulated_gyro_takes_the_same_way_in_as_any_other(tmp_path: Path) -> None:
+def test_the_simulated_gyro_corrects_the_odometry_and_is_published_as_imu(tmp_path: Path) -> None:
     tables: dict[str, dict[str, object]] = {"odometry": {"gyro": True}}
     tables["sim"] = {"track_multiplier": 1.6, "gyro_bias": 0.02}
     with Daemon(tmp_path, config=tables) as daemon, Bus(daemon.endpoint) as bus:
@@ -91,7 +93,7 @@ def test_the_simulated_gyro_takes_the_same_way_in_as_any_other(tmp_path: Path) -
 
 
 @pytest.mark.slow
-def test_a_drive_is_recorded_as_calibrate_reads_it(tmp_path: Path) -> None:
+def test_calibrate_reads_a_drive_that_echo_recorded_as_csv(tmp_path: Path) -> None:
     tables: dict[str, dict[str, object]] = {"odometry": {"gyro": True}}
     with running(tmp_path, config=tables) as (daemon, _):
         words = ("echo", "wheel_states", "imu", "--csv", "-n", "300")
@@ -106,7 +108,9 @@ def test_a_drive_is_recorded_as_calibrate_reads_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_who_sends_beside_the_simulated_gyro_is_refused_counted_and_told(tmp_path: Path) -> None:
+def test_a_second_imu_sender_beside_the_simulated_gyro_is_refused_counted_and_logged(
+    tmp_path: Path,
+) -> None:
     tables: dict[str, dict[str, object]] = {"odometry": {"gyro": True}}
     with Daemon(tmp_path, config=tables) as daemon, Bus(daemon.endpoint) as bus:
         bus.linked()
@@ -123,7 +127,7 @@ TURNING = {"angular_velocity": {"z": 0.0}}
 
 
 @pytest.mark.slow
-def test_a_gyro_on_the_bus_is_heard_and_what_is_no_sample_is_counted(
+def test_a_gyro_on_the_bus_is_used_and_its_invalid_samples_are_counted(
     tmp_path: Path, peer: Peer
 ) -> None:
     tables: dict[str, dict[str, object]] = {"odometry": {"gyro": True}}
@@ -148,16 +152,16 @@ def test_a_gyro_on_the_bus_is_heard_and_what_is_no_sample_is_counted(
         assert [e for e in daemon.events("imu_refused") if e["level"] == "warning"]
 
 
-def test_a_gyro_of_ros_is_heard_on_either_transport(real: Bus) -> None:
+def test_a_ros_imu_is_received_on_either_transport(real: Bus) -> None:
     sample = Imu(
         Header(), Quaternion(), [0.0] * 9, Vector3(z=51.0), [0.0] * 9, Vector3(), [0.0] * 9
     )
     rmw = rmw_key(0, "/imu/data", "sensor_msgs/msg/Imu")
     attachment = Attachment(1, 10**18, bytes(range(16))).pack()
     real.session.put("imu/data", encode(sample, "cdr"))
-    until(lambda: real.count("imu_out_of_range") == 1, 5.0, "the bridge's is heard")
+    until(lambda: real.count("imu_out_of_range") == 1, 5.0, "the bridge's sample is received")
     real.session.put(rmw, encode(sample, "cdr"), attachment=attachment)
-    until(lambda: real.count("imu_out_of_range") == 2, 5.0, "rmw_zenoh's is heard")
+    until(lambda: real.count("imu_out_of_range") == 2, 5.0, "rmw_zenoh's sample is received")
 
 
 # faults that the file names

@@ -88,7 +88,7 @@ def test_a_port_that_is_missing_at_the_start_is_reported_and_picked_up_when_it_a
 
 @pytest.mark.slow
 @pytest.mark.parametrize("often", [1, pytest.param(4, marks=pytest.mark.slow)])
-def test_sigterm_while_the_port_is_missing_ends_with_0_however_soon_it_comes(
+def test_sigterm_while_the_port_is_missing_ends_with_0_at_any_time_after_the_start(
     tmp_path: Path, often: int
 ) -> None:
     # In the first milliseconds the signal interrupts an attempt to open the port, later a pause.
@@ -229,7 +229,7 @@ def unprivileged() -> list[str]:
 
 
 @pytest.mark.slow
-def test_a_port_without_permission_ends_with_77_and_the_mend(tmp_path: Path, peer: Peer) -> None:
+def test_a_port_without_permission_ends_with_77_and_the_remedy(tmp_path: Path, peer: Peer) -> None:
     drop = unprivileged()
     device = os.path.realpath(peer.path)
     os.chmod(device, 0o000)  # not even for the owner, who is root here but without root's rights

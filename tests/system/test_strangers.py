@@ -391,34 +391,34 @@ SHORT, LONG = 0.5, pytest.param(20.0, marks=pytest.mark.soak)
 
 @pytest.mark.parametrize("seconds", [SHORT, LONG])
 @pytest.mark.parametrize("kind", ["flood", "huge"])
-def test_what_a_client_sends_too_much_of_costs_no_tick_and_keeps_nobody_out(
+def test_floods_and_huge_messages_cost_no_tick_and_keep_no_client_out(
     robot: Robot, kind: str, seconds: float
 ) -> None:
     hold(robot, kind, seconds)
 
 
 @pytest.mark.parametrize("seconds", [SHORT, LONG])
-def test_idle_connections_at_the_plain_door_cost_no_tick_and_keep_nobody_out(
+def test_idle_plain_connections_cost_no_tick_and_keep_no_client_out(
     robot: Robot, seconds: float
 ) -> None:
     hold(robot, "idle", seconds, doors=("tcp",))
 
 
-def test_idle_connections_at_the_tls_door_cost_no_tick_and_keep_nobody_out_while_they_stay(
+def test_idle_tls_connections_cost_no_tick_and_keep_no_client_out(
     robot: Robot,
 ) -> None:
     hold(robot, "idle", SHORT, doors=("tls",))
 
 
 @pytest.mark.parametrize("seconds", [SHORT, LONG])
-def test_garbage_at_the_plain_door_costs_no_tick_and_keeps_nobody_out(
+def test_garbage_at_the_plain_endpoint_costs_no_tick_and_keeps_no_client_out(
     robot: Robot, seconds: float
 ) -> None:
     hold(robot, "garbage", seconds, doors=("tcp",))
 
 
 @pytest.mark.parametrize("seconds", [SHORT, LONG])
-def test_garbage_at_the_tls_door_disturbs_neither_the_loop_nor_who_is_in_nor_the_other_door(
+def test_garbage_at_the_tls_endpoint_disturbs_no_loop_and_no_connected_or_plain_client(
     robot: Robot, seconds: float
 ) -> None:
     count = 300 if seconds == SHORT else None  # because the daemon accepts 10 a second
@@ -430,5 +430,5 @@ def test_garbage_at_the_tls_door_disturbs_neither_the_loop_nor_who_is_in_nor_the
     reason="Zenoh 1.10 waits 100 ms after each TLS handshake that fails, or that is not made in "
     "10 s, before it accepts the next (eclipse-zenoh/zenoh issue 2685); no setting mends that",
 )
-def test_garbage_at_the_tls_door_keeps_no_operator_out(robot: Robot) -> None:
+def test_garbage_at_the_tls_endpoint_keeps_no_operator_out(robot: Robot) -> None:
     hold(robot, "garbage", 0.0, doors=("tls",), comers=("operator",), count=25)

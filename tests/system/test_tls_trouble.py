@@ -78,17 +78,17 @@ def told(endpoint: str, directory: str) -> MendableError:
     return error.value
 
 
-def test_with_the_right_certificate_it_connects(tls: Path, robot: str) -> None:
+def test_a_client_with_a_valid_certificate_connects(tls: Path, robot: str) -> None:
     client_session(robot, str(tls / "client")).close()
 
 
-def test_without_a_directory_it_is_asked_for() -> None:
+def test_connecting_without_a_certificate_directory_asks_for_the_option_tls() -> None:
     error = told("tls/no.such.host.invalid:7449", "")
     assert isinstance(error, CertificateError)
     assert "--tls DIRECTORY" in str(error)
 
 
-def test_the_directory_is_looked_at_before_the_network(tmp_path: Path) -> None:
+def test_the_certificate_directory_is_checked_before_the_network(tmp_path: Path) -> None:
     error = told("tls/no.such.host.invalid:7449", str(tmp_path / "none"))
     assert isinstance(error, CertificateError)
     assert f"there is no directory {tmp_path / 'none'}" in str(error)
@@ -105,7 +105,7 @@ def test_the_directory_is_looked_at_before_the_network(tmp_path: Path) -> None:
         ("robot elsewhere", "tls renew --address 127.0.0.1"),
     ],
 )
-def test_what_is_wrong_with_the_robot_s_certificate(
+def test_the_error_says_what_is_wrong_with_the_robot_s_certificate(
     tls: Path, robot_has: str, sentence: str
 ) -> None:
     endpoint = free_endpoint().replace("tcp/", "tls/")
@@ -123,21 +123,23 @@ def test_what_is_wrong_with_the_robot_s_certificate(
         ("ended", "has expired or is not valid yet"),
     ],
 )
-def test_what_is_wrong_with_ours(tls: Path, robot: str, shown: str, sentence: str) -> None:
+def test_the_error_says_what_is_wrong_with_the_client_s_certificate(
+    tls: Path, robot: str, shown: str, sentence: str
+) -> None:
     assert sentence in str(told(robot, str(tls / shown)))
 
 
-def test_a_name_that_does_not_resolve(tls: Path) -> None:
+def test_the_error_names_a_host_that_does_not_resolve(tls: Path) -> None:
     error = told("tls/no.such.host.invalid:7449", str(tls / "client"))
     assert "the name no.such.host.invalid does not resolve" in str(error)
 
 
-def test_a_port_where_nobody_listens(tls: Path) -> None:
+def test_the_error_says_that_no_program_listens_on_the_port(tls: Path) -> None:
     endpoint = free_endpoint().replace("tcp/", "tls/")
     assert "no program listens on port" in str(told(endpoint, str(tls / "client")))
 
 
-def test_one_that_speaks_no_tls(tls: Path) -> None:
+def test_the_error_says_that_the_server_does_not_speak_tls(tls: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         endpoint = f"tls/127.0.0.1:{server.getsockname()[1]}"
         server.settimeout(10.0)

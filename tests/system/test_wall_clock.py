@@ -63,21 +63,21 @@ def test_top_says_how_long_ago_the_robot_was_seen_and_how_often_lines_come(place
     assert 1 < max(found) < 1000
 
 
-def test_fleet_says_how_long_ago_it_heard_of_it(place: Place) -> None:
+def test_fleet_says_how_long_ago_the_robot_was_seen(place: Place) -> None:
     told = place.tool("fleet", "--once").out
     heard = re.search(r"^acsar .* (\d+\.\d) s ", told, re.M)
     assert heard, told
     assert "SILENT" not in told
 
 
-def test_hz_says_how_often_it_comes(place: Place) -> None:
+def test_hz_prints_the_rate_and_the_gaps_of_a_key(place: Place) -> None:
     (line,) = place.tool("hz", "odom", "-n", "1", "--json").out.splitlines()
     figures = json.loads(line)
     assert figures["hz"] > 1
     assert 0 <= figures["gap_min_ms"] <= figures["gap_max_ms"] < 60_000
 
 
-def test_echo_ends_after_so_long_a_silence_and_not_before(place: Place) -> None:
+def test_echo_ends_when_the_timeout_of_silence_is_over_and_not_before(place: Place) -> None:
     ended = place.tool("echo", "state", "-n", "12", "--timeout", "5")
     assert ended.code == 0
     assert len(ended.out.splitlines()) == 12

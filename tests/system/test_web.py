@@ -43,7 +43,9 @@ def bus(standing: Bus) -> Bus:
     return standing
 
 
-async def test_who_opens_it_is_told_the_robot_and_follows_it(page: Page, bus: Bus) -> None:
+async def test_a_new_connection_gets_the_robot_s_description_and_can_follow_it(
+    page: Page, bus: Bus
+) -> None:
     async with hands(page) as ours:
         hello = (await ours.find(lambda said: "hello" in said))["hello"]
         assert (hello["robot"], hello["role"]) == ("acsar", "maintainer")
@@ -62,7 +64,7 @@ async def test_who_opens_it_is_told_the_robot_and_follows_it(page: Page, bus: Bu
 
 
 @pytest.mark.slow
-async def test_who_opens_it_has_the_last_minute_and_what_was_wished_while_somebody_looked(
+async def test_a_new_connection_gets_the_last_minute_with_commands_sent_while_a_page_was_open(
     daemon: Daemon, bus: Bus, tmp_path: Path
 ) -> None:
     with Page(daemon, tmp_path) as page:
@@ -88,7 +90,7 @@ async def test_who_opens_it_has_the_last_minute_and_what_was_wished_while_somebo
 
 
 @pytest.mark.network
-async def test_all_that_it_says_is_described_and_nothing_that_is_described_is_never_said(
+async def test_every_message_of_the_socket_is_described_and_every_described_one_occurs(
     tmp_path: Path,
 ) -> None:
     heard: list[Any] = []
@@ -133,7 +135,7 @@ async def test_all_that_it_says_is_described_and_nothing_that_is_described_is_ne
 
 
 @pytest.mark.network
-async def test_a_connection_that_ends_while_it_drives_is_one_zero_and_silence(
+async def test_a_connection_that_ends_while_it_drives_sends_one_zero_and_then_no_command(
     page: Page, bus: Bus
 ) -> None:
     with bus.follow("cmd/teleop") as heard:
@@ -190,7 +192,7 @@ async def first_recording(session: aiohttp.ClientSession) -> str:
             await asyncio.sleep(0.1)
 
 
-async def test_each_answer_to_a_program_is_as_it_is_described(page: Page, bus: Bus) -> None:
+async def test_each_http_answer_is_as_described(page: Page, bus: Bus) -> None:
     seen: dict[tuple[str, str], int] = {}
     async with aiohttp.ClientSession(page.here) as session:
         name = await first_recording(session)
@@ -211,7 +213,7 @@ async def test_each_answer_to_a_program_is_as_it_is_described(page: Page, bus: B
     assert seen["post", "/api/srv/set"] == 409
 
 
-async def test_a_path_with_another_method_says_which_it_takes(page: Page) -> None:
+async def test_a_path_called_with_another_method_names_the_method_it_accepts(page: Page) -> None:
     async with aiohttp.ClientSession(page.here) as session:
         async with session.get("/api/srv/stop") as answer:
             assert (answer.status, answer.headers["Allow"]) == (405, "POST")
@@ -220,7 +222,7 @@ async def test_a_path_with_another_method_says_which_it_takes(page: Page) -> Non
             assert answer.status == 404
 
 
-async def test_no_other_page_holds_ours_in_a_frame_or_lends_it_scripts(page: Page) -> None:
+async def test_no_other_page_can_frame_the_page_or_add_scripts_to_it(page: Page) -> None:
     async with aiohttp.ClientSession(page.here) as session:
         for place in ("/", "/page/main.js", "/api/state", "/nothing"):
             async with session.get(place) as answer:
@@ -230,7 +232,7 @@ async def test_no_other_page_holds_ours_in_a_frame_or_lends_it_scripts(page: Pag
                 assert answer.headers["X-Content-Type-Options"] == "nosniff"
 
 
-async def test_recordings_are_listed_and_fetched_as_they_are(page: Page, daemon: Daemon) -> None:
+async def test_recordings_are_listed_and_downloaded_as_mcap(page: Page, daemon: Daemon) -> None:
     async with aiohttp.ClientSession(page.here) as session:
         name = await first_recording(session)
         async with session.get(f"/api/recordings/{name}") as answer:
@@ -251,9 +253,7 @@ async def drawn(session: aiohttp.ClientSession) -> tuple[str, dict[str, Any]]:
 
 
 @pytest.mark.slow
-async def test_a_recording_is_drawn_as_a_page_that_has_nothing_to_do_with_ours(
-    page: Page, bus: Bus
-) -> None:
+async def test_a_recording_s_report_is_isolated_from_the_robot_s_page(page: Page, bus: Bus) -> None:
     async with aiohttp.ClientSession(page.here) as session:
         name, told = await drawn(session)
         assert told == {"status": 200, "report": "ready", "href": f"report/{name}"}
@@ -272,7 +272,7 @@ async def test_a_recording_is_drawn_as_a_page_that_has_nothing_to_do_with_ours(
 
 
 @pytest.mark.slow
-async def test_without_its_library_a_report_is_refused_with_what_to_type(
+async def test_a_report_without_plotly_is_refused_with_the_command_that_installs_it(
     daemon: Daemon, tmp_path: Path
 ) -> None:
     (tmp_path / "plotly.py").write_text("raise ImportError('not installed')")
@@ -327,7 +327,7 @@ class Terminal(Program):
 
 
 @pytest.mark.slow
-def test_a_daemon_in_a_terminal_serves_its_page_at_a_free_port_and_anew_when_it_ends(
+def test_a_daemon_in_a_terminal_serves_its_page_at_a_free_port_and_restarts_it(
     tmp_path: Path,
 ) -> None:
     with socket.socket() as taken:
@@ -361,7 +361,9 @@ def test_a_daemon_in_a_terminal_serves_its_page_at_a_free_port_and_anew_when_it_
 
 
 @pytest.mark.slow
-def test_a_daemon_that_nobody_looks_at_or_that_may_not_serves_no_page(tmp_path: Path) -> None:
+def test_a_daemon_without_a_terminal_or_with_the_page_disabled_serves_no_page(
+    tmp_path: Path,
+) -> None:
     config = write_config(tmp_path / "a.toml", {"web": {"page": False}})
     with Terminal(tmp_path, "--config", str(config)) as told, Daemon(tmp_path) as piped:
         told.shows("link_up")

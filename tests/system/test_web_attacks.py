@@ -202,7 +202,7 @@ ASKS: dict[str, tuple[str, str, dict[str, Any], int, str]] = {
 
 
 @pytest.mark.parametrize("what", ASKS)
-async def test_who_asks_for_what_he_may_not_have_is_refused(
+async def test_a_request_for_a_forbidden_resource_is_refused(
     table: Table, bus: Bus, tokens: dict[str, str], what: str
 ) -> None:
     where, path, how, status, reason = ASKS[what]
@@ -215,7 +215,7 @@ async def test_who_asks_for_what_he_may_not_have_is_refused(
                 assert answer.status == status
 
 
-async def test_who_asks_without_end_is_slowed_down_and_may_stop(
+async def test_a_client_that_floods_requests_is_limited_and_can_still_stop(
     table: Table, bus: Bus, tokens: dict[str, str]
 ) -> None:
     with table.attack("800 questions at once", "429", "too_fast", 100):
@@ -256,7 +256,7 @@ RAW: dict[str, str] = {
 
 
 @pytest.mark.parametrize("what", RAW)
-def test_what_is_no_plain_request_is_refused_whole(table: Table, bus: Bus, what: str) -> None:
+def test_a_malformed_request_is_refused_as_a_whole(table: Table, bus: Bus, what: str) -> None:
     # The robot is ready at the end: no second request, for a stop, was found in the first.
     reason = "host" if what == "no Host" else "malformed"
     with table.attack(what, "400", reason), _opened(table.page) as opened:
@@ -269,7 +269,7 @@ def _opened(page: Page) -> socket.socket:
     return socket.create_connection(("127.0.0.1", int(page.here.rpartition(":")[2])), 30.0)
 
 
-async def test_who_only_looks_drives_nothing_whatever_he_sends(
+async def test_a_viewer_moves_nothing_with_any_message(
     table: Table, bus: Bus, tokens: dict[str, str]
 ) -> None:
     commands = bus.count("commands")
@@ -299,7 +299,7 @@ async def _known(ours: Hands, bus: Bus) -> None:
         ("20 stamps of tomorrow", -86400.0, "robot", "command_stale"),
     ],
 )
-async def test_nobody_obeys_a_stamp_that_is_not_of_now(
+async def test_a_command_with_a_stale_or_future_stamp_is_not_obeyed(
     table: Table, bus: Bus, what: str, late_s: float, by: str, reason: str
 ) -> None:
     number = int(what.split()[0])
@@ -346,7 +346,7 @@ async def test_a_frame_that_is_not_a_message_is_reported_once_a_second_and_a_flo
             assert sum("refused" in one for one in told) < 50  # limited by the send rate
 
 
-async def test_a_thousand_connections_leave_the_one_who_drives_his_page(
+async def test_a_thousand_connections_do_not_disconnect_the_page_that_drives(
     table: Table, bus: Bus
 ) -> None:
     page = table.page
@@ -420,7 +420,9 @@ def test_a_head_without_an_end_is_cut_off(table: Table, bus: Bus, before: bytes)
 
 @pytest.mark.parametrize("headers", [0, 60])
 @pytest.mark.nightly
-def test_answers_that_nobody_reads_cost_little_memory(table: Table, bus: Bus, headers: int) -> None:
+def test_answers_that_no_client_reads_cost_little_memory(
+    table: Table, bus: Bus, headers: int
+) -> None:
     """Sixty clients without a token send requests without end, and read no answer."""
     page, place = table.page, URL(table.page.away)
     trusting = ssl._create_unverified_context()
@@ -460,7 +462,7 @@ async def test_a_viewer_that_floods_with_pings_is_cut_off(
 
 
 @pytest.mark.nightly
-def test_who_takes_his_time_is_sent_away(table: Table, bus: Bus) -> None:
+def test_a_slow_or_silent_client_is_disconnected(table: Table, bus: Bus) -> None:
     """A header of one byte a second, no bytes at all, and a body that is announced but not sent."""
     begun = time.monotonic()
     with (
@@ -478,7 +480,7 @@ def test_who_takes_his_time_is_sent_away(table: Table, bus: Bus) -> None:
                     assert drips.recv(4096) == b""
                     break
             else:
-                raise AssertionError("nobody cut it off")
+                raise AssertionError("the server did not cut it off")
         with suppress(ConnectionError):
             assert says_nothing.recv(4096) == b""
         answer = keeps.recv(4096)
@@ -486,7 +488,9 @@ def test_who_takes_his_time_is_sent_away(table: Table, bus: Bus) -> None:
     assert time.monotonic() - begun < max(BODY_S, REQUEST_S) + PATIENCE_S
 
 
-def test_who_does_not_read_the_answers_is_disconnected_soon(table: Table, bus: Bus) -> None:
+def test_a_client_that_does_not_read_its_answers_is_disconnected_soon(
+    table: Table, bus: Bus
+) -> None:
     place = Path(f"/proc/{table.page.pid}/fd")
     with socket.socket() as greedy:
         greedy.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
@@ -522,7 +526,7 @@ ENDLESS: dict[str, tuple[str, int, Rate, str]] = {
 
 @pytest.mark.variations(5)
 @pytest.mark.parametrize("what", ENDLESS)
-async def test_a_client_that_asks_without_end_waits_and_is_not_refused(
+async def test_a_client_that_pipelines_requests_without_end_is_delayed_and_not_refused(
     table: Table, bus: Bus, tokens: dict[str, str], what: str
 ) -> None:
     said, clients, rate, status = ENDLESS[what]
@@ -560,7 +564,7 @@ async def test_a_client_that_asks_without_end_waits_and_is_not_refused(
     assert answers.total() <= rate.most + (rate.hz + clients / HOLD_S) * lasts_s
 
 
-async def test_a_stop_beyond_the_rate_is_sent_at_once_and_only_its_answer_waits(
+async def test_a_stop_beyond_the_rate_is_sent_immediately_and_only_its_answer_waits(
     page: Page, bus: Bus, tokens: dict[str, str]
 ) -> None:
     async with page.client(tokens["viewer"]) as session:
@@ -595,7 +599,9 @@ async def test_a_stop_beyond_the_rate_is_sent_at_once_and_only_its_answer_waits(
             one.cancel()
 
 
-async def test_handshakes_of_one_network_wait_beyond_their_rate(table: Table, bus: Bus) -> None:
+async def test_handshakes_from_one_network_are_delayed_beyond_their_rate(
+    table: Table, bus: Bus
+) -> None:
     place, lasts_s, done = URL(table.page.away), 3.0, 0
 
     async def shakes(end: float) -> None:

@@ -76,7 +76,9 @@ async def eventually(look: Callable[[], Any]) -> None:
             await asyncio.sleep(0.01)
 
 
-async def test_who_is_told_to_go_drives_no_more_though_he_does_not_read(inside: Inside) -> None:
+async def test_a_client_that_must_disconnect_drives_no_more_even_if_it_does_not_read(
+    inside: Inside,
+) -> None:
     async with inside.hands() as ours:
         await ours.find(lambda said: "hello" in said)
         await ours.drive(0.0)
@@ -97,7 +99,7 @@ async def test_who_is_told_to_go_drives_no_more_though_he_does_not_read(inside: 
         wire.abort()
 
 
-async def test_who_does_not_read_gets_the_newest_when_he_does_and_nothing_in_between(
+async def test_a_client_that_stops_reading_later_gets_only_the_newest_message(
     inside: Inside, tmp_path: Path
 ) -> None:
     def left_out() -> int:
@@ -130,7 +132,7 @@ async def test_who_does_not_read_gets_the_newest_when_he_does_and_nothing_in_bet
             assert news["age"] < 1000 * (stamps[-1] - stamps[-2]) / 2  # it is the newest one
 
 
-async def test_a_stamp_that_no_signature_holds_is_refused_and_the_hand_lives(
+async def test_a_stamp_too_large_to_sign_is_refused_and_the_next_command_is_accepted(
     inside: Inside,
 ) -> None:
     async with inside.hands() as ours:
@@ -152,7 +154,7 @@ async def test_a_flood_of_stops_ends_its_connection(inside: Inside) -> None:
         assert ours.socket.close_code == 1008
 
 
-async def test_a_key_that_is_left_and_wanted_again_at_once_is_followed(
+async def test_a_key_that_is_unsubscribed_and_immediately_subscribed_again_is_followed(
     inside: Inside, tmp_path: Path
 ) -> None:
     with Daemon(tmp_path) as daemon, client_session(daemon.endpoint, "") as session:
@@ -170,7 +172,7 @@ async def test_a_key_that_is_left_and_wanted_again_at_once_is_followed(
             assert list(viewer._out.following) == [("acsar", "state")]
 
 
-async def test_who_unsubscribes_and_leaves_at_once_leaves_no_subscription_behind(
+async def test_a_client_that_unsubscribes_and_disconnects_leaves_no_subscription(
     inside: Inside, tmp_path: Path
 ) -> None:
     with Daemon(tmp_path) as daemon, client_session(daemon.endpoint, "") as session:
@@ -186,7 +188,9 @@ async def test_who_unsubscribes_and_leaves_at_once_leaves_no_subscription_behind
             assert inside.robots.streams.followed("acsar", "odom") is None
 
 
-async def test_who_pings_and_does_not_read_gets_one_answer_to_all_pings(inside: Inside) -> None:
+async def test_a_client_that_pings_without_reading_gets_one_answer_to_all_pings(
+    inside: Inside,
+) -> None:
     async with inside.hands() as ours:
         await ours.find(lambda said: "hello" in said)
         wire = cast(Any, ours.socket)._response.connection.transport
@@ -222,7 +226,7 @@ async def test_a_bus_that_is_gone_is_reported_and_the_key_comes_when_it_is_back(
                 await ours.state(lambda state: state["mode"])
 
 
-async def test_a_robot_whose_bus_is_gone_at_once_is_told_as_gone_and_the_server_lives(
+async def test_a_robot_with_a_closed_session_is_reported_as_gone_and_the_server_goes_on(
     inside: Inside, tmp_path: Path
 ) -> None:
     with Daemon(tmp_path) as daemon:
@@ -236,7 +240,7 @@ async def test_a_robot_whose_bus_is_gone_at_once_is_told_as_gone_and_the_server_
         running.cancel()
 
 
-async def test_a_dead_hand_ends_the_server(inside: Inside, tmp_path: Path) -> None:
+async def test_a_failed_command_outbox_ends_the_server(inside: Inside, tmp_path: Path) -> None:
     address = Address("tcp/127.0.0.1:1", "acsar", "")
     wanted = Wanted(Config(), address, (), "", tmp_path)
     inside.parts.commands.outbox.dead.set_exception(MemoryError("no room"))
@@ -262,7 +266,7 @@ def shared(tmp_path: Path) -> Inside:
     return Inside(tmp_path, WebConfig(origins=(DASHBOARD,)))
 
 
-async def test_a_page_of_a_listed_origin_may_ask_and_read_and_any_other_may_not(
+async def test_only_a_page_of_a_listed_origin_may_send_requests_and_read_answers(
     shared: Inside,
 ) -> None:
     """Another page of this machine, and the robot's own, are tried as well."""

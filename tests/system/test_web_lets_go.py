@@ -91,14 +91,16 @@ TIMES = pytest.mark.parametrize(
 
 @TIMES
 @pytest.mark.parametrize("way", OF_THE_BROWSER, ids=lambda way: way.__name__)
-def test_who_lets_go_drives_no_more(daemon: Daemon, page: Page, way: Way, times: int) -> None:
+def test_a_client_that_releases_the_stick_drives_no_more(
+    daemon: Daemon, page: Page, way: Way, times: int
+) -> None:
     for _ in range(times):
         let_go(daemon, page, way)
 
 
 @TIMES
 @pytest.mark.parametrize("way", OF_THE_SERVER, ids=lambda way: way.__name__)
-def test_whose_page_ends_drives_no_more(
+def test_a_client_whose_page_server_ends_drives_no_more(
     daemon: Daemon, tmp_path: Path, way: Way, times: int
 ) -> None:
     for n in range(times):

@@ -55,7 +55,7 @@ def cleared(two: Two) -> None:
         bus.at_rest()
 
 
-async def test_another_robot_is_followed_and_stopped_and_only_that(two: Two) -> None:
+async def test_another_robot_can_be_followed_and_stopped_and_nothing_else(two: Two) -> None:
     async with hands(two.page) as ours:
         await ours.say(subscribe="fleet")
         seen = await ours.find(lambda said: len(said.get("fleet", ())) == 2)
@@ -86,7 +86,9 @@ async def test_a_page_without_a_connection_stops_another_robot_too(two: Two) -> 
     assert two.ours.state()["mode"] == "ready"
 
 
-async def test_a_robot_that_is_not_there_or_cannot_be_is_not_said_to_be_stopped(two: Two) -> None:
+async def test_a_stop_of_an_absent_robot_or_an_invalid_id_is_answered_with_an_error(
+    two: Two,
+) -> None:
     async with hands(two.page) as ours:
         names = {"robot3": "no answer", "a/**": "not a robot's id"}
         for name, why in names.items():
@@ -96,7 +98,9 @@ async def test_a_robot_that_is_not_there_or_cannot_be_is_not_said_to_be_stopped(
             assert why in answer["text"]
 
 
-async def test_beside_a_daemon_it_says_why_it_sees_no_others(two: Two, tmp_path: Path) -> None:
+async def test_a_page_connected_to_a_daemon_says_why_it_shows_no_other_robots(
+    two: Two, tmp_path: Path
+) -> None:
     with Page(two.daemon, tmp_path) as beside:
         async with hands(beside) as ours:
             await ours.say(subscribe="fleet")

@@ -77,7 +77,7 @@ async def test_a_phone_drives_and_is_named_and_a_stop_of_a_viewer_s_latches(
         assert (await ours.call("clear", latch=state["latch"]))["ok"]
 
 
-async def test_an_invitation_is_a_link_and_a_code_and_lets_in(page: Page) -> None:
+async def test_an_invitation_prints_a_link_and_a_qr_code_that_give_access(page: Page) -> None:
     told = page.tokens("--invite", "operator", "--name", "guest", "--days", "30")
     assert "guest is operator until" in told
     assert any(char in told for char in "▀▄█")  # the code
@@ -158,7 +158,7 @@ async def test_a_link_with_fewer_permissions_replaces_a_cookie_only_if_asked_to(
         assert await opens("operator") == (303, "operator")
 
 
-async def test_two_pages_on_one_host_leave_each_other_s_phones_in(
+async def test_a_phone_can_use_two_pages_on_one_host_with_its_two_tokens(
     page: Page, daemon: Daemon, tmp_path: Path
 ) -> None:
     """A browser's cookies do not depend on ports."""
@@ -178,7 +178,7 @@ async def test_two_pages_on_one_host_leave_each_other_s_phones_in(
                     assert (await answer.json()).get("name") == name
 
 
-async def test_who_drives_and_is_revoked_is_sent_away_within_a_second_and_the_robot_stops(
+async def test_a_driver_whose_token_is_revoked_is_disconnected_within_a_second_and_stops(
     page: Page, bus: Bus
 ) -> None:
     token = page.invite("operator", "trusted")
@@ -230,7 +230,7 @@ async def test_a_connection_whose_token_was_revoked_is_cut_and_others_are_not(pa
         writer.transport.abort()
 
 
-async def test_a_program_gone_wrong_shuts_out_nobody_else_at_its_address(
+async def test_a_client_with_too_many_connections_shuts_out_no_other_at_its_address(
     page: Page, bus: Bus
 ) -> None:
     """All of them come from 127.0.0.1, including the robot's own browser."""
@@ -262,7 +262,7 @@ async def test_a_program_gone_wrong_shuts_out_nobody_else_at_its_address(
     assert page.refused()["too_many"] == counted + refused
 
 
-async def test_one_who_follows_all_that_he_can_leaves_others_theirs(
+async def test_a_client_with_the_most_subscriptions_does_not_take_those_of_others(
     page: Page, bus: Bus, viewer: str, operator: str
 ) -> None:
     async with AsyncExitStack() as stack:
@@ -285,7 +285,7 @@ async def test_one_who_follows_all_that_he_can_leaves_others_theirs(
         assert not [one for one in ours.heard if "refused" in one]
 
 
-def test_what_is_no_request_is_refused_in_words_like_the_rest(page: Page, bus: Bus) -> None:
+def test_bytes_that_are_not_a_request_get_a_json_error(page: Page, bus: Bus) -> None:
     counted = page.refused()
     port = int(page.here.rpartition(":")[2])
     for said, reason, words in [
@@ -303,7 +303,7 @@ def test_what_is_no_request_is_refused_in_words_like_the_rest(page: Page, bus: B
     assert "Traceback" not in page.stderr
 
 
-def test_what_is_refused_is_a_line_a_second_in_the_log_by_reason_and_never_with_a_token(
+def test_refusals_are_logged_once_a_second_by_reason_and_without_tokens(
     page: Page, bus: Bus
 ) -> None:
     def lines() -> list[dict[str, Any]]:
@@ -324,13 +324,17 @@ def test_what_is_refused_is_a_line_a_second_in_the_log_by_reason_and_never_with_
                     assert answer.status in (401, 429)
 
     run(story)
-    until(lambda: counted("bad token") + counted("too fast") >= before + 5, 10.0, "all are told")
+    until(
+        lambda: counted("bad token") + counted("too fast") >= before + 5,
+        10.0,
+        "all refusals are logged",
+    )
     assert " from 127.0.0.1" in lines()[-1]["text"]
     assert len(lines()) - told <= time.monotonic() - begun + 1.0
     assert "guessed" not in page.stderr
 
 
-def test_who_was_refused_is_told_by_address_and_by_the_name_of_the_token(
+def test_the_log_of_a_refusal_names_the_address_and_the_token_s_name(
     page: Page, bus: Bus, viewer: str, operator: str
 ) -> None:
     def told(words: str) -> bool:
@@ -352,7 +356,7 @@ def test_who_was_refused_is_told_by_address_and_by_the_name_of_the_token(
     assert not told(operator)
 
 
-async def test_any_program_that_drives_is_told_in_words_why_it_is_sent_away(
+async def test_a_driving_program_that_is_disconnected_gets_a_close_code_and_a_reason(
     page: Page, bus: Bus
 ) -> None:
     """A connection that ends before the close was answered is equivalent to a lost radio link."""

@@ -66,19 +66,19 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
 
 
 @pytest.mark.parametrize("role", ROLES)
-def test_each_certificate_is_told_its_role_and_name(robot: Robot, role: Identity) -> None:
+def test_whoami_returns_the_role_and_name_of_each_certificate(robot: Robot, role: Identity) -> None:
     with connect(robot.tls, tls=robot.own(role)) as client:
         us = client.whoami()
         assert (us.role, us.certificate, us.sender) == (role, role, client.sender)
 
 
-def test_without_a_certificate_one_is_what_the_machine_is(robot: Robot) -> None:
+def test_a_local_client_without_a_certificate_is_a_maintainer(robot: Robot) -> None:
     with connect(robot.plain) as client:
         us = client.whoami()
     assert (us.role, us.certificate) == ("maintainer", "")
 
 
-def test_the_verb_says_role_certificate_and_what_that_may(robot: Robot) -> None:
+def test_the_verb_whoami_prints_the_role_the_certificate_and_its_permissions(robot: Robot) -> None:
     ended = robot.tool("viewer", "whoami")
     assert (ended.code, ended.err) == (0, "")
     assert f"your certificate viewer has the role viewer: {VIEWER_MAY}" in ended.out
@@ -88,7 +88,7 @@ def test_the_verb_says_role_certificate_and_what_that_may(robot: Robot) -> None:
 
 
 @pytest.mark.slow
-def test_a_certificate_in_no_list_is_reported_with_77(robot: Robot) -> None:
+def test_an_unlisted_certificate_is_reported_with_77(robot: Robot) -> None:
     ended = robot.tool("unlisted", "whoami")
     assert ended.code == 77
     assert SILENCE in ended.out
@@ -104,7 +104,7 @@ def test_a_certificate_in_no_list_is_reported_with_77(robot: Robot) -> None:
     ids=lambda words: words[0],
 )
 @pytest.mark.nightly
-def test_tools_say_that_a_certificate_is_in_no_list(robot: Robot, words: tuple[str, ...]) -> None:
+def test_tools_say_that_the_certificate_is_unlisted(robot: Robot, words: tuple[str, ...]) -> None:
     ended = robot.tool("unlisted", *words)
     assert ended.code != 0
     assert SILENCE in ended.err
@@ -115,7 +115,7 @@ def test_tools_say_that_a_certificate_is_in_no_list(robot: Robot, words: tuple[s
     "words", [("call", "stop"), ("fleet", "--once")], ids=lambda words: words[0]
 )
 @pytest.mark.nightly
-def test_who_names_many_robots_by_a_certificate_of_no_list_is_told_so(
+def test_a_command_to_many_robots_with_an_unlisted_certificate_says_that_it_is_unlisted(
     robot: Robot, words: tuple[str, ...]
 ) -> None:
     ended = robot.tool("unlisted", *words, "--id", "acsar,other")
@@ -125,7 +125,7 @@ def test_who_names_many_robots_by_a_certificate_of_no_list_is_told_so(
 
 
 @pytest.mark.slow
-def test_who_means_all_robots_by_a_certificate_of_no_list_is_told_how_to_find_out(
+def test_a_wildcard_with_an_unlisted_certificate_suggests_whoami(
     robot: Robot,
 ) -> None:
     ended = robot.tool("unlisted", "call", "stop", "--id", "*")
@@ -145,7 +145,7 @@ def test_who_means_all_robots_by_a_certificate_of_no_list_is_told_how_to_find_ou
     ids=lambda words: words[0] if isinstance(words, tuple) else "",
 )
 @pytest.mark.nightly
-def test_a_wrong_id_is_asked_about_before_any_list(
+def test_the_error_suggests_a_wrong_id_before_an_unlisted_certificate(
     robot: Robot, words: tuple[str, ...], key: str
 ) -> None:
     ended = robot.tool("operator", *words, "--id", "robot1")
@@ -194,7 +194,7 @@ def test_a_certificate_that_ends_while_a_client_follows_is_reported(
 
 
 @pytest.mark.slow
-def test_a_drive_by_a_certificate_of_no_list_says_so(robot: Robot) -> None:
+def test_a_drive_with_an_unlisted_certificate_says_that_it_is_unlisted(robot: Robot) -> None:
     with (
         connect(robot.tls, tls=robot.own("unlisted")) as client,
         pytest.raises(NoAnswerError, match=SILENCE),
@@ -202,7 +202,7 @@ def test_a_drive_by_a_certificate_of_no_list_says_so(robot: Robot) -> None:
         client.drive(0.3, seconds=1.0)
 
 
-def test_a_viewer_s_foxglove_is_told_what_he_may(robot: Robot) -> None:
+def test_foxglove_with_a_viewer_s_certificate_shows_its_permissions(robot: Robot) -> None:
     may = f"your certificate viewer has the role viewer: {VIEWER_MAY}"
     port = int(free_endpoint().rpartition(":")[2])
     words = ["foxglove", "--drive", "--address", f"127.0.0.1:{port}", "--connect", robot.tls]
@@ -232,7 +232,7 @@ def test_a_viewer_s_foxglove_is_told_what_he_may(robot: Robot) -> None:
 
 
 @pytest.mark.slow
-def test_a_drive_of_a_viewer_raises_what_his_certificate_may(robot: Robot) -> None:
+def test_a_viewer_s_drive_raises_an_error_with_the_certificate_s_permissions(robot: Robot) -> None:
     with (
         connect(robot.tls, tls=robot.own("viewer")) as client,
         pytest.raises(
@@ -249,7 +249,7 @@ async def _drive(robot: Robot) -> None:
 
 @pytest.mark.slow
 @pytest.mark.nightly
-def test_an_async_drive_of_a_viewer_raises_the_same(robot: Robot) -> None:
+def test_an_async_drive_of_a_viewer_raises_not_permitted(robot: Robot) -> None:
     import asyncio
 
     with pytest.raises(NotPermittedError, match="has the role viewer"):
@@ -268,7 +268,7 @@ def test_an_async_drive_of_a_viewer_raises_the_same(robot: Robot) -> None:
         ),
     ],
 )
-def test_the_keyboard_of_who_may_not_drive_is_told_before_a_key_is_pressed(
+def test_the_drive_verb_refuses_a_client_without_permission_before_a_key_is_pressed(
     robot: Robot, who: Identity, code: int, told: str
 ) -> None:
     link = ["--connect", robot.tls, "--tls", robot.own(who)]
@@ -287,7 +287,7 @@ def test_the_keyboard_of_who_may_not_drive_is_told_before_a_key_is_pressed(
     ],
     ids=["clear", "set_pose", "config"],
 )
-def test_what_a_viewer_may_not_ask_is_reported_with_the_role_it_takes(
+def test_a_request_that_a_viewer_may_not_make_is_refused_with_the_role_it_needs(
     robot: Robot, words: tuple[str, ...], least: str
 ) -> None:
     ended = robot.tool("viewer", *words)
@@ -296,7 +296,7 @@ def test_what_a_viewer_may_not_ask_is_reported_with_the_role_it_takes(
     assert f"needs at least the role {least}" in ended.err
 
 
-def test_an_operator_drives_over_tls_and_stands_where_it_says(robot: Robot) -> None:
+def test_an_operator_drives_over_tls_and_reads_the_new_pose(robot: Robot) -> None:
     with connect(robot.tls, tls=robot.own("operator")) as client:
         before = client.pose().x
         client.drive(0.3, seconds=0.5)

@@ -242,7 +242,7 @@ def test_every_refused_form_is_counted_and_only_zeros_are_sent_until_a_good_one_
 
 
 @pytest.mark.slow
-def test_a_peer_that_falls_silent_is_said_gets_only_zeros_and_drives_on_after_a_short_gap(
+def test_a_silent_board_is_reported_gets_only_zeros_and_drives_on_after_a_short_gap(
     tmp_path: Path, peer: Peer
 ) -> None:
     with running(tmp_path, peer) as bus, bus.follow("state") as states, bus.commanding(0.5):

@@ -25,7 +25,7 @@ BEFORE = (
 
 
 @pytest.mark.nightly
-def test_a_router_runs_on_the_places_that_the_page_makes_as_a_user_of_its_own(
+def test_a_router_runs_as_its_own_user_in_the_directories_that_the_page_creates(
     container: Container,
 ) -> None:
     (places,) = (block for block in blocks("sh") if "install -d -o zenohd" in block.text)

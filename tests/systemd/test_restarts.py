@@ -109,7 +109,7 @@ def end(container: Container, way: Way) -> None:
     ],
 )
 @pytest.mark.timeout(900)
-def test_a_latched_robot_stands_after_the_unit_has_ended_until_it_is_released(
+def test_a_latched_robot_stays_at_rest_after_the_unit_ended_until_it_is_released(
     container: Container, board: Board, driver: Driver, kind: Kind, way: Way, times: int
 ) -> None:
     assert container.start().code == 0
@@ -126,7 +126,7 @@ def test_a_latched_robot_stands_after_the_unit_has_ended_until_it_is_released(
 
 
 @pytest.mark.parametrize("kind", ["stop", pytest.param("fault", marks=pytest.mark.soak)])
-def test_a_latched_robot_stands_after_a_reboot_until_it_is_released(
+def test_a_latched_robot_stays_at_rest_after_a_reboot_until_it_is_released(
     rootfs: Path, tmp_path: Path, kind: Kind
 ) -> None:
     (keeps := tmp_path / "states").mkdir(mode=0o700)
@@ -168,7 +168,7 @@ def test_on_a_read_only_disk_the_robot_starts_stopped_and_clear_releases_it(
     drives(board)
 
 
-def test_the_file_is_the_services_own_and_can_be_read_by_root(
+def test_the_state_file_belongs_to_the_service_s_user_and_root_can_read_it(
     container: Container, board: Board
 ) -> None:
     assert container.start().code == 0

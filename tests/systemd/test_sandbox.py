@@ -32,7 +32,7 @@ def test_systemd_finds_nothing_wrong_with_a_unit(container: Container, unit: str
 
 
 @pytest.mark.parametrize("unit", [UNIT, GATEWAY, PAGE])
-def test_its_exposure_is_small(container: Container, unit: str) -> None:
+def test_the_security_exposure_of_each_unit_is_small(container: Container, unit: str) -> None:
     words = ["security", "--offline=yes", "--no-pager", f"/etc/systemd/system/{unit}"]
     text = container.run("systemd-analyze", *words).out.splitlines()[-1]
     print(text.strip(" →"))
@@ -135,7 +135,7 @@ def test_a_reload_gives_the_services_a_new_certificate_while_the_robot_drives(
     assert container.main_pid() == daemon
 
 
-def test_a_gateway_that_is_killed_is_open_again_and_the_daemon_does_not_notice(
+def test_a_gateway_that_is_killed_is_restarted_and_the_daemon_keeps_running(
     container: Container, board: Board
 ) -> None:
     opened(container)
@@ -167,7 +167,7 @@ def test_a_gateway_that_hangs_holds_up_no_stop_nor_restart_of_the_daemon(
     assert container.main_pid(GATEWAY) != first
 
 
-def test_what_a_stranger_can_take_of_the_gateway_is_limited(
+def test_memory_and_processor_time_of_the_gateway_are_limited(
     container: Container, board: Board
 ) -> None:
     opened(container)
@@ -184,7 +184,7 @@ def test_without_lan_conf_there_is_no_gateway(container: Container, board: Board
     assert container.show("ActiveState", GATEWAY) == "inactive"
 
 
-def test_without_its_key_lan_conf_fails_the_start_instead_of_going_without(
+def test_lan_conf_without_its_key_fails_the_start_of_the_unit(
     container: Container, board: Board
 ) -> None:
     container.path(TLS).mkdir(parents=True, exist_ok=True)
@@ -197,7 +197,7 @@ def test_without_its_key_lan_conf_fails_the_start_instead_of_going_without(
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("unit", [GATEWAY, PAGE])
-def test_without_its_key_the_gateway_or_page_waits_for_a_person_and_doctor_says_which(
+def test_without_its_key_the_gateway_or_page_stays_down_and_doctor_names_the_key(
     container: Container, board: Board, unit: str
 ) -> None:
     opened(container)
@@ -231,7 +231,7 @@ def reaches(container: Container, address: str) -> bool:
     return container.run("python3", "-c", code, address).code == 0
 
 
-def test_even_a_bus_that_is_open_by_mistake_is_closed_to_other_computers(
+def test_a_bus_that_is_opened_by_mistake_cannot_be_reached_from_other_computers(
     container: Container, board: Board
 ) -> None:
     container.run("ip", "address", "replace", "10.9.8.7/32", "dev", "lo")

@@ -75,7 +75,7 @@ def test_a_dry_run_prints_every_file_and_command_and_touches_nothing(bare: Conta
     assert f"run     systemctl enable --now {UNIT} {GATEWAY} {PAGE}" in done.out
 
 
-def test_installed_it_runs_and_uninstalled_nothing_is_left(bare: Container) -> None:
+def test_the_service_runs_after_install_and_leaves_no_file_after_uninstall(bare: Container) -> None:
     before = listing(bare)
     done = bare.run(ACSARD, "service", "install")
     assert done.code == 0, done.out + done.err
@@ -118,10 +118,12 @@ print(answer.read().decode())
 
 
 @pytest.mark.nightly
-def test_the_page_runs_beside_it_within_its_limits_and_falls_alone(bare: Container) -> None:
+def test_the_page_runs_within_its_limits_and_its_end_does_not_end_the_daemon(
+    bare: Container,
+) -> None:
     bare.write(CONFIGURATION, "")  # the simulator
     assert bare.run(ACSARD, "service", "install").code == 0
-    until(lambda: '"mode"' in asks(bare, "/api/state"), 20.0, "the page tells the state")
+    until(lambda: '"mode"' in asks(bare, "/api/state"), 20.0, "the page answers the state")
     assert "stopped and latched" in asks(bare, "/api/srv/stop", "POST")
     assert bare.show("MemoryMax", PAGE) == str(256 << 20)
     daemon, first = bare.main_pid(), bare.main_pid(PAGE)
@@ -209,7 +211,9 @@ def drawn(container: Container) -> dict[str, object]:
 
 
 @pytest.mark.nightly
-def test_its_page_lists_hands_out_and_draws_recordings_and_can_change_none(bare: Container) -> None:
+def test_the_service_s_page_lists_serves_and_draws_recordings_and_cannot_change_them(
+    bare: Container,
+) -> None:
     recording = recorded_before(bare)
     bare.write(CONFIGURATION, "")  # the simulator
     done = bare.run(ACSARD, "service", "install")
@@ -251,7 +255,7 @@ def test_a_purge_after_an_uninstall_removes_what_the_uninstall_kept(bare: Contai
         assert not bare.path(place).exists(), place
 
 
-def test_nothing_of_somebody_else_is_overwritten_or_removed_without_force(bare: Container) -> None:
+def test_a_foreign_file_is_not_overwritten_or_removed_without_force(bare: Container) -> None:
     unit = f"/etc/systemd/system/{UNIT}"
     bare.write(unit, "[Service]\nExecStart=/bin/true\n")
     refused = bare.run(ACSARD, "service", "install")
@@ -265,7 +269,7 @@ def test_nothing_of_somebody_else_is_overwritten_or_removed_without_force(bare: 
     assert bare.show("ActiveState") == "active"
 
 
-def test_a_configuration_that_was_written_is_kept(bare: Container) -> None:
+def test_an_existing_configuration_is_kept_by_install_and_uninstall(bare: Container) -> None:
     own = '[robot]\nid = "mine"\n'
     bare.write(CONFIGURATION, own)
     assert bare.run(ACSARD, "service", "install").code == 0

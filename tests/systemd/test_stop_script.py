@@ -110,25 +110,33 @@ def config(where: Path, text: str) -> Path:
         '[mcu]\nport = "PORT"',
     ],
 )
-def test_it_finds_the_port_however_it_is_written(tmp_path: Path, wire: Wire, text: str) -> None:
+def test_the_stop_script_finds_the_port_in_every_toml_notation(
+    tmp_path: Path, wire: Wire, text: str
+) -> None:
     ended = stop(config(tmp_path, text.replace("PORT", wire.name)))
     assert (ended.code, ended.err) == (0, "")
     assert wire.heard() == STOP
 
 
-def test_it_finds_the_port_in_the_reference_configuration(tmp_path: Path, wire: Wire) -> None:
+def test_the_stop_script_finds_the_port_in_the_reference_configuration(
+    tmp_path: Path, wire: Wire
+) -> None:
     text = (ROOT / "acsard.toml").read_text().replace('port = "sim"', f'port = "{wire.name}"')
     stop(config(tmp_path, text))
     assert wire.heard() == STOP
 
 
-def test_it_takes_the_configuration_the_daemon_takes(tmp_path: Path, wire: Wire) -> None:
+def test_the_stop_script_reads_the_configuration_that_the_environment_names(
+    tmp_path: Path, wire: Wire
+) -> None:
     path = config(tmp_path, f'[mcu]\nport = "{wire.name}"\n')
     assert stop("", ACSARD_CONFIG=str(path)).code == 0
     assert wire.heard() == STOP
 
 
-def test_it_adds_the_comma_where_the_firmware_wants_one(tmp_path: Path, wire: Wire) -> None:
+def test_the_stop_script_adds_a_trailing_comma_if_it_is_configured(
+    tmp_path: Path, wire: Wire
+) -> None:
     stop(config(tmp_path, f'[mcu]\nport = "{wire.name}"\ntrailing_comma = true\n'))
     assert wire.heard() == b"\r\n" + 3 * ZERO_LINE.replace(b"\r\n", b",\r\n")
     stop(config(tmp_path, f'[mcu]\nport = "{wire.name}"\ntrailing_comma = false # true\n'))
@@ -166,7 +174,7 @@ def test_the_port_is_set_raw_at_its_baud_rate_and_keeps_dtr(
         '[mcu]\nport = "$(touch /tmp/never) -x"\n',
     ],
 )
-def test_without_a_port_it_does_nothing(tmp_path: Path, text: str) -> None:
+def test_the_stop_script_does_nothing_without_a_real_port(tmp_path: Path, text: str) -> None:
     ended = stop(config(tmp_path, text))
     assert (ended.code, ended.err) == (0, "")
 
@@ -174,19 +182,19 @@ def test_without_a_port_it_does_nothing(tmp_path: Path, text: str) -> None:
 @pytest.mark.parametrize(
     "text", ["", "[mcu]\n", "this is no TOML", 'mcu = { port = "/dev/ttyUSB0" }\n']
 )
-def test_where_it_finds_no_port_it_says_so_and_takes_the_one_of_the_udev_rules(
-    tmp_path: Path, text: str
-) -> None:
+def test_the_stop_script_falls_back_to_dev_acsar_and_says_so(tmp_path: Path, text: str) -> None:
     ended = stop(config(tmp_path, text))
     assert ended.code == 0
     assert "/dev/acsar" in ended.err
 
 
-def test_without_a_configuration_it_does_nothing(tmp_path: Path) -> None:
+def test_the_stop_script_does_nothing_without_a_configuration(tmp_path: Path) -> None:
     assert stop(tmp_path / "nothing")[:2] == (0, "")
 
 
-def test_a_port_that_takes_nothing_does_not_hold_it_up(tmp_path: Path, wire: Wire) -> None:
+def test_a_port_that_accepts_no_bytes_does_not_delay_the_stop_script(
+    tmp_path: Path, wire: Wire
+) -> None:
     tty.setraw(wire.slave)
     for _ in range(10):
         wire.fill()
@@ -211,7 +219,9 @@ def processor_s() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def test_it_is_done_within_20_ms(tmp_path: Path, wire: Wire) -> None:
+def test_the_stop_script_takes_less_than_20_ms_of_processor_time(
+    tmp_path: Path, wire: Wire
+) -> None:
     text = (ROOT / "acsard.toml").read_text().replace('port = "sim"', f'port = "{wire.name}"')
     path = config(tmp_path, text)
     took, spent = [], []

@@ -105,7 +105,7 @@ def test_any_other_device_is_left_alone(container: Container, ids: str) -> None:
     assert "SYSTEMD_WANTS" not in other.properties
 
 
-def test_an_ftdi_chip_is_told_not_to_hold_bytes_back(container: Container) -> None:
+def test_the_latency_timer_of_an_ftdi_chip_is_set_to_1_ms(container: Container) -> None:
     def writes(driver: str) -> bool:
         log = verdict(container, "0403:6001", driver=driver).log
         return any("latency_timer' writing '1'" in line for line in log.splitlines())
@@ -114,7 +114,7 @@ def test_an_ftdi_chip_is_told_not_to_hold_bytes_back(container: Container) -> No
     assert not writes("cp210x")
 
 
-def test_a_board_of_one_s_own_is_added_and_others_are_excluded_by_a_file_before_it(
+def test_an_earlier_rules_file_can_add_and_exclude_boards(
     container: Container,
 ) -> None:
     own = "/etc/udev/rules.d/69-my-robot.rules"

@@ -96,7 +96,7 @@ def within(took: list[Fault], bound: float) -> bool:
     return mostly and max(undisturbed(took), default=0.0) <= bound
 
 
-def test_it_starts_says_it_is_ready_publishes_and_drives(
+def test_the_unit_starts_reports_ready_publishes_and_drives(
     container: Container, board: Board, driver: Driver
 ) -> None:
     began = time.monotonic()
@@ -125,7 +125,7 @@ def test_only_the_control_loop_is_real_time(container: Container, board: Board) 
     assert set(policies.values()) == {os.SCHED_OTHER}
 
 
-def test_it_has_no_user_no_capabilities_and_no_way_to_gain_any(
+def test_the_daemon_has_a_dynamic_user_no_capabilities_and_cannot_gain_any(
     container: Container, board: Board
 ) -> None:
     container.start()
@@ -188,7 +188,7 @@ def test_stop_ramps_down_ends_with_stop_and_exits_0(
     assert max(ends) < 1.5
 
 
-def test_a_bad_configuration_ends_it_with_78_and_it_stays_down(
+def test_a_bad_configuration_ends_the_unit_with_78_and_it_stays_down(
     container: Container, board: Board
 ) -> None:
     container.write(CONFIG, f'[mcu]\nport = "{PORT}"\nbaud = 9600\n[control]\nrate = -1\n')
@@ -204,7 +204,7 @@ def test_a_bad_configuration_ends_it_with_78_and_it_stays_down(
     assert "rate" in told
 
 
-def test_a_forbidden_port_ends_it_with_77_and_it_stays_down(
+def test_a_forbidden_port_ends_the_unit_with_77_and_it_stays_down(
     container: Container, board: Board
 ) -> None:
     # Follow the link inside, because it is the container's.
@@ -215,7 +215,7 @@ def test_a_forbidden_port_ends_it_with_77_and_it_stays_down(
     assert container.show("NRestarts") == "0"
 
 
-def test_a_missing_port_is_waited_for(container: Container, driver: Driver) -> None:
+def test_the_unit_waits_for_a_missing_port(container: Container, driver: Driver) -> None:
     assert container.start().code == 0
     status = until(lambda: container.show("StatusText"), 3.0, "a status")
     print(f"status without a board: {status!r}")
@@ -225,7 +225,7 @@ def test_a_missing_port_is_waited_for(container: Container, driver: Driver) -> N
     container.path(PORT).unlink()
 
 
-def test_the_journal_can_be_asked_for_an_event(container: Container, board: Board) -> None:
+def test_journal_entries_have_the_event_fields(container: Container, board: Board) -> None:
     container.start()
     until(
         lambda: any(entry.get("ACSARD_EVENT") == "link_up" for entry in container.journal()),
@@ -240,7 +240,7 @@ def test_the_journal_can_be_asked_for_an_event(container: Container, board: Boar
 
 
 @pytest.mark.soak
-def test_a_daemon_that_cannot_stay_up_is_left_alone_after_ten_starts(
+def test_a_daemon_that_cannot_stay_up_is_not_restarted_after_ten_starts(
     container: Container, board: Board
 ) -> None:
     container.start()

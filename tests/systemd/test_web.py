@@ -170,12 +170,10 @@ def test_an_invited_phone_drives_and_stops_the_installed_robot_until_it_is_revok
         SERVED_S,
         "the robot stands",
     )
-    assert stands["mode"] != "stopped", "nobody has stopped it: who drove is gone"
+    assert stands["mode"] != "stopped", "no client has stopped it: the driver is gone"
 
 
-def test_who_has_no_token_gets_the_empty_page_and_nothing_else(
-    robot: Container, phone: Phone
-) -> None:
+def test_a_client_without_a_token_gets_only_the_empty_page(robot: Container, phone: Phone) -> None:
     async def story() -> None:
         for token in ("", "x" * 43):
             async with phone.browser(token) as stranger:
@@ -188,7 +186,7 @@ def test_who_has_no_token_gets_the_empty_page_and_nothing_else(
     on(phone, story)
 
 
-def test_the_unit_lets_in_the_networks_of_lan_conf_and_these_to_the_page_alone(
+def test_the_networks_of_lan_conf_reach_the_page_and_no_other_port(
     robot: Container, phone: Phone
 ) -> None:
     assert phone.reaches(8443)
@@ -217,7 +215,9 @@ def test_a_renewed_certificate_is_shown_after_the_reload_and_tokens_still_count(
     on(phone, story)
 
 
-def test_without_the_drop_in_it_stays_down_and_names_it(robot: Container, phone: Phone) -> None:
+def test_the_page_unit_without_its_drop_in_stays_down_and_names_lan_conf(
+    robot: Container, phone: Phone
+) -> None:
     robot.types("rm -r /etc/systemd/system/acsard-web.service.d && systemctl daemon-reload")
     robot.types("systemctl restart acsard-web")
     until(lambda: robot.show("ActiveState", PAGE) == "failed", SERVED_S, "it gives up")
