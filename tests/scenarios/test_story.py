@@ -476,7 +476,7 @@ def is_near(line: Line, incident: Incident) -> bool:
 
 
 @pytest.mark.parametrize("output", ["show", "report", "export"])
-def test_one_output_alone_tells_what_happened_when_why_and_by_which_client(
+def test_one_output_alone_reports_each_event_with_time_reason_and_client(
     output: str, story: Story
 ) -> None:
     lines = story.outputs[output]
