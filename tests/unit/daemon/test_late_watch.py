@@ -177,7 +177,7 @@ def test_reports_are_a_second_apart(monkeypatch: pytest.MonkeyPatch) -> None:
         assert moments[1] - moments[0] >= 0.9
 
 
-def test_the_loop_s_times_are_those_between_two_periods() -> None:
+def test_the_loop_s_scheduler_times_are_the_differences_between_two_periods() -> None:
     late = late_watch.Late(0, 30 * MS, b"1000 200 3\n", b"1500 900 5\n")
     assert late.loop == Scheduled(500, 700)
 
