@@ -212,7 +212,7 @@ def test_a_big_robot_that_responds_late_and_falls_short_is_a_warning(
 
 
 @pytest.mark.slow
-def test_a_push_by_hand_with_a_dead_encoder_is_reported_as_slip_of_no_known_wheel() -> None:
+def test_a_push_by_hand_with_a_stuck_encoder_is_reported_as_slip_of_one_side() -> None:
     made = world()
     made.drive(0.3, seconds=0.5)
     made.send(0.0)
