@@ -369,7 +369,7 @@ def test_a_replay_with_another_configuration_reports_the_differences(
     assert f"{fastest} replayed" in out
 
 
-def test_it_tells_which_limits_are_others_what_they_do_and_that_the_wheels_knew_nothing_of_it(
+def test_a_replay_names_changed_limits_their_effect_and_a_fault_they_might_avoid(
     where: Path, tmp_path: Path
 ) -> None:
     other = tmp_path / "slow.toml"
