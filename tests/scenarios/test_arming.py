@@ -46,7 +46,7 @@ def cleared(way: Way, *names: str) -> tuple[World, list[Speaker]]:
 @pytest.mark.variations(4)
 @pytest.mark.parametrize("count", [2, more(30), long(100)])
 @pytest.mark.parametrize("way", get_args(Way))
-def test_the_zeros_of_one_program_never_release_another(way: Way, count: int) -> None:
+def test_the_zeros_of_one_program_never_arm_another(way: Way, count: int) -> None:
     """One client sends zeros at 10 Hz, the other always 0.5 m/s: it moved 2.1 m in 5 s."""
     for seed in range(count):
         dice = random.Random(seed)
@@ -66,7 +66,7 @@ def test_the_zeros_of_one_program_never_release_another(way: Way, count: int) ->
 
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [10, more(40), long(1000)])
-def test_programs_whose_stamps_come_from_several_routers_never_release_each_other(
+def test_programs_whose_stamps_come_from_several_routers_never_arm_each_other(
     count: int,
 ) -> None:
     """One program sends zeros, and another one always sends speeds.

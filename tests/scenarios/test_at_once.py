@@ -229,7 +229,9 @@ def test_the_reported_latencies_of_a_command_are_the_real_ones(world: World) -> 
     figures = world.state.latencies
     waited = figures["command_to_wire"].since_start
     assert waited.max == pytest.approx((GAP_NS - 1 * MS) / 1000)
-    assert figures["mcu_round_trip"].since_start.count == 0, "no plain reply tells what it answers"
+    assert figures["mcu_round_trip"].since_start.count == 0, (
+        "a plain reply does not name the line that it answers"
+    )
     assert figures["period_lateness"].since_start.max == 0.0
 
 

@@ -199,7 +199,7 @@ def test_another_configuration_stays_in_force_after_a_damaged_section(
 def test_damage_that_hides_the_end_of_a_file_is_not_reported_as_a_truncation(
     long: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The damage covers the head of the last chunk with its length, and the content behind it."""
+    """The damage covers the head of the last chunk with its length, and the content after it."""
     begin, end = chunks(long.read_bytes())[-1]
     new = harmed(long, tmp_path / "harmed.mcap", begin, (end - begin) // 2)
     recording = Recording(new)

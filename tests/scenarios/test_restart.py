@@ -38,7 +38,7 @@ ZEROS_S, CYCLE_S = 0.3, 2.0
 
 
 class MemoryFile:
-    """The latch file without a disk: it has the newest latches at once, as after the rename."""
+    """The latch file without a disk: it has the newest latches immediately."""
 
     def __init__(self) -> None:
         self.data = b""
@@ -72,7 +72,7 @@ class MemoryFile:
 
 
 class Host:
-    """A computer with a daemon, a board that nobody switches off, and one stop-and-go commander."""
+    """A computer with a daemon, a board that stays on, and one stop-and-go commander."""
 
     def __init__(self, dice: random.Random) -> None:
         self.file, self.dice = MemoryFile(), dice
@@ -168,7 +168,7 @@ def test_a_latched_robot_stands_after_a_restart_until_it_is_released(kind: Kind)
 @pytest.mark.slow
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_robot_whose_latch_file_is_cut_stands_until_it_is_cleared(kind: Kind) -> None:
+def test_a_robot_whose_latch_file_is_truncated_stands_until_a_clear(kind: Kind) -> None:
     stands_until_released(Host(random.Random(2)), kind, cut)
 
 
@@ -355,7 +355,7 @@ def test_a_stop_while_the_bus_closes_is_in_force_at_the_next_start() -> None:
 def test_a_stop_in_a_step_that_raises_is_in_force_at_the_next_start(
     monkeypatch: pytest.MonkeyPatch, owner: type, name: str, works: bool, by: str
 ) -> None:
-    """The bug is in the bus's input, in the robot, behind the robot's step, or in publishing."""
+    """The bug is in the bus's input, in the robot, after the robot's step, or in publishing."""
     host = Host(random.Random(16))
     host.patrols(2 * CYCLE_S)
     usual = getattr(owner, name)

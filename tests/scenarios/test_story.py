@@ -515,7 +515,7 @@ def test_show_and_export_of_a_part_have_the_same_lines(
 def test_show_and_export_of_a_damaged_recording_have_the_same_lines(
     story: Story, tmp_path: Path
 ) -> None:
-    """The export has no messages of the steps behind the damage, but their events."""
+    """The export has no messages of the steps after the damage, but it has their events."""
     bad, new = tmp_path / "bad.mcap", tmp_path / "new.mcap"
     data = bytearray(listed(story.where)[0].read_bytes())
     begin, end = chunks(data)[4]

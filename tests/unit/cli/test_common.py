@@ -225,7 +225,7 @@ def test_a_certificate_goes_with_a_tls_endpoint_only(
     assert asked(places.option, "tls/robot:7449", tls="/home/b")[2] == "/home/b"
 
 
-def test_a_tool_without_an_address_says_so(tmp_path: Path) -> None:
+def test_a_tool_without_an_address_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "a.toml"
     file.write_text("[bus]\nlisten = []\n")
     with pytest.raises(MendableError) as caught:

@@ -443,7 +443,7 @@ def test_recover_writes_a_whole_file_or_none_and_overwrites_no_recording(
     assert sorted(one.name for one in tmp_path.iterdir() if one.is_file()) == ["mine", "new.mcap"]
 
 
-def test_recover_replaces_its_own_earlier_result_only_on_request_and_says_so(
+def test_recover_replaces_its_earlier_result_only_with_force_and_reports_it(
     where: Path, tmp_path: Path
 ) -> None:
     new = tmp_path / "new.mcap"

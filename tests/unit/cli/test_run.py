@@ -58,7 +58,7 @@ def test_one_option_changes_its_own_table_only(words: list[str], table: str) -> 
     assert changed == [table]
 
 
-def test_the_banner_tells_a_simulator_from_a_robot() -> None:
+def test_the_banner_distinguishes_a_simulator_from_a_robot() -> None:
     simulated = run.banner(Config(), "acsard.toml", "/dev/pts/3")
     config = Config(mcu=McuConfig(port="/dev/ttyUSB0"))
     real = run.banner(config, "acsard.toml", "/dev/ttyUSB0")

@@ -372,7 +372,7 @@ def test_an_unknown_role_is_refused(own: Path, capsys: pytest.CaptureFixture[str
     assert "viewer" in capsys.readouterr().err
 
 
-def test_add_without_an_authority_says_what_makes_one(
+def test_add_without_an_authority_names_the_command_that_makes_one(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ("--role", "viewer", "--directory", str(tmp_path / "none"))
@@ -382,7 +382,7 @@ def test_add_without_an_authority_says_what_makes_one(
 
 
 @pytest.mark.parametrize("name", ["ca.pem", "ca-key.pem"])
-def test_add_with_a_broken_authority_says_so(
+def test_add_with_a_broken_authority_is_refused_with_the_reason(
     own: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:
     (own / name).write_text("not what it should be")
@@ -410,7 +410,7 @@ sys.exit(main(["tls", *sys.argv[1:]]))
 
 @pytest.fixture
 def locked() -> Iterator[Path]:
-    """Yield a directory that everyone may enter but nobody may write to.
+    """Yield a directory that every user may enter and no user may write to.
 
     It is not inside a directory that only root may enter.
     """
@@ -652,7 +652,7 @@ def test_an_encrypted_authority_s_password_is_asked_for(own: Path) -> None:
 
 
 @pytest.mark.slow
-def test_an_encrypted_authority_without_a_terminal_says_so(own: Path) -> None:
+def test_an_encrypted_authority_without_a_terminal_is_refused_with_the_reason(own: Path) -> None:
     encrypt(own, b"secret")
     words = [sys.executable, "-m", "acsard", "tls", "renew", "--directory", str(own)]
     done = subprocess.run(words, input="secret\n", capture_output=True, text=True, timeout=30.0)

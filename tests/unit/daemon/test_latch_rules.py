@@ -299,7 +299,7 @@ def test_a_stop_that_no_step_served_is_newer_than_the_stop_before_it(ahead: int)
 
 
 def test_a_stop_that_no_step_served_is_newer_than_a_stop_that_was_released() -> None:
-    """The wall clock went back, and the released stop had the number behind `INACTIVE`."""
+    """The wall clock went back, and the released stop had the number after that of `INACTIVE`."""
     keeper, now = Keeper(), Instant(NOW.mono_ns, NOW.wall_ns - 9 * NS_PER_S)
     life = Lifecycle(active=True, latches=Latches(inactive=INACTIVE))
     life.stop("joe", 1, Instant(1, now.wall_ns))

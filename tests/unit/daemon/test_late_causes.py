@@ -158,12 +158,14 @@ def test_the_thread_s_own_disk_delay_is_enough_to_name_the_disk() -> None:
 
 
 @pytest.mark.parametrize(("stolen_ms", "named"), [(10, False), (20, False), (30, True)])
-def test_one_or_two_ticks_of_steal_time_are_usual(stolen_ms: int, named: bool) -> None:
+def test_one_or_two_ticks_of_steal_time_are_not_named_as_a_cause(
+    stolen_ms: int, named: bool
+) -> None:
     late = Lateness(12 * MS, Scheduled(), Reading(0, (5, 5)), Reading(0, (5, 5 + stolen_ms * MS)))
     assert causes(late)[0] == (("steal",) if named else ())
 
 
-def test_two_causes_at_once_are_both_named() -> None:
+def test_two_simultaneous_causes_are_both_named() -> None:
     conditions = Conditions(slow_clock=SlowClock("powersave", 600, 1500))
     hog = Program(812, "hog", 150 * MS)
     late = Lateness(50 * MS, Scheduled(0, 50 * MS), Reading(), Reading(conditions=conditions), hog)

@@ -75,7 +75,7 @@ def test_the_minimum_gap_begins_when_the_last_line_is_sent() -> None:
 def test_an_early_line_replaces_the_line_of_the_next_period() -> None:
     paced = ticked()
     assert paced.hears(6 * MS)
-    assert not paced.hears(9 * MS), "only one"
+    assert not paced.hears(9 * MS), "one early line in a period"
     assert not paced.ticks(10 * MS)
     assert paced.ticks(20 * MS)
 
@@ -100,7 +100,7 @@ def test_a_command_within_the_minimum_gap_is_sent_as_soon_as_the_gap_has_passed(
     paced = ticked()
     assert not paced.hears(1 * MS)
     assert paced.retry_ns == GAP_NS
-    assert not paced.pace.listens, "it is awake for the newest command anyway"
+    assert not paced.pace.listens, "the retry sends the newest command anyway"
     assert paced.hears(GAP_NS)
     assert paced.retry_ns is None
 

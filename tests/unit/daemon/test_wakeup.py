@@ -147,6 +147,6 @@ async def test_in_a_flood_of_stops_one_step_is_early_and_the_period_takes_the_re
     waiting += 1
     wakeup.stop()
     await asyncio.sleep(0.01)
-    assert steps[2:] == [1], "the next stop gets a step at once again"
+    assert steps[2:] == [1], "the next stop gets an early step again"
     wakeup()
     await running

@@ -202,7 +202,7 @@ IN_NEED = {
 
 
 @each("need", IN_NEED)
-def test_of_too_many_robots_for_the_screen_one_that_needs_help_is_shown_first(need: str) -> None:
+def test_a_robot_that_needs_help_is_shown_first_if_the_fleet_exceeds_the_screen(need: str) -> None:
     rows = [replace(ROW, robot_id=f"robot{n:02d}") for n in range(29)]
     shown = table([*rows, replace(IN_NEED[need], robot_id="robot99")], 120, 22)
     assert shown[1].startswith("robot99")
