@@ -499,7 +499,7 @@ def test_nav2_that_retries_a_goal_by_itself_drives_when_its_zero_counts(
 @pytest.mark.slow
 @pytest.mark.variations(2)
 @by_each_road
-def test_the_first_goal_of_nav2_after_a_start_does_not_move_the_robot_and_the_second_one_does(
+def test_after_a_start_the_second_goal_of_nav2_is_the_first_to_move_the_robot(
     world: World, road: Road
 ) -> None:
     """Nothing before the goal, TwistStamped speeds at 20 Hz from its start, one zero at its end."""
@@ -596,7 +596,7 @@ def test_docking_has_its_own_place_above_nav2_and_below_ros2_control() -> None:
 
 @pytest.mark.slow
 @by_each_road
-def test_the_first_docking_after_a_start_must_be_cancelled_and_later_ones_pass_the_zeros_of_nav2(
+def test_after_one_cancelled_docking_later_ones_drive_through_the_zeros_of_nav2(
     world: World, road: Road
 ) -> None:
     """The collision monitor still repeats its zeros when the docking server begins."""

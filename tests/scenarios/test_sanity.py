@@ -170,7 +170,7 @@ def test_a_bit_flipped_while_the_link_returns_is_no_fault(number: int) -> None:
 
 
 @pytest.mark.slow
-def test_a_bit_flipped_in_the_first_line_after_clear_is_no_fault_and_does_not_turn_the_pose(
+def test_a_bit_error_in_the_first_line_after_clear_is_no_fault_and_turns_no_pose(
     world: World,
 ) -> None:
     for _ in range(3):

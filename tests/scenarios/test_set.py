@@ -254,7 +254,7 @@ def test_noise_set_higher_makes_the_pose_less_certain(world: World) -> None:
     assert grows() > 20 * little
 
 
-def test_a_setting_with_its_present_value_is_answered_as_no_change(world: World) -> None:
+def test_setting_the_present_value_is_answered_with_nothing_changes(world: World) -> None:
     reply = sets(world, limits__linear_speed=1.0)
     assert (reply.success, reply.message) == (
         True,

@@ -249,7 +249,7 @@ def test_the_temporary_file_of_a_killed_write_is_removed(tmp_path: Path, started
     assert not list(tmp_path.glob(f".{NAME}.*"))
 
 
-def test_a_file_system_without_locks_keeps_latches_all_the_same(
+def test_a_file_system_without_locks_still_keeps_latches(
     tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def without(*words: object) -> None:

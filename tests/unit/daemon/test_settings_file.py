@@ -452,7 +452,7 @@ def test_a_change_that_the_robot_has_obeyed_is_written_before_the_next_check(
 
 
 @pytest.mark.slow
-def test_an_editor_that_writes_while_the_change_is_computed_loses_nothing(
+def test_an_edit_during_the_computation_of_a_change_is_not_lost(
     file: Path, made: SettingsFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     texts = ["# second\n"]

@@ -120,7 +120,7 @@ def test_undecodable_messages_are_distinguished_from_silence() -> None:
 
 
 @each("width", [40, 80])
-def test_a_warning_stands_below_the_mode_with_its_words(width: int) -> None:
+def test_a_warning_is_shown_below_the_mode_with_its_text(width: int) -> None:
     inputs = {"emergency_stop": "released", "bumpers": [False, False]}
     battery = BatterySummary(24.5, 87.0, -1.25, "ok")
     told = lines_of(of(mode="ready", recording_error="disk full", battery=battery, **inputs), width)
