@@ -360,7 +360,9 @@ COMMANDS: dict[str, How] = {
     "acsard calibrate --positions sim/pose --yes": Elsewhere(
         GUIDED, "test_the_simulator_is_calibrated_by_its_true_pose_without_a_person"
     ),
-    "acsard calibrate --log drive.csv": Elsewhere(CALIBRATE, "test_people_are_told"),
+    "acsard calibrate --log drive.csv": Elsewhere(
+        CALIBRATE, "test_the_result_is_printed_as_text_and_the_file_stays"
+    ),
     # deploy/calibration
     "acsard calibrate --log drive --config acsard.toml": BAG,
     "acsard calibrate --log drive --config acsard.toml --write": BAG,
@@ -371,7 +373,7 @@ COMMANDS: dict[str, How] = {
     "ros2 bag convert -i drive -o mcap.yaml": NO_ROS,
     "zstd -d drive_0.mcap.zstd": Shown("of the package zstd"),
     "acsard calibrate --log drive.csv --distance 4.03 --write": Elsewhere(
-        CALIBRATE, "test_of_two_logs_put_together_a_distance_is_the_straight_one_s"
+        CALIBRATE, "test_in_two_joined_logs_the_distance_belongs_to_the_straight_drive"
     ),
     "sudo apt install gcc libsimavr-dev libelf-dev": InCi("libsimavr-dev"),
     '.venv/bin/pytest -m "not (firmware or soak)" tests/firmware': PYTEST,
@@ -477,18 +479,18 @@ COMMANDS: dict[str, How] = {
         LOG, "test_the_list_has_a_line_for_each_recording_with_its_events"
     ),
     "sudo /opt/acsard/venv/bin/acsard recording --from yesterday": Elsewhere(
-        LOG, "test_the_list_takes_only_the_recordings_of_a_time"
+        LOG, "test_the_list_can_be_restricted_to_a_range_of_time"
     ),
     "sudo /opt/acsard/venv/bin/acsard recording show --from 14:05": Elsewhere(
         "tests/unit/cli/test_recording_times.py",
         "test_a_time_of_day_is_looked_up_before_now_in_the_ring",
     ),
     "sudo /opt/acsard/venv/bin/acsard recording replay": Elsewhere(
-        LOG, "test_a_replay_says_that_all_is_the_same"
+        LOG, "test_a_replay_without_differences_reports_equal_counts"
     ),
     "sudo /opt/acsard/venv/bin/acsard recording export 12 drive.mcap": Elsewhere(
         "tests/unit/cli/test_recording_export.py",
-        "test_a_number_and_a_name_are_taken_and_what_is_there_stays",
+        "test_export_takes_a_number_and_a_name_and_overwrites_no_file",
     ),
     "acsard recording report FILE": Elsewhere(
         "tests/unit/cli/test_recording_report.py",

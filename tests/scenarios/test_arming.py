@@ -46,7 +46,7 @@ def cleared(way: Way, *names: str) -> tuple[World, list[Speaker]]:
 @pytest.mark.variations(4)
 @pytest.mark.parametrize("count", [2, more(30), long(100)])
 @pytest.mark.parametrize("way", get_args(Way))
-def test_the_zeros_of_one_program_never_release_another(way: Way, count: int) -> None:
+def test_the_zeros_of_one_program_never_arm_another(way: Way, count: int) -> None:
     """One client sends zeros at 10 Hz, the other always 0.5 m/s: it moved 2.1 m in 5 s."""
     for seed in range(count):
         dice = random.Random(seed)
@@ -66,7 +66,7 @@ def test_the_zeros_of_one_program_never_release_another(way: Way, count: int) ->
 
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [10, more(40), long(1000)])
-def test_programs_whose_stamps_come_from_several_routers_never_release_each_other(
+def test_programs_whose_stamps_come_from_several_routers_never_arm_each_other(
     count: int,
 ) -> None:
     """One program sends zeros, and another one always sends speeds.
@@ -112,7 +112,7 @@ def test_a_program_whose_stamping_router_changes_must_send_a_zero_again_and_then
 
 @pytest.mark.slow
 @pytest.mark.parametrize("way", SHARED)
-def test_a_shared_sender_that_a_crowd_pushed_out_must_let_go_as_before(way: Way) -> None:
+def test_a_shared_sender_that_many_senders_displaced_must_still_return_to_neutral(way: Way) -> None:
     world = quiet()
     zeros, speeds = Speaker(world, way), Speaker(world, way)
     crowd = [Speaker(world, "signed", f"stranger {number}") for number in range(40)]
@@ -142,7 +142,7 @@ def test_a_pause_arms_no_sender(way: Way, pauses: tuple[float, ...]) -> None:
 
 @pytest.mark.slow
 @each("way", get_args(Way))
-def test_a_network_that_loses_all_for_a_while_arms_nobody(way: Way) -> None:
+def test_a_network_that_loses_all_messages_for_a_while_arms_no_sender(way: Way) -> None:
     world, (speaker,) = cleared(way, "a")
     since_ns = world.now_ns
     for _ in range(3):
@@ -155,7 +155,7 @@ def test_a_network_that_loses_all_for_a_while_arms_nobody(way: Way) -> None:
 
 @pytest.mark.slow
 @each("way", OWN)
-def test_a_zero_of_an_identity_of_its_own_arms_at_once_right_behind_its_speeds(way: Way) -> None:
+def test_a_zero_of_an_unshared_identity_arms_immediately_even_right_after_speeds(way: Way) -> None:
     world, (speaker,) = cleared(way, "a")
     speaker.hold(0.4, 1.0)
     assert world.state.mode == "ready"
@@ -210,7 +210,7 @@ def test_an_armed_sender_stays_armed_and_just_drives_again(
 
 @pytest.mark.slow
 @each("way", get_args(Way))
-def test_a_first_command_without_a_zero_is_answered_in_plain_words(way: Way) -> None:
+def test_a_first_command_without_a_zero_gets_a_reason_in_plain_words(way: Way) -> None:
     world = quiet()
     speaker = Speaker(world, way, "b")
     for _ in range(20):
@@ -223,7 +223,7 @@ def test_a_first_command_without_a_zero_is_answered_in_plain_words(way: Way) -> 
 
 @pytest.mark.slow
 @each("way", STAMPED)
-def test_after_clear_a_held_key_stays_without_effect_until_it_is_let_go(way: Way) -> None:
+def test_after_clear_a_held_key_has_no_effect_until_it_is_released(way: Way) -> None:
     world, (speaker,) = cleared(way, "a")
     since_ns = world.now_ns
     speaker.hold(0.4, 5.0)
@@ -233,7 +233,7 @@ def test_after_clear_a_held_key_stays_without_effect_until_it_is_let_go(way: Way
 
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [4, more(60)])
-def test_a_zero_that_was_proven_never_outlives_the_speeds_behind_it(count: int) -> None:
+def test_a_proven_zero_of_one_program_never_arms_the_delayed_speeds_of_another(count: int) -> None:
     """One program sends one plain zero, the other 0.5 m/s with a header through heavy jitter."""
     for seed in range(count):
         dice = random.Random(seed)
@@ -253,7 +253,7 @@ def test_a_zero_that_was_proven_never_outlives_the_speeds_behind_it(count: int) 
 
 @pytest.mark.slow
 @each("stall", [0.02, 0.1])
-def test_a_zero_from_before_a_restart_of_the_board_arms_nobody(stall: float) -> None:
+def test_a_zero_from_before_a_restart_of_the_board_arms_no_sender(stall: float) -> None:
     """A clear, a zero and the restart come while the loop stands. One step then obeys them all."""
     world = quiet()
     world.drive(0.4, seconds=0.5)
@@ -279,7 +279,7 @@ def test_a_zero_from_before_a_restart_of_the_board_arms_nobody(stall: float) -> 
 
 @each("pause", [0.5, 1.0])
 @each("way", ["plain", "bridge"])
-def test_a_stall_of_the_daemon_is_no_pause_between_the_zero_of_one_and_the_speeds_of_another(
+def test_a_stall_of_the_daemon_does_not_count_as_a_pause_after_another_sender_s_zero(
     way: Way, pause: float
 ) -> None:
     """The first step after the stall begins before the bus has delivered what waited."""

@@ -40,7 +40,7 @@ def between_ticks(world: World, ms: float) -> None:
     world.run(ms / 1e3)
 
 
-def test_a_fresh_command_is_on_the_wire_at_once(world: World) -> None:
+def test_a_fresh_command_is_sent_between_periods_without_delay(world: World) -> None:
     between_ticks(world, 6.0)
     at_ns = world.now_ns
     world.send(0.5)
@@ -48,7 +48,7 @@ def test_a_fresh_command_is_on_the_wire_at_once(world: World) -> None:
     assert world.port.sent[-1][1] != world.port.sent[-2][1]
 
 
-def test_one_that_comes_right_after_a_line_waits_for_the_gap_and_no_longer(world: World) -> None:
+def test_a_command_right_after_a_line_waits_for_the_minimum_gap_and_no_longer(world: World) -> None:
     between_ticks(world, 1.0)
     at_ns = world.now_ns
     world.send(0.5)
@@ -56,7 +56,7 @@ def test_one_that_comes_right_after_a_line_waits_for_the_gap_and_no_longer(world
     assert sent_after(world, at_ns) == [GAP_NS - 1 * MS]
 
 
-def test_it_takes_the_place_of_the_next_periods_line(world: World) -> None:
+def test_an_early_line_replaces_the_line_of_the_next_period(world: World) -> None:
     between_ticks(world, 6.0)
     at_ns = world.now_ns
     world.send(0.5)
@@ -65,9 +65,7 @@ def test_it_takes_the_place_of_the_next_periods_line(world: World) -> None:
 
 
 @pytest.mark.parametrize("hz", [30.0, 99.0, 333.0, 1000.0, 5000.0])
-def test_however_often_commands_come_there_are_no_more_lines_than_periods(
-    world: World, hz: float
-) -> None:
+def test_no_rate_of_commands_makes_more_lines_than_periods(world: World, hz: float) -> None:
     at_ns = world.now_ns
     world.hold(0.5, seconds=1.0, hz=hz)
     lines = sent_after(world, at_ns)
@@ -75,7 +73,7 @@ def test_however_often_commands_come_there_are_no_more_lines_than_periods(
     assert min(b - a for a, b in pairwise(lines)) >= GAP_NS
 
 
-def test_a_stop_goes_at_once_too(world: World) -> None:
+def test_a_stop_is_sent_between_periods_too(world: World) -> None:
     world.hold(0.5, seconds=1.0)
     between_ticks(world, 6.0)
     at_ns = world.now_ns
@@ -84,7 +82,7 @@ def test_a_stop_goes_at_once_too(world: World) -> None:
     assert world.state.mode == "stopped"
 
 
-def test_one_whose_command_does_not_count_pulls_no_line_forward(world: World) -> None:
+def test_a_command_that_does_not_count_sends_no_early_line(world: World) -> None:
     world.hold(0.5, seconds=0.5, source="teleop")
     world.send(0.0, source="nav")
     between_ticks(world, 6.0)
@@ -168,7 +166,7 @@ def test_a_flood_that_no_line_can_answer_makes_few_steps(
     assert world.steps - steps <= 100 * (3 + IDLE_WAKES)
 
 
-def test_after_a_stall_the_clocks_line_goes_though_one_went_at_once(world: World) -> None:
+def test_after_a_stall_the_periodic_line_is_sent_even_after_an_early_line(world: World) -> None:
     between_ticks(world, 6.0)
     world.send(0.5)
     world.stall(0.045)
@@ -177,7 +175,9 @@ def test_after_a_stall_the_clocks_line_goes_though_one_went_at_once(world: World
     assert sent_after(world, at_ns) == [0]
 
 
-def test_what_makes_it_brake_goes_in_the_period_whose_line_went_ahead(world: World) -> None:
+def test_a_request_that_makes_the_robot_brake_is_sent_even_after_an_early_line(
+    world: World,
+) -> None:
     world.hold(0.5, seconds=1.0)
     between_ticks(world, 5.0)
     world.send(0.5)
@@ -222,18 +222,20 @@ def test_a_repeated_command_keeps_a_robot_from_stopping_but_makes_no_line_of_its
     assert world.state.mode == "driving"
 
 
-def test_what_the_daemon_says_of_itself_is_what_happened(world: World) -> None:
+def test_the_reported_latencies_of_a_command_are_the_real_ones(world: World) -> None:
     between_ticks(world, 1.0)
     world.send(0.5)
     world.run(1.1)
     figures = world.state.latencies
     waited = figures["command_to_wire"].since_start
     assert waited.max == pytest.approx((GAP_NS - 1 * MS) / 1000)
-    assert figures["mcu_round_trip"].since_start.count == 0, "no plain reply tells what it answers"
+    assert figures["mcu_round_trip"].since_start.count == 0, (
+        "a plain reply does not name the line that it answers"
+    )
     assert figures["period_lateness"].since_start.max == 0.0
 
 
-def test_checked_replies_tell_how_long_the_microcontroller_takes() -> None:
+def test_checked_replies_give_the_round_trip_time_of_the_microcontroller() -> None:
     world = World(Config(mcu=McuConfig(link_check="require")))
     world.run(1.0)
     round_trip = world.state.latencies["mcu_round_trip"].since_start

@@ -130,7 +130,7 @@ def test_each_press_stops_the_robot_within_a_period_until_a_clear(
 @pytest.mark.variations(4)
 @pytest.mark.parametrize("count", [5, pytest.param(25, marks=pytest.mark.slow), MOST[1]])
 @pytest.mark.parametrize(("place", "sign"), [*zip(PLACES, (-1, 1, 0, 0), strict=True)])
-def test_a_bumper_that_limits_stands_within_a_period_and_then_lets_it_only_away(
+def test_a_limiting_bumper_stops_the_robot_within_a_period_and_allows_only_retreat(
     place: Place, sign: int, count: int
 ) -> None:
     world, dice = World(AWAY), random.Random(count)

@@ -53,7 +53,9 @@ def drive(seed: int, seconds: float) -> tuple[float, float, int]:
         pytest.param(620.0, 5, marks=[pytest.mark.soak, pytest.mark.timeout(600)], id="450 m"),
     ],
 )
-def test_with_the_mcu_s_counts_bursts_cost_a_centimetre_at_most(seconds: float, seeds: int) -> None:
+def test_with_the_mcu_s_counts_bursts_of_lost_lines_cost_at_most_a_centimetre(
+    seconds: float, seeds: int
+) -> None:
     drives = [drive(seed, seconds) for seed in range(seeds)]
     off, metres, lost = (sum(column) / seeds for column in zip(*drives, strict=True))
     print(

@@ -102,7 +102,7 @@ def test_a_square_ends_where_the_raw_counter_says(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("counts", "coarse"), [(16, True), (96, True), (3200, False)])
-def test_state_counts_the_lines_of_coarse_encoders_whose_counts_nobody_knows(
+def test_state_counts_the_lines_of_coarse_encoders_whose_resolution_is_unknown(
     counts: int, coarse: bool
 ) -> None:
     world = World(Config(sim=SimConfig(encoder_counts=counts)))
@@ -114,7 +114,7 @@ def test_state_counts_the_lines_of_coarse_encoders_whose_counts_nobody_knows(
     assert coarse or "coarse_encoder_lines" not in world.state.counters
 
 
-def test_configured_counts_that_the_speeds_show_are_those_of_the_state() -> None:
+def test_state_reports_the_configured_counts_if_the_speeds_agree_with_them() -> None:
     mcu = McuConfig(encoder_counts=16)
     world = World(Config(sim=SimConfig(encoder_counts=16), mcu=mcu))
     world.run(0.5)

@@ -76,7 +76,7 @@ def test_at_equal_priority_the_first_keeps_the_robot() -> None:
     assert "came first" in {s.name: s.waits_for for s in world.state.sources}["left"]
 
 
-def test_a_stop_latches_until_clear_and_then_wants_neutral(world: World) -> None:
+def test_a_stop_latches_until_clear_and_then_requires_neutral(world: World) -> None:
     world.drive(0.5, seconds=1.0)
     assert world.call("stop").success
     world.hold(0.5, seconds=1.0)
@@ -97,7 +97,7 @@ def test_a_stop_brakes_harder_than_a_timeout(world: World) -> None:
     assert world.lines()[-1] == b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
 
 
-def test_any_put_on_stop_stops_whatever_it_holds(world: World) -> None:
+def test_a_put_on_stop_stops_the_robot_with_any_payload(world: World) -> None:
     for payload in (b"", b"\x00", b"{}", b"please"):
         world.put("stop", payload)
         world.run(0.02)
@@ -156,7 +156,7 @@ def test_a_robot_stopped_while_inactive_is_inactive_after_clear(world: World) ->
         ),
     ],
 )
-def test_a_bad_command_is_refused_whole_and_counted(
+def test_a_bad_command_is_refused_as_a_whole_and_counted(
     key: str, payload: bytes, put: bool, reason: str
 ) -> None:
     world = World()
@@ -188,7 +188,7 @@ def test_a_backlog_of_stamped_commands_is_not_obeyed(world: World) -> None:
     assert world.state.mode == "ready"
 
 
-def test_a_sender_whose_clock_is_a_day_off_drives_all_the_same(world: World) -> None:
+def test_a_sender_whose_clock_is_a_day_off_can_drive(world: World) -> None:
     day_ns = 86_400_000_000_000
     world.send(0.0, stamp_ns=world.now_ns + day_ns)
     world.run(0.05)
@@ -198,7 +198,7 @@ def test_a_sender_whose_clock_is_a_day_off_drives_all_the_same(world: World) -> 
     assert world.state.mode == "driving"
 
 
-def test_state_says_that_a_sender_is_not_known_yet_and_counts_what_did_not_count() -> None:
+def test_state_reports_a_new_sender_and_counts_its_ignored_commands() -> None:
     world = World()
     world.run(0.2)
     client = Speaker(world, "signed", ahead=-3600.0)
@@ -215,7 +215,7 @@ def test_state_says_that_a_sender_is_not_known_yet_and_counts_what_did_not_count
     assert world.state.mode == "driving"
 
 
-def test_stamps_that_zenoh_replaces_are_counted_and_no_matter(world: World) -> None:
+def test_stamps_that_zenoh_replaces_are_only_counted(world: World) -> None:
     client = Speaker(world, "signed", ahead=0.4)
     client.open()
     assert "stamps_replaced" not in world.state.counters
@@ -226,7 +226,7 @@ def test_stamps_that_zenoh_replaces_are_counted_and_no_matter(world: World) -> N
 
 
 @pytest.mark.slow
-def test_hardware_whose_controller_failed_holds_the_robot_but_not_in_silence(world: World) -> None:
+def test_failed_hardware_holds_the_robot_and_the_reason_is_reported(world: World) -> None:
     """ros2_control's hardware sends these zeros for ever, while Nav2 goes on."""
     world.send(0.0, source="nav")
     world.send(0.0, source="ros2_control")
@@ -264,7 +264,7 @@ def test_the_first_try_of_a_ros_user_is_answered_in_words(world: World, way: Way
     assert told.text == f"app: {world.state.reason}"
 
 
-def test_who_is_not_of_ros_is_not_told_of_its_tools(world: World) -> None:
+def test_the_reason_for_a_native_sender_names_no_ros_tools(world: World) -> None:
     Speaker(world, "signed").hold(0.5, 5.0)
     assert "send a zero first" in world.state.reason
     assert "ros2" not in world.state.reason
@@ -292,13 +292,13 @@ def test_set_pose_and_reset_odometry_move_the_pose_and_not_the_robot(world: Worl
     assert not world.call("set_pose", b'{"x": 1}').success
 
 
-def test_a_get_on_everything_stops_nothing(world: World) -> None:
+def test_a_query_on_the_wildcard_calls_no_service(world: World) -> None:
     for service in ("stop", "clear", "deactivate"):
         assert world.ask(f"srv/{service}", asked="**") == []
     assert world.state.mode == "ready"
 
 
-def test_state_is_published_ten_times_a_second_and_at_once_on_change(world: World) -> None:
+def test_state_is_published_ten_times_a_second_and_immediately_on_change(world: World) -> None:
     world.bus.wanted.add("state")
     world.run(0.5)
     published = world.bus.published["state"]
@@ -334,7 +334,7 @@ def test_a_zero_from_before_the_clear_does_not_count_as_neutral(world: World) ->
     assert "send a zero first" in world.state.reason
 
 
-def test_shutting_down_ramps_to_rest_and_obeys_nobody(world: World) -> None:
+def test_shutting_down_ramps_to_rest_and_obeys_no_client(world: World) -> None:
     world.drive(0.9, seconds=2.0)
     world.loop.shutting_down = True
     world.hold(0.9, seconds=0.35)
@@ -400,7 +400,7 @@ def waits_for(world: World, source: str = "nav") -> str:
 
 @pytest.mark.variations(2)
 @by_each_way
-def test_the_zero_of_another_on_the_same_key_does_not_set_the_robot_off(
+def test_a_zero_of_another_sender_on_the_same_key_does_not_start_the_robot(
     world: World, via: Via
 ) -> None:
     holding, other = Person(world, via, "a"), Person(world, via, "b")
@@ -427,7 +427,7 @@ def test_the_zero_of_another_on_the_same_key_does_not_set_the_robot_off(
 
 
 @by_each_way
-def test_of_two_on_the_same_key_the_first_is_obeyed_alone_and_the_second_is_reported(
+def test_only_the_first_of_two_senders_on_a_key_is_obeyed_and_the_second_is_reported(
     world: World, via: Via
 ) -> None:
     first, second = Person(world, via, "a"), Person(world, via, "b")
@@ -473,7 +473,7 @@ def test_two_nodes_behind_one_bridge_that_stamps_nothing_are_one_sender(world: W
 @pytest.mark.variations(3)
 @by_each_way
 @pytest.mark.parametrize("cleared_after", [0.05, 0.2, 0.4, 0.55])
-def test_what_the_network_held_back_around_a_clear_does_not_set_the_robot_off(
+def test_commands_that_the_network_delayed_around_a_clear_do_not_start_the_robot(
     world: World, via: Via, cleared_after: float
 ) -> None:
     person = Person(world, via, "a")
@@ -498,7 +498,7 @@ def test_what_the_network_held_back_around_a_clear_does_not_set_the_robot_off(
 
 @pytest.mark.variations(3)
 @by_each_way
-def test_a_network_that_lets_samples_in_by_heaps_makes_no_pause_of_them(
+def test_a_network_that_delivers_in_bursts_does_not_make_a_pause_that_arms(
     world: World, via: Via
 ) -> None:
     person = Person(world, via, "a")
@@ -514,7 +514,7 @@ def test_a_network_that_lets_samples_in_by_heaps_makes_no_pause_of_them(
 @pytest.mark.variations(3)
 @by_each_way
 @pytest.mark.parametrize("nonsense", ["NaN", "cut", "nothing", "a NaN in a stamped one"])
-def test_what_cannot_be_read_arms_nobody(world: World, via: Via, nonsense: str) -> None:
+def test_an_unreadable_command_arms_no_sender(world: World, via: Via, nonsense: str) -> None:
     person = Person(world, via, "a")
     stamp = Time(*divmod(world.instant.wall_ns, NS_PER_S))
     bad, kind = {

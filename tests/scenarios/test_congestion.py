@@ -52,7 +52,7 @@ def driven_over(way: Way, delay: Callable[[float], float], seconds: float) -> tu
     ("share", "seconds"), [(0.095, 30.0), (0.01, 60.0), (0.02, 60.0), (0.05, 60.0)]
 )
 @pytest.mark.parametrize("way", STAMPED)
-def test_delays_that_grow_slowly_are_not_taken_for_a_clock(
+def test_slowly_growing_delays_are_not_mistaken_for_a_clock_adjustment(
     way: Way, share: float, seconds: float
 ) -> None:
     oldest, obeyed = driven_over(way, lambda t: share * t, seconds)
@@ -64,7 +64,7 @@ def test_delays_that_grow_slowly_are_not_taken_for_a_clock(
 @pytest.mark.variations(20)
 @pytest.mark.parametrize("plateau", [3.0, 0.5, 8.0, 30.0])
 @pytest.mark.parametrize("way", STAMPED)
-def test_a_constant_delay_that_comes_by_a_jump_is_not_taken_for_a_clock(
+def test_a_delay_that_jumps_and_stays_is_not_mistaken_for_a_clock_adjustment(
     way: Way, plateau: float
 ) -> None:
     seconds = 12.0
@@ -78,7 +78,7 @@ def test_a_constant_delay_that_comes_by_a_jump_is_not_taken_for_a_clock(
 @pytest.mark.slow
 @pytest.mark.nightly
 @pytest.mark.parametrize("way", STAMPED)
-def test_no_shape_of_congestion_has_an_old_command_obeyed(way: Way) -> None:
+def test_no_shape_of_congestion_makes_the_robot_obey_an_old_command(way: Way) -> None:
     """Growth of 1 to 10 % and plateaus of 0.5 to 30 s follow one another, with jitter."""
     for seed in range(6):
         dice = random.Random(seed)
@@ -133,7 +133,7 @@ def test_a_sender_with_a_steady_clock_drives_on_as_soon_as_it_is_prompt_again() 
 
 
 @each("way", STAMPED)
-def test_a_release_brakes_at_once_while_the_delay_of_its_sender_is_in_doubt(way: Way) -> None:
+def test_a_zero_brakes_immediately_while_the_delay_of_its_sender_is_unproven(way: Way) -> None:
     source = Source("app", 50, 2.0)
     world = World(Config(commands=CommandsConfig(sources=(source,))))
     world.run(0.5)
@@ -154,7 +154,7 @@ def test_a_release_brakes_at_once_while_the_delay_of_its_sender_is_in_doubt(way:
     assert outputs.applied.linear < 1.0
 
 
-def test_what_is_forgiven_to_a_foreign_clock_is_counted_in_state() -> None:
+def test_state_counts_the_milliseconds_by_which_a_foreign_clock_was_adjusted() -> None:
     world = quiet()
     speaker = Speaker(world, "rmw")
     speaker.open()
@@ -165,7 +165,7 @@ def test_what_is_forgiven_to_a_foreign_clock_is_counted_in_state() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("way", ["rmw", "header", "zenoh"])
-def test_a_zenoh_clock_that_stands_until_it_was_caught_up_is_an_adjustment(way: Way) -> None:
+def test_a_zenoh_clock_that_stands_still_after_it_was_set_back_is_an_adjustment(way: Way) -> None:
     """Zenoh's clock never goes back: after its wall clock was set back by 3 s it nearly stands."""
     world = quiet()
     speaker = Speaker(world, way)
@@ -185,7 +185,9 @@ def test_a_zenoh_clock_that_stands_until_it_was_caught_up_is_an_adjustment(way: 
 @pytest.mark.slow
 @each("timeout", [0.25, 5.0])
 @each("way", STAMPED)
-def test_an_older_command_behind_a_newer_one_is_not_obeyed(way: Way, timeout: float) -> None:
+def test_an_older_command_that_arrives_after_a_newer_one_is_not_obeyed(
+    way: Way, timeout: float
+) -> None:
     """The defect moved the robot 0.26 m, and 2.5 m at a timeout of 5 s."""
     world = World(Config(commands=CommandsConfig(sources=(Source("app", 50, timeout),))))
     world.run(0.3)
@@ -237,7 +239,7 @@ def test_numbers_alone_keep_the_order_too() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("way", ["signed", "rmw"])
-def test_commands_that_were_lost_are_not_taken_for_a_pause(way: Way) -> None:
+def test_lost_commands_are_not_mistaken_for_a_pause(way: Way) -> None:
     """After a loss of 2.2 s the daemon believed any constant delay, and obeyed commands 5 s old."""
     world = quiet()
     speaker = Speaker(world, way)
@@ -291,7 +293,7 @@ def test_the_old_commands_of_a_slow_sender_are_not_followed(way: Way) -> None:
 @pytest.mark.slow
 @each("trouble", ["lost", "second lost", "twice"])
 @each("way", ["signed", "rmw"])
-def test_a_clock_that_is_set_back_while_a_command_is_lost_or_repeated_heals(
+def test_a_sender_recovers_from_a_clock_set_back_during_a_lost_or_repeated_command(
     way: Way, trouble: str
 ) -> None:
     """The sender was refused for as many minutes as its clock was set back by seconds."""

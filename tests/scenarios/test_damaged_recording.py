@@ -155,7 +155,7 @@ def test_damage_at_twenty_random_places_costs_at_most_a_twentieth_each(
     assert min(shares) >= SHARE
 
 
-def test_replay_and_export_end_with_a_code_of_their_own_and_say_what_is_missing(
+def test_replay_and_export_exit_with_their_own_code_and_name_the_missing_part(
     long: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     begin, end = chunks(long.read_bytes())[22]
@@ -176,7 +176,7 @@ def test_replay_and_export_end_with_a_code_of_their_own_and_say_what_is_missing(
     assert "not exported" not in capsys.readouterr().err
 
 
-def test_another_configuration_stays_in_force_behind_a_damaged_place(
+def test_another_configuration_stays_in_force_after_a_damaged_section(
     long: Path, tmp_path: Path
 ) -> None:
     """The recorded robot got other limits on its way, and they stay changed too."""
@@ -196,10 +196,10 @@ def test_another_configuration_stays_in_force_behind_a_damaged_place(
     assert found.linear_speed == plain.robot.config.limits.linear_speed != 1.0
 
 
-def test_damage_that_hides_the_end_of_a_file_is_not_taken_for_a_cut(
+def test_damage_that_hides_the_end_of_a_file_is_not_reported_as_a_truncation(
     long: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The damage covers the head of the last chunk with its length, and the content behind it."""
+    """The damage covers the head of the last chunk with its length, and the content after it."""
     begin, end = chunks(long.read_bytes())[-1]
     new = harmed(long, tmp_path / "harmed.mcap", begin, (end - begin) // 2)
     recording = Recording(new)
@@ -214,7 +214,7 @@ def test_damage_that_hides_the_end_of_a_file_is_not_taken_for_a_cut(
     )
 
 
-def test_a_lost_chunk_whose_events_begin_the_next_one_is_not_taken_for_a_forgery(
+def test_a_lost_chunk_whose_events_begin_the_next_one_is_not_reported_as_a_forgery(
     tmp_path: Path,
 ) -> None:
     tape, world = recorded_world()

@@ -33,7 +33,7 @@ def test_a_stop_is_a_warning_until_it_is_cleared(world: World) -> None:
 
 
 @pytest.mark.slow
-def test_a_source_that_is_refused_is_a_warning_as_long_as_it_is_refused(world: World) -> None:
+def test_a_source_is_a_warning_while_it_is_refused(world: World) -> None:
     world.drive(0.3, seconds=0.5)
     assert row(world, "commands").level == OK
     for _ in range(30):
@@ -45,7 +45,7 @@ def test_a_source_that_is_refused_is_a_warning_as_long_as_it_is_refused(world: W
     assert (row(world, "commands").level, world.state.source) == (OK, "app")
 
 
-def test_a_sender_whose_clock_is_new_here_is_no_warning(world: World) -> None:
+def test_a_new_sender_with_another_clock_causes_no_warning(world: World) -> None:
     client = Speaker(world, "signed", ahead=-3600.0)
     client.hold(0.0, 0.2)
     assert world.state.counters["commands_of_new_senders"] == 4

@@ -83,7 +83,7 @@ def test_every_message_of_a_sample_has_its_stamp(world: World) -> None:
         assert tf.transforms[0].header.stamp == stamp == wheels.header.stamp
 
 
-def test_what_is_applied_ramps_by_the_acceleration(world: World) -> None:
+def test_the_applied_speed_ramps_by_the_acceleration(world: World) -> None:
     world.bus.wanted.add("cmd_vel_out")
     world.drive(0.5, seconds=1.0)
     twists = world.bus.published["cmd_vel_out"]
@@ -107,7 +107,7 @@ def test_silence_begins_a_ramp_within_the_timeout_and_a_tick(world: World) -> No
     assert world.lines()[-1] == b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
 
 
-def test_every_wheel_only_falls_on_the_way_down_from_an_arc(world: World) -> None:
+def test_no_wheel_speeds_up_while_the_robot_brakes_out_of_an_arc(world: World) -> None:
     world.drive(0.9, 3.0, seconds=2.0)
     seen: list[tuple[float, ...]] = []
     world.watch = lambda outputs: seen.append(outputs.speeds.as_tuple())
@@ -119,7 +119,7 @@ def test_every_wheel_only_falls_on_the_way_down_from_an_arc(world: World) -> Non
     assert falling[-1] == (0.0, 0.0, 0.0, 0.0)
 
 
-def test_too_fast_a_wish_is_scaled_with_its_curvature_kept(world: World) -> None:
+def test_a_command_above_the_limits_is_scaled_and_keeps_its_curvature(world: World) -> None:
     world.drive(5.0, 5.0, seconds=2.0)
     applied = world.loop.outputs
     assert applied is not None
@@ -137,7 +137,7 @@ def test_wheels_can_be_commanded_by_name_in_any_order(world: World) -> None:
     assert world.state.source == "ros2_control"
 
 
-def test_a_motor_mounted_the_other_way_round_is_signed_once() -> None:
+def test_a_reversed_motor_changes_the_sign_of_command_and_feedback_once() -> None:
     world = World(Config(mcu=McuConfig(wheels=WheelMap(front_left="-a", front_right="+b"))))
     world.run(0.2)
     world.drive(0.5, seconds=1.0)

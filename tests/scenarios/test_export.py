@@ -132,12 +132,12 @@ def assert_same(then: Sequence[Message], now: Sequence[Message]) -> None:
 
 @pytest.mark.slow
 @each("key", ["odom", "tf", "tf_static", "wheel_states", "cmd_vel_out", "battery"])
-def test_every_message_is_the_one_that_was_published(key: str, both: Any) -> None:
+def test_every_exported_message_equals_the_published_one(key: str, both: Any) -> None:
     world, _, said = both
     assert_same(world.bus.published[key], said[key])
 
 
-def test_every_state_is_the_same_but_for_what_the_daemon_measures_of_itself(both: Any) -> None:
+def test_every_exported_state_equals_the_published_one_without_latencies(both: Any) -> None:
     world, _, said = both
     then = [replace(one, latencies={}) for one in world.bus.published["state"]]
     assert all(isinstance(one, RobotState) and one.counters["lines"] for one in then[20:])
@@ -145,7 +145,7 @@ def test_every_state_is_the_same_but_for_what_the_daemon_measures_of_itself(both
     assert then[-1].counters["commands_superseded"] > 0
 
 
-def test_every_diagnostics_has_the_same_rows_but_those(both: Any) -> None:
+def test_every_exported_diagnostics_has_the_same_rows_except_measured_ones(both: Any) -> None:
     world, _, said = both
     left_out = MEASURED | {"acsard: recording"}
     then = [
@@ -196,7 +196,7 @@ def test_every_line_reason_of_the_log_is_a_reason_that_the_state_has(both: Any) 
         assert line.msg.partition(" (by ")[0] == f"{mode}: {reason}"
 
 
-def test_every_command_is_there_by_its_source_with_the_time_it_came(both: Any) -> None:
+def test_every_command_is_exported_under_its_source_with_its_arrival_time(both: Any) -> None:
     _, tape, said = both
     offset_ns = {}
     heard: Said = defaultdict(list)
@@ -321,7 +321,7 @@ def same(told: Any, ours: Any) -> bool:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("library", ["seeking", "not seeking", "rosbags"])
-def test_two_libraries_make_of_the_definitions_in_the_file_what_was_published(
+def test_two_libraries_decode_the_file_by_its_definitions_to_the_published_messages(
     library: str, recorded: Any, file: Path
 ) -> None:
     world, tape, _ = recorded
@@ -342,7 +342,7 @@ def test_two_libraries_make_of_the_definitions_in_the_file_what_was_published(
     assert lines == [(one.stamp.sec, one.stamp.nanosec, plain(one.name)) for one in happened(world)]
 
 
-def test_it_is_the_definitions_in_the_file_that_they_read_by(file: Path, tmp_path: Path) -> None:
+def test_the_libraries_decode_by_the_definitions_in_the_file(file: Path, tmp_path: Path) -> None:
     # The definitions are in the compressed chunks and after them, where a seeking reader looks
     # first.
     whole = file.read_bytes()

@@ -230,7 +230,7 @@ def test_a_replay_finds_every_forged_reason_name_and_event(
 
 
 @pytest.mark.slow
-def test_a_recording_that_nobody_forged_replays_equal(
+def test_an_unforged_recording_replays_without_differences(
     original: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["recording", "replay", str(original)]) == Exit.OK, capsys.readouterr().out

@@ -73,7 +73,7 @@ def wandering(made: World, seed: int, seconds: float = 60.0) -> Drive:
 @pytest.mark.parametrize(
     "seed", [1, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(2, 21))]
 )
-def test_with_a_gyro_the_heading_errs_by_less_than_a_hundredth_of_what_was_turned(
+def test_with_a_gyro_the_heading_error_is_below_one_percent_of_all_rotation(
     seed: int,
 ) -> None:
     drive = wandering(world(), seed)
@@ -83,7 +83,7 @@ def test_with_a_gyro_the_heading_errs_by_less_than_a_hundredth_of_what_was_turne
 
 
 @pytest.mark.slow
-def test_to_turn_on_and_on_the_same_way_costs_no_more() -> None:
+def test_with_a_gyro_a_long_rotation_in_one_direction_has_a_small_heading_error() -> None:
     with_gyro, without = Drive(world()), Drive(world(gyro=False))
     for drive in (with_gyro, without):
         drive.world.drive(0.0, 0.0, 0.2)
@@ -95,7 +95,7 @@ def test_to_turn_on_and_on_the_same_way_costs_no_more() -> None:
 
 
 @pytest.mark.slow
-def test_the_position_follows_the_truth_too() -> None:
+def test_with_a_gyro_the_position_follows_the_true_one_too() -> None:
     made = world()
     wandering(made, 3, seconds=30.0)
     pose, truth = made.state, made.truth
@@ -138,7 +138,7 @@ def test_a_gyro_that_dies_is_reported_and_the_wheels_go_on() -> None:
 @pytest.mark.parametrize(
     ("verb", "pose"), [("reset_odometry", b""), ("set_pose", b'{"x": 1.0, "y": 0.0, "yaw": 1.0}')]
 )
-def test_where_the_pose_is_set_what_the_wheels_told_before_is_of_no_account(
+def test_after_a_set_pose_earlier_wheel_slip_does_not_affect_the_heading(
     verb: str, pose: bytes
 ) -> None:
     made = world()
@@ -167,7 +167,7 @@ def test_wheels_that_lose_their_grip_are_reported() -> None:
     assert drive.error < 0.02
 
 
-def test_a_sample_that_cannot_be_is_counted_and_changes_nothing() -> None:
+def test_an_implausible_gyro_sample_is_counted_and_changes_nothing() -> None:
     made = world()
     made.put("imu", b'{"angular_velocity": {"z": 1e9}}')
     made.put("imu", b'{"angular_velocity": {"z": NaN}}')
@@ -178,7 +178,7 @@ def test_a_sample_that_cannot_be_is_counted_and_changes_nothing() -> None:
     assert made.state.yaw == 0.0
 
 
-def test_without_the_setting_nobody_listens_to_a_gyro() -> None:
+def test_without_the_setting_the_gyro_is_off_and_has_no_diagnostics() -> None:
     made = World()
     made.run(1.0)
     assert made.state.gyro == "off"
@@ -200,7 +200,7 @@ def gone_silent(made: World, seed: int) -> Drive:
 
 
 @pytest.mark.slow
-def test_without_its_gyro_the_heading_is_good_by_the_track_that_it_taught() -> None:
+def test_without_its_gyro_the_robot_keeps_a_good_heading_by_the_learned_track() -> None:
     plain, asked = gone_silent(world(), 11), gone_silent(world(learned_track=True), 11)
     print(f"the gyro is silent: by the configured track {plain.error:.0%} of {plain.all:.1f} rad, "
           f"by the learned one {asked.error:.1%}; {asked.world.state.effective_track}")  # fmt: skip
@@ -229,7 +229,7 @@ def test_the_covariance_knows_how_well_the_track_is_known() -> None:
 
 
 @pytest.mark.slow
-def test_what_was_learned_is_replayed_to_the_last_bit() -> None:
+def test_a_drive_with_a_learned_track_is_replayed_to_the_last_bit() -> None:
     tape = Tape()
     made = world(learned_track=True, recorder=tape)
     wandering(made, 13, seconds=25.0)

@@ -100,18 +100,18 @@ def ends_as_it_always_did(minutes: int) -> None:
 
 
 @pytest.mark.slow
-def test_two_minutes_end_as_they_always_did() -> None:
+def test_a_drive_of_two_minutes_ends_in_the_recorded_state() -> None:
     ends_as_it_always_did(SHORT)
 
 
 @pytest.mark.slow
 @pytest.mark.nightly
-def test_ten_minutes_end_as_they_always_did() -> None:
+def test_a_drive_of_ten_minutes_ends_in_the_recorded_state() -> None:
     ends_as_it_always_did(SLOW)
 
 
 @pytest.mark.soak
-def test_an_hour_ends_as_it_always_did() -> None:
+def test_a_drive_of_an_hour_ends_in_the_recorded_state() -> None:
     ends_as_it_always_did(LONG)
 
 

@@ -84,7 +84,7 @@ def test_the_secret_of_a_sender_is_published_nowhere() -> None:
 
 
 @pytest.mark.slow
-def test_an_attacker_who_knows_all_that_is_published_cannot_drive_as_the_operator() -> None:
+def test_an_attacker_that_reads_all_published_messages_cannot_drive_as_the_operator() -> None:
     world, victim, texts = driven()
     shown = world.state.sender
     candidates = list(dict.fromkeys([shown, *names(texts)]))
@@ -114,7 +114,7 @@ def test_the_session_that_stamps_a_command_is_not_published() -> None:
 
 
 @pytest.mark.parametrize("certificate", ["", "anna"])
-def test_a_stolen_secret_counts_under_no_other_certificate(certificate: str) -> None:
+def test_a_stolen_secret_is_useless_under_another_certificate(certificate: str) -> None:
     world = World()
     victim = Speaker(world, "signed", VICTIM)
     thief = Speaker(world, "signed", VICTIM, ahead=AHEAD_NS / NS_PER_S)
@@ -137,7 +137,7 @@ def test_a_stolen_secret_counts_under_no_other_certificate(certificate: str) -> 
 
 
 @pytest.mark.slow
-def test_a_stolen_secret_counts_on_no_key_of_ros() -> None:
+def test_a_stolen_secret_is_useless_on_ros_keys() -> None:
     world = World()
     victim = Speaker(world, "signed", VICTIM)
     thief = Speaker(world, "signed", VICTIM, ahead=AHEAD_NS / NS_PER_S)

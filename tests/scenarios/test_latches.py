@@ -78,7 +78,7 @@ def test_a_clear_read_before_a_later_stop_and_delivered_after_it_is_refused(worl
     assert world.state.mode == "ready"
 
 
-def test_a_clear_read_before_any_stop_releases_none(world: World) -> None:
+def test_a_clear_read_before_any_stop_releases_no_stop(world: World) -> None:
     assert world.state.latch == 0
     call(world, "stop", "joe")
     world.run(3.0)
@@ -109,7 +109,7 @@ def test_every_stop_is_a_new_latch_also_while_one_holds(world: World) -> None:
     assert msgspec.json.decode(msgspec.json.encode(float(seen[-1]))) == seen[-1]
 
 
-def test_a_bumper_does_not_hide_who_stopped_the_robot(world: World) -> None:
+def test_a_bumper_does_not_hide_the_client_that_stopped_the_robot(world: World) -> None:
     with world.mcu.bumpers():
         world.run(0.2)
         call(world, "stop", "joe")

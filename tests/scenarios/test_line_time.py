@@ -79,7 +79,7 @@ def test_stalls_of_the_host_cost_no_distance(stall: float, reports: bool) -> Non
 
 
 @pytest.mark.parametrize("link", ["plain", "checked", "checked with counts"])
-def test_a_stop_line_that_leaves_late_is_no_sample_of_the_time_before_it(link: str) -> None:
+def test_the_pose_of_a_pushed_robot_is_right_although_stop_lines_leave_late(link: str) -> None:
     """A person pushes the robot, so that it moves while only stop lines are sent."""
     mcu = McuConfig(
         link_check="off" if link == "plain" else "auto",

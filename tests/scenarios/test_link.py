@@ -46,7 +46,7 @@ def moving(lines: list[bytes]) -> list[bytes]:
     return [line for line in lines if line not in (ZERO, b"\r\n")]
 
 
-def test_unplugging_is_reported_at_once_and_wishes_nothing(world: World) -> None:
+def test_unplugging_is_reported_immediately_and_commands_zero(world: World) -> None:
     world.drive(0.5, seconds=1.0)
     world.port.unplug()
     world.run(0.01)
@@ -59,7 +59,7 @@ def test_unplugging_is_reported_at_once_and_wishes_nothing(world: World) -> None
 
 
 @pytest.mark.slow
-def test_a_speed_that_nobody_measures_any_more_is_not_reported(world: World) -> None:
+def test_a_speed_is_not_reported_after_its_measurements_end(world: World) -> None:
     world.drive(1.0, seconds=3.0)
     moving_x = world.state.linear
     assert moving_x == pytest.approx(1.0, abs=0.05)
@@ -88,7 +88,7 @@ def test_a_speed_that_nobody_measures_any_more_is_not_reported(world: World) -> 
     assert world.state.feedback_age == pytest.approx(0.0, abs=0.02)
 
 
-def test_a_robot_that_has_never_heard_its_board_reports_no_speed_and_no_age() -> None:
+def test_a_robot_that_never_received_feedback_reports_no_speed_and_no_age() -> None:
     world = World(plugged=False)
     world.run(1.0)
     state = world.state
@@ -167,7 +167,7 @@ def test_a_short_silence_only_ramps_up_again(world: World) -> None:
     assert world.state.mode == "driving"
 
 
-def test_a_long_silence_wants_neutral_again(world: World) -> None:
+def test_a_long_silence_requires_neutral_again(world: World) -> None:
     world.drive(0.5, seconds=1.0)
     with world.mcu.mute():
         world.hold(0.5, seconds=1.5)
@@ -356,7 +356,7 @@ def test_the_first_line_after_a_reopening_is_zero_even_when_the_output_was_block
     assert moving(world.lines())
 
 
-def test_a_line_that_the_loop_stood_still_over_is_superseded_and_the_next_one_goes(
+def test_a_line_that_a_stall_in_the_step_delays_is_superseded_by_the_next_one(
     world: World,
 ) -> None:
     world.drive(0.5, seconds=0.2)  # on the way up each line has another speed
@@ -371,7 +371,7 @@ def test_a_line_that_the_loop_stood_still_over_is_superseded_and_the_next_one_go
     assert world.state.counters["lines_superseded"] == 1
 
 
-def test_a_zero_goes_however_long_the_loop_stood_still_over_it(world: World) -> None:
+def test_a_zero_line_is_sent_however_long_the_step_stalled(world: World) -> None:
     sent, begun_ns = len(world.port.sent), world.now_ns
     world.stall_in_step(0.2)
     world.run(0.2)
@@ -381,7 +381,7 @@ def test_a_zero_goes_however_long_the_loop_stood_still_over_it(world: World) -> 
     assert world.state.counters.get("lines_superseded", 0) == 0
 
 
-def test_a_torn_line_moves_nothing_and_spoils_none_behind_it(world: World) -> None:
+def test_a_torn_line_moves_nothing_and_spoils_no_later_line(world: World) -> None:
     world.drive(0.5, seconds=1.0)
     world.run(0.005)  # the last one arrives
     valid, heard = world.mcu.valid_lines, len(world.mcu.heard)
@@ -406,7 +406,7 @@ def test_a_slow_wire_drives_at_the_rate_it_carries() -> None:
     assert world.state.counters.get("lines_superseded", 0) == 0
 
 
-def test_a_stall_of_the_loop_bunches_nothing_and_loses_no_distance(world: World) -> None:
+def test_a_stall_of_the_loop_causes_no_burst_of_lines_and_loses_no_distance(world: World) -> None:
     world.drive(0.5, seconds=1.0)
     sent = len(world.port.sent)
     world.send(0.5)
@@ -418,7 +418,7 @@ def test_a_stall_of_the_loop_bunches_nothing_and_loses_no_distance(world: World)
     assert world.state.x == pytest.approx(world.mcu.vehicle.pose.x, abs=0.005)
 
 
-def test_a_loop_that_did_not_run_is_told_so_and_a_board_that_is_silent_as_that(
+def test_a_lost_link_is_reported_as_a_host_stall_or_as_a_silent_board(
     world: World,
 ) -> None:
     world.drive(0.5, seconds=1.0)
@@ -460,21 +460,21 @@ def test_a_link_that_loses_lines_is_reported_once(fault: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_sound_link_is_not_said_to_lose_lines() -> None:
+def test_a_sound_link_is_not_reported_to_lose_lines() -> None:
     world = World()
     world.drive(0.5, seconds=25.0)
     assert not [event for event in world.events if event.name == "lines_lost"]
     assert "link_lost" not in world.state.counters
 
 
-def test_a_board_that_is_silent_now_and_then_is_counted() -> None:
+def test_each_silence_of_a_board_is_counted() -> None:
     world = World()
     with world.mcu.having(named("stalls=1:0.3")):
         world.run(5.5)
     assert world.state.counters["link_lost"] == 5
 
 
-def test_a_simulator_that_the_file_makes_mute_never_links() -> None:
+def test_a_simulator_that_is_configured_mute_never_brings_the_link_up() -> None:
     world = World(Config(sim=SimConfig(faults=("mute",))), wanted={"state"})
     world.run(10.0)
     states = [one for one in world.bus.published["state"] if isinstance(one, RobotState)]
@@ -494,7 +494,7 @@ def test_a_simulator_that_the_file_makes_mute_never_links() -> None:
         ),
     ],
 )
-def test_a_silent_or_garbled_board_is_told_by_what_was_heard(
+def test_a_silent_or_garbled_board_is_diagnosed_by_the_received_bytes(
     fault: str, heard: str, mend: str
 ) -> None:
     world = World(wanted={"state"})

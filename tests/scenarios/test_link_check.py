@@ -119,7 +119,7 @@ def test_an_mcu_without_samples_is_driven_checked_and_the_log_says_what_is_missi
     ("firmware", "comma"), [("no_check", False), ("plain_only", False), ("comma_latched", True)]
 )
 @pytest.mark.parametrize("counts", [0, 3200])
-def test_auto_drives_old_firmware_plainly_and_unharmed(
+def test_auto_drives_old_firmware_with_plain_lines_and_without_faults(
     firmware: str, comma: bool, counts: int
 ) -> None:
     world = World(config(counts=counts, trailing_comma=comma))
@@ -230,7 +230,7 @@ def test_a_reset_is_found_by_the_clock_when_its_announcement_is_lost() -> None:
     assert world.state.x - x < 0.05
 
 
-def test_replugging_another_mcu_is_negotiated_anew() -> None:
+def test_another_mcu_on_the_port_is_negotiated_again() -> None:
     world = started(config(counts=3200))
     world.drive(0.5, seconds=1.0)
     x = world.state.x
@@ -324,7 +324,7 @@ def accepted_by_the_host(data: bytes, codec: Codec, checked: bool) -> list[objec
     "count",
     [10_000, pytest.param(1_000_000, marks=[pytest.mark.soak, pytest.mark.timeout(1800)])],
 )
-def test_of_single_bit_errors_none_changes_a_value_on_a_checked_link(count: int) -> None:
+def test_no_single_bit_error_changes_a_value_on_a_checked_link(count: int) -> None:
     codec, tried, wrong = Codec(WheelMap()), Counter[str](), Counter[str]()
     for number, plain in enumerate(itertools.cycle(replies_of_a_drive(random.Random(7), 5000))):
         if number * 8 * 41 >= count:
@@ -420,14 +420,14 @@ def jittery_drive(check: str, counts: int) -> World:
 
 
 @pytest.mark.slow
-def test_when_the_host_reads_the_lines_does_not_bend_the_pose() -> None:
+def test_with_counts_late_reads_of_the_host_do_not_bend_the_pose() -> None:
     by_speeds, by_counts = off_by(jittery_drive("off", 0)), off_by(jittery_drive("require", 3200))
     print(f"\n  late reads: {by_speeds:.4%} off by speeds, {by_counts:.4%} by counts")
     assert by_counts < min(0.001, by_speeds)
 
 
 @pytest.mark.slow
-def test_over_a_long_drive_counts_and_clock_wrap_and_nothing_jumps() -> None:
+def test_counts_and_clock_wrap_in_a_long_drive_without_a_jump_of_the_pose() -> None:
     fine = replace(config("require", 40_000), sim=SimConfig(encoder_counts=40_000))
     world = World(fine)
     world.mcu._on_ns -= 60 * NS_PER_S  # run for a minute: the clock wraps in 5 s
@@ -479,7 +479,7 @@ def test_a_stall_of_the_host_loses_no_distance_with_counts() -> None:
 
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("motor", range(4))
-def test_a_lying_encoder_is_still_found_out_with_counts(motor: int) -> None:
+def test_with_counts_a_stuck_encoder_is_a_fault(motor: int) -> None:
     world = started(config("require", 3200))
     world.drive(0.5, seconds=1.0)
     with world.mcu.stuck_encoder(motor):
@@ -576,7 +576,7 @@ class Echo(FakeMcu):
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("check", ["auto", "require"])
 @pytest.mark.parametrize("counts", [0, 3200])
-def test_a_line_that_echoes_is_never_driven_on(check: str, counts: int) -> None:
+def test_a_serial_line_that_echoes_is_never_driven(check: str, counts: int) -> None:
     world = World(config(check, counts), plugged=False)
     echo = Echo(world.config, world.now_ns)
     world.port.plug(echo)
@@ -599,7 +599,7 @@ def test_a_line_that_echoes_is_never_driven_on(check: str, counts: int) -> None:
     [pytest.param(0, 0, id="prompt"), pytest.param(0, 16, id="adapter"),
      pytest.param(30, 0, id="radio"), pytest.param(60, 0, id="slow radio")],
 )  # fmt: skip
-def test_a_plain_link_that_echoes_is_found_out_when_the_speed_changes(
+def test_an_echo_on_a_plain_link_is_detected_when_the_speed_changes(
     changes: dict[str, float], most: float, delay_ms: int, latency_ms: int
 ) -> None:
     world = World(replace(Config(), limits=replace(LimitsConfig(), **changes)), plugged=False)
@@ -640,7 +640,7 @@ class HalfDuplex(FakeMcu):
      pytest.param(0.1, 0, id="reports at 10 Hz"), pytest.param(0.01, 0, id="reports at 100 Hz"),
      pytest.param(0.1, 16, id="reports at 10 Hz by an adapter")],
 )  # fmt: skip
-def test_an_echo_beside_the_replies_of_a_board_is_found_out_when_the_speed_changes(
+def test_an_echo_beside_replies_of_a_board_is_detected_when_the_speed_changes(
     acceleration: float, period: float, latency_ms: int
 ) -> None:
     limits = replace(LimitsConfig(), linear_acceleration=acceleration)
@@ -663,7 +663,7 @@ def test_an_echo_beside_the_replies_of_a_board_is_found_out_when_the_speed_chang
 @pytest.mark.slow
 @each("lag", [0.01, 0.02, 0.03, 0.05])
 @each("deceleration", [0.6, 1.0, 3.0])
-def test_an_ideal_board_whose_motors_lag_by_whole_periods_is_not_taken_for_an_echo(
+def test_an_ideal_board_whose_motors_lag_by_whole_periods_is_not_reported_as_an_echo(
     lag: float, deceleration: float
 ) -> None:
     limits = replace(
@@ -683,7 +683,7 @@ def test_an_ideal_board_whose_motors_lag_by_whole_periods_is_not_taken_for_an_ec
 
 @pytest.mark.parametrize("check", ["auto", "require"])
 @pytest.mark.parametrize("counts", [0, 3200])
-def test_a_checked_link_that_begins_to_echo_while_it_drives_is_found_out(
+def test_an_echo_that_begins_on_a_checked_link_during_a_drive_is_detected(
     check: str, counts: int
 ) -> None:
     world = World(config(check, counts))
@@ -704,7 +704,7 @@ def test_a_checked_link_that_begins_to_echo_while_it_drives_is_found_out(
     [(0.002, 3200), (0.002, 1_000_000), (0.05, 3200), (0.05, 1_000_000), (0.3, 3200),
      (0.3, 1_000_000)],
 )  # fmt: skip
-def test_no_board_whose_motors_lag_by_2_ms_is_taken_for_an_echo(
+def test_no_board_whose_motors_lag_by_2_ms_is_reported_as_an_echo(
     lag: float, counts: int, period: float, speeds: int
 ) -> None:
     plain = Config(

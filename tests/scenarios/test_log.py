@@ -63,7 +63,7 @@ def call(world: World, service: str, name: bytes = b"", via: Via = "native") -> 
 
 
 @pytest.mark.parametrize("service", [key.removeprefix("srv/") for key in VERBS])
-def test_every_service_is_reported_once_with_who_called_it(world: World, service: str) -> None:
+def test_every_service_call_is_reported_once_with_its_caller(world: World, service: str) -> None:
     if service == "clear":
         call(world, "stop", signed("ann@desk"))
     call(world, service, signed("joe@laptop patrol"))
@@ -72,7 +72,7 @@ def test_every_service_is_reported_once_with_who_called_it(world: World, service
     assert event.count == 1
 
 
-def test_who_stopped_and_who_cleared_stand_in_order(world: World) -> None:
+def test_stops_and_clears_are_reported_in_order_with_their_clients(world: World) -> None:
     for name in ("joe", "ann"):
         call(world, "stop", signed(name))
         call(world, "clear", signed(name + "@desk"))
@@ -85,13 +85,13 @@ def test_who_stopped_and_who_cleared_stand_in_order(world: World) -> None:
     ]
 
 
-def test_the_stop_of_a_second_client_is_reported_at_once(world: World) -> None:
+def test_the_stop_of_a_second_client_is_reported_without_delay(world: World) -> None:
     call(world, "stop", signed("joe"))
     call(world, "stop", signed("ann"))
     assert [event.by for event in told(world, "stop")] == [shown("joe"), shown("ann")]
 
 
-def test_no_stop_is_reported_behind_the_clear_that_released_it(world: World) -> None:
+def test_no_stop_is_reported_after_the_clear_that_released_it(world: World) -> None:
     for _ in range(2 * BURST):
         call(world, "stop", signed("joe"))
         world.run(0.05)
@@ -104,7 +104,7 @@ def test_no_stop_is_reported_behind_the_clear_that_released_it(world: World) -> 
     ]
 
 
-def test_no_clear_is_reported_behind_the_stop_that_came_after_it(world: World) -> None:
+def test_no_clear_is_reported_after_the_stop_that_followed_it(world: World) -> None:
     for _ in range(BURST):
         call(world, "stop", signed("joe"))
         world.run(0.05)
@@ -127,7 +127,7 @@ def test_a_client_that_repeats_a_stop_pushes_no_other_row_out_of_the_events(worl
     assert "deactivate" in {row.name for row in events.events}
 
 
-def test_ros_says_less_of_who_calls_and_the_log_says_so(world: World) -> None:
+def test_the_log_says_that_a_caller_over_ros_is_unnamed(world: World) -> None:
     call(world, "stop", bytes(16) + b"\x10" + bytes(range(16)), "rmw")
     world.run(2.0)
     call(world, "clear", b"", "bridge")
@@ -153,7 +153,7 @@ def test_a_put_on_stop_is_reported_with_its_name_or_the_session_that_stamped_it(
 # the changes and their reasons
 
 
-def test_a_drive_is_the_mode_and_its_commander(world: World) -> None:
+def test_a_drive_is_reported_as_changes_of_mode_and_commander(world: World) -> None:
     world.drive(0.5, seconds=0.5)
     world.run(1.0)
     assert [event.text for event in told(world, "mode")] == [
@@ -165,7 +165,7 @@ def test_a_drive_is_the_mode_and_its_commander(world: World) -> None:
     ]
 
 
-def test_a_higher_priority_is_another_commander_and_so_is_going_back(world: World) -> None:
+def test_each_change_of_the_commander_by_priority_is_reported(world: World) -> None:
     world.drive(0.5, seconds=0.3)
     world.drive(0.3, seconds=0.3, source="teleop")
     world.send(0.0, source="app")
@@ -178,7 +178,7 @@ def test_a_higher_priority_is_another_commander_and_so_is_going_back(world: Worl
     ]
 
 
-def test_a_lost_cable_is_the_link_and_the_mode(world: World) -> None:
+def test_a_lost_cable_is_reported_as_a_link_event_and_a_mode_event(world: World) -> None:
     world.drive(0.5, seconds=0.5)
     world.events.clear()
     world.port.unplug()
@@ -195,7 +195,9 @@ def counted(events: list[Event]) -> int:
 
 
 @pytest.mark.slow
-def test_refused_commands_are_a_line_a_second_by_reason_and_none_is_missing(world: World) -> None:
+def test_refused_commands_are_one_log_line_a_second_that_counts_them_by_reason(
+    world: World,
+) -> None:
     for step in range(500):
         world.put("cmd/app" if step % 5 else "cmd/nobody", b'{"linear": {"x": 0.5}}')
         world.send(0.1, source="stranger")
@@ -208,7 +210,7 @@ def test_refused_commands_are_a_line_a_second_by_reason_and_none_is_missing(worl
     assert "100 x wrong_shape" in lines[2].text
 
 
-def test_missed_periods_are_a_line_a_second_and_none_is_missing(world: World) -> None:
+def test_missed_periods_are_one_log_line_a_second_that_counts_all(world: World) -> None:
     for _ in range(20):
         world.stall(0.05)
         world.run(0.05)
@@ -229,7 +231,7 @@ def test_the_cause_of_a_late_period_is_in_the_line_that_follows() -> None:
     assert cause.text.startswith("late: by 0.04 s, because other programs used the processor for")
 
 
-def test_a_wire_full_of_noise_is_a_line_a_second_and_none_is_missing(world: World) -> None:
+def test_noise_on_the_wire_is_one_log_line_a_second_that_counts_all(world: World) -> None:
     with world.mcu.noise():
         world.run(5.0)
     world.run(1.1)
@@ -247,7 +249,7 @@ def most_lines(world: World) -> int:
 
 
 @pytest.mark.slow
-def test_a_cable_that_flaps_for_a_minute_is_some_lines_a_second(world: World) -> None:
+def test_a_flapping_cable_causes_a_bounded_number_of_log_lines_a_second(world: World) -> None:
     most = []
     for _ in range(60):
         for _ in range(10):
@@ -261,7 +263,9 @@ def test_a_cable_that_flaps_for_a_minute_is_some_lines_a_second(world: World) ->
 
 
 @pytest.mark.slow
-def test_a_commander_slower_than_its_timeout_is_a_line_a_second(world: World) -> None:
+def test_a_commander_slower_than_its_timeout_causes_at_most_two_log_lines_a_second(
+    world: World,
+) -> None:
     most = []
     for _ in range(20):
         for _ in range(3):
@@ -272,7 +276,7 @@ def test_a_commander_slower_than_its_timeout_is_a_line_a_second(world: World) ->
 
 
 @pytest.mark.slow
-def test_commanders_that_take_turns_all_the_time_are_some_lines_a_second(world: World) -> None:
+def test_commanders_that_alternate_cause_a_bounded_number_of_log_lines(world: World) -> None:
     for turn in range(200):
         world.send(0.0, source=("teleop", "app")[turn % 2])
         world.run(0.3)
@@ -282,7 +286,7 @@ def test_commanders_that_take_turns_all_the_time_are_some_lines_a_second(world: 
     assert counted(told(world, "commander")) == 200
 
 
-def test_a_thousand_names_are_a_short_line(world: World) -> None:
+def test_stops_by_a_thousand_names_are_few_and_short_log_lines(world: World) -> None:
     for number in range(1000):
         name = signed("x" * 30 + str(number))
         world.bus.arrivals.append(
@@ -295,7 +299,7 @@ def test_a_thousand_names_are_a_short_line(world: World) -> None:
 
 
 @pytest.mark.slow
-def test_a_quiet_day_is_silent(world: World) -> None:
+def test_a_day_without_events_logs_nothing(world: World) -> None:
     world.run(60.0)
     assert world.events == []
 
@@ -303,7 +307,7 @@ def test_a_quiet_day_is_silent(world: World) -> None:
 # at the end
 
 
-def test_the_totals_are_what_was_driven_and_counted(world: World) -> None:
+def test_the_totals_are_the_driven_distance_and_the_counted_events(world: World) -> None:
     world.drive(0.5, seconds=2.0)
     world.send(0.0)
     world.run(1.0)
@@ -317,7 +321,7 @@ def test_the_totals_are_what_was_driven_and_counted(world: World) -> None:
     assert totals["lines"] == world.state.counters["lines"]
 
 
-def test_every_name_is_one_of_the_set(world: World) -> None:
+def test_every_event_name_is_in_the_declared_set(world: World) -> None:
     with world.mcu.noise():
         world.drive(0.5, seconds=1.0)
     world.mcu.reset(world.now_ns)

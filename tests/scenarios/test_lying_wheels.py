@@ -79,7 +79,9 @@ SLOW = pytest.mark.slow
           for kind in ("dead", "reversed", "stuck") for wheel in range(4)),
     ],
 )  # fmt: skip
-def test_the_pose_goes_on_right_and_state_names_the_wheel(kind: str, wheel: int) -> None:
+def test_with_one_wheel_fault_the_pose_stays_right_and_state_names_the_wheel(
+    kind: str, wheel: int
+) -> None:
     made = world()
     made.drive(0.3, seconds=1.0)
     with lies(made, kind, wheel):
@@ -95,7 +97,7 @@ def test_the_pose_goes_on_right_and_state_names_the_wheel(kind: str, wheel: int)
     assert f"{WHEELS[wheel]} wheel is left out" in told[0]
 
 
-def test_it_is_out_within_fifty_milliseconds_and_the_fault_comes_when_it_came() -> None:
+def test_a_stuck_wheel_is_left_out_within_50_ms_and_the_fault_follows_in_time() -> None:
     made = world(fault_time=0.5)
     made.drive(0.8, seconds=2.0)
     begun, out = made.now_ns, 0
@@ -112,7 +114,7 @@ def test_it_is_out_within_fifty_milliseconds_and_the_fault_comes_when_it_came() 
 
 
 @SLOW
-def test_an_encoder_that_lives_again_is_believed_again() -> None:
+def test_an_encoder_that_works_again_is_used_again() -> None:
     made = world()
     made.drive(0.5, seconds=1.0)
     with made.mcu.stuck_encoder(2):
@@ -124,7 +126,7 @@ def test_an_encoder_that_lives_again_is_believed_again() -> None:
 
 
 @SLOW
-def test_with_a_gyro_the_heading_and_the_distance_stay_right() -> None:
+def test_with_a_gyro_and_a_wheel_fault_heading_and_distance_stay_right() -> None:
     made = world(gyro=True, sim=SimConfig(track_multiplier=1.6, gyro_bias=0.01))
     made.drive(0.4, 0.8, seconds=3.0)
     with made.mcu.stuck_encoder(0):
@@ -210,7 +212,7 @@ def test_a_big_robot_that_responds_late_and_falls_short_is_a_warning(
 
 
 @pytest.mark.slow
-def test_pushed_by_hand_with_a_dead_encoder_nothing_is_known_and_slip_is_reported() -> None:
+def test_a_push_by_hand_with_a_stuck_encoder_is_reported_as_slip_of_one_side() -> None:
     made = world()
     made.drive(0.3, seconds=0.5)
     made.send(0.0)
@@ -243,7 +245,7 @@ def test_slip_makes_the_covariance_a_hundred_times_as_large() -> None:
         pytest.param(3600, marks=[pytest.mark.soak, pytest.mark.timeout(3600)]),
     ],
 )
-def test_ordinary_drives_are_never_doubted(counts: int, seconds: int) -> None:
+def test_ordinary_drives_cause_no_wheel_fault(counts: int, seconds: int) -> None:
     """The robot skids on a slippery floor, has coarse encoders, and is sometimes pushed."""
     sim = SimConfig(encoder_counts=counts, track_multiplier=1.6, turn_slip=0.5)
     made, dice = world(sim=sim, fault_time=0.5), random.Random(counts)
@@ -272,9 +274,7 @@ def test_ordinary_drives_are_never_doubted(counts: int, seconds: int) -> None:
         pytest.param(0.0, "dead", marks=SLOW),
     ],
 )
-def test_a_gyro_that_is_none_is_named_in_its_first_turn_and_never_used(
-    share: float, does: str
-) -> None:
+def test_a_false_gyro_is_reported_in_the_first_turn_and_never_used(share: float, does: str) -> None:
     made = world(gyro=True, sim=SimConfig(gyro_noise=0.002, gyro_bias=0.001), share=share)
     made.run(1.5)
     made.drive(0.2, 0.6, seconds=1.5)
@@ -288,7 +288,7 @@ def test_a_gyro_that_is_none_is_named_in_its_first_turn_and_never_used(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("baud", "period"), [(38400, 0.01), (19200, 0.02)])
-def test_lines_that_waited_while_the_computer_stood_still_are_no_fault(
+def test_lines_that_waited_while_the_computer_stalled_cause_no_fault(
     baud: Literal[19200, 38400], period: float
 ) -> None:
     """The board reports by its own clock, and its watchdog has stopped the motors."""
@@ -304,7 +304,7 @@ def test_lines_that_waited_while_the_computer_stood_still_are_no_fault(
 @pytest.mark.slow
 @pytest.mark.parametrize("clear", [True, False])
 @pytest.mark.parametrize(("counts", "speed"), [(16, 1.0), (48, 0.5), (3200, 0.8)])
-def test_a_runaway_is_found_behind_a_late_step_and_again_behind_a_clear(
+def test_a_runaway_is_detected_after_a_late_step_and_again_after_a_clear(
     counts: int, speed: float, clear: bool
 ) -> None:
     """Single lines of few counts report no motion, although the wheel turns."""
@@ -325,7 +325,7 @@ def test_a_runaway_is_found_behind_a_late_step_and_again_behind_a_clear(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("every", "fault_time"), [(0.5, 0.5), (0.7, 0.8)])
-def test_a_computer_that_is_late_again_and_again_hides_no_runaway(
+def test_a_computer_that_is_late_repeatedly_hides_no_runaway(
     every: float, fault_time: float
 ) -> None:
     config = Config(

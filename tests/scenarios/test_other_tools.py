@@ -78,7 +78,7 @@ def drives(world: World, act: Callable[[], None]) -> None:
     assert world.state.mode == "driving", world.state.reason
 
 
-def test_the_table_of_the_page_has_the_tools_that_are_played_here() -> None:
+def test_the_table_of_the_ros_page_lists_exactly_the_tools_of_this_module() -> None:
     table = (ROS2 / "README.md").read_text().partition("\n### After a clear\n")[2]
     rows = re.findall(r"^\| ([^|]+) \| [^|]+ \| [^|]+ \|$", table.partition("\n## ")[0], re.M)
     assert set(rows) - {"tool"} == TOOLS
@@ -93,7 +93,7 @@ def test_the_table_of_the_page_has_the_tools_that_are_played_here() -> None:
     [("rmw", 0.1, 0.38, 0.42), ("rmw", 0.0, 0.38, 0.42),
      ("bridge", 0.1, 0.09, 0.15), ("bridge", 0.0, 0.0, 0.03)],
 )  # fmt: skip
-def test_of_two_publishers_on_a_topic_the_first_drives_by_rmw_and_both_by_the_bridge(
+def test_the_first_of_two_publishers_drives_by_rmw_and_both_drive_by_the_bridge(
     world: World, road: Road, other: float, least: float, most: float
 ) -> None:
     first, second = Speaker(world, road, "first"), Speaker(world, road, "second")
@@ -140,7 +140,7 @@ def test_keyboard_drives_after_k_was_held_for_a_second(world: World, road: Road)
     drives(world, lambda: keyboard.press(FAST, 1.5))
 
 
-def test_keyboard_by_rmw_drives_at_once_after_one_k(world: World) -> None:
+def test_keyboard_by_rmw_drives_immediately_after_one_k(world: World) -> None:
     keyboard = Keyboard(world, "rmw")
     keyboard.press(0.0, 1.1)
     keyboard.press(FAST, 1.5)
@@ -310,7 +310,7 @@ def test_topic_pub_of_a_speed_never_drives_however_often_it_is_started(
         world.run(pause)
 
 
-def test_topic_pub_of_a_zero_by_rmw_arms_nobody_else(world: World) -> None:
+def test_topic_pub_of_a_zero_by_rmw_arms_no_other_sender(world: World) -> None:
     topic_pub(world, "rmw", "zero", 0.0, 2.0)
     stands(world, lambda: topic_pub(world, "rmw", "speed", FAST, 3.0))
 
@@ -326,7 +326,7 @@ def test_topic_pub_once_of_a_zero_by_the_bridge_arms_after_a_second(world: World
 
 @pytest.mark.slow
 @by_each_road
-def test_drive_py_drives_at_once_after_a_clear(world: World, road: Road) -> None:
+def test_drive_py_drives_immediately_after_a_clear(world: World, road: Road) -> None:
     """It sends its opening zeros for the time that its file sets."""
     text = (ROS2 / "drive.py").read_text()
     (zeros,) = re.findall(r"^ZEROS_S = ([\d.]+)$", text, re.M)
@@ -499,7 +499,7 @@ def test_nav2_that_retries_a_goal_by_itself_drives_when_its_zero_counts(
 @pytest.mark.slow
 @pytest.mark.variations(2)
 @by_each_road
-def test_the_first_goal_of_nav2_after_a_start_does_not_move_the_robot_and_the_second_one_does(
+def test_after_a_start_the_second_goal_of_nav2_is_the_first_to_move_the_robot(
     world: World, road: Road
 ) -> None:
     """Nothing before the goal, TwistStamped speeds at 20 Hz from its start, one zero at its end."""
@@ -596,7 +596,7 @@ def test_docking_has_its_own_place_above_nav2_and_below_ros2_control() -> None:
 
 @pytest.mark.slow
 @by_each_road
-def test_the_first_docking_after_a_start_must_be_cancelled_and_later_ones_pass_the_zeros_of_nav2(
+def test_after_one_cancelled_docking_later_ones_drive_through_the_zeros_of_nav2(
     world: World, road: Road
 ) -> None:
     """The collision monitor still repeats its zeros when the docking server begins."""
@@ -667,7 +667,7 @@ class DiffDrive(Speaker):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("road", "silence"), [("rmw", 1.0), ("bridge", 2.0)])
-def test_ros2_control_drives_after_nobody_sent_cmd_vel_for_a_while(
+def test_ros2_control_drives_after_a_while_without_cmd_vel(
     world: World, road: Road, silence: float
 ) -> None:
     control = DiffDrive(world, road)

@@ -53,7 +53,7 @@ def lives_again(tape: Tape, config: Config, first: int = 0, least: int = 100) ->
 
 @pytest.mark.slow
 @pytest.mark.parametrize("after", [0.1, 0.5, 1.2])
-def test_a_recording_that_begins_within_a_ramp_knows_how_long_that_may_take(after: float) -> None:
+def test_a_recording_that_begins_in_a_ramp_stores_when_the_ramp_was_commanded(after: float) -> None:
     """The guard of the replay lets the rest of the ramp pass, and nothing that comes too late."""
     tape, world = recorded_world()
     world.drive(1.0, seconds=2.0)
@@ -90,7 +90,7 @@ def test_a_drive_through_every_fault_is_replayed_to_the_last_bit(config: Config)
 
 
 @pytest.mark.slow
-def test_settings_that_were_changed_meanwhile_are_replayed_too() -> None:
+def test_settings_that_were_changed_during_the_recording_are_replayed_too() -> None:
     tape, world = recorded_world(PLAIN)
     world.drive(0.5, seconds=1.0)
     world.call("stop")
@@ -108,7 +108,7 @@ def test_settings_that_were_changed_meanwhile_are_replayed_too() -> None:
 
 
 @pytest.mark.slow
-def test_it_goes_on_from_any_moment_of_such_a_drive() -> None:
+def test_a_replay_can_begin_at_any_saved_state_of_a_drive_with_faults() -> None:
     tape, world = recorded_world(FULL, every=397)
     drive_through_faults(world, 20.0)
     assert len(tape.states) > 5
@@ -130,7 +130,9 @@ def test_an_hour_through_every_fault_is_replayed() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("config", [PLAIN, FULL], ids=["plain", "checked, counted, with a gyro"])
-def test_a_recording_that_begins_in_a_drive_goes_on_from_its_state(config: Config) -> None:
+def test_a_recording_that_begins_in_a_drive_is_replayed_from_its_first_state(
+    config: Config,
+) -> None:
     tape, world = recorded_world(config)
     world.drive(0.6, 0.4, seconds=2.0)
     tape.cut = True
@@ -140,7 +142,7 @@ def test_a_recording_that_begins_in_a_drive_goes_on_from_its_state(config: Confi
     lives_again(tape, config, first)
 
 
-def test_a_line_that_was_otherwise_is_named_with_what_each_side_knew() -> None:
+def test_a_line_that_differs_is_reported_with_the_inputs_of_both_sides() -> None:
     tape = Tape()
     World(recorder=tape).drive(0.5, 0.2, seconds=1.0)
     number = len(tape.taken) - 3
@@ -155,7 +157,7 @@ def test_a_line_that_was_otherwise_is_named_with_what_each_side_knew() -> None:
     assert (first.recorded.line, first.replayed.line) == (other.line, taken.outputs.line)
 
 
-def test_a_command_that_had_not_come_makes_another_drive() -> None:
+def test_a_replay_without_one_recorded_command_differs() -> None:
     tape = Tape()
     World(recorder=tape).drive(0.5, 0.2, seconds=1.0)
     moves = [n for n, t in enumerate(tape.taken) for c in t.inputs.commands if c.twist.linear]
@@ -168,7 +170,7 @@ def test_a_command_that_had_not_come_makes_another_drive() -> None:
     assert "line" in first.what or "mode" in first.what
 
 
-def test_one_bit_of_a_pose_is_told_from_none() -> None:
+def test_a_pose_that_differs_in_one_bit_is_the_same_but_not_exact() -> None:
     tape = Tape()
     World(recorder=tape).drive(0.5, 0.2, seconds=1.0)
     number = max(n for n, t in enumerate(tape.taken) if t.outputs.estimates)
@@ -180,7 +182,7 @@ def test_one_bit_of_a_pose_is_told_from_none() -> None:
     assert (comparison.same, comparison.exact) == (True, False)
 
 
-def test_other_limits_name_the_first_line_that_differs() -> None:
+def test_a_replay_with_other_limits_reports_the_first_line_that_differs() -> None:
     tape = Tape()
     World(recorder=tape).drive(0.5, seconds=2.0)
     replay = Replay(SLOW_LIMITS)
@@ -195,7 +197,7 @@ def test_other_limits_name_the_first_line_that_differs() -> None:
 
 
 @pytest.mark.slow
-def test_other_limits_take_over_in_the_middle_of_a_drive() -> None:
+def test_a_replay_may_change_the_limits_in_the_middle_of_a_drive() -> None:
     tape, world = recorded_world()
     world.drive(0.5, 0.3, seconds=2.0)
     tape.cut = True

@@ -38,7 +38,7 @@ ZEROS_S, CYCLE_S = 0.3, 2.0
 
 
 class MemoryFile:
-    """The latch file without a disk: it has the newest latches at once, as after the rename."""
+    """The latch file without a disk: it has the newest latches immediately."""
 
     def __init__(self) -> None:
         self.data = b""
@@ -72,7 +72,7 @@ class MemoryFile:
 
 
 class Host:
-    """A computer with a daemon, a board that nobody switches off, and one stop-and-go commander."""
+    """A computer with a daemon, a board that stays on, and one stop-and-go commander."""
 
     def __init__(self, dice: random.Random) -> None:
         self.file, self.dice = MemoryFile(), dice
@@ -168,7 +168,7 @@ def test_a_latched_robot_stands_after_a_restart_until_it_is_released(kind: Kind)
 @pytest.mark.slow
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_robot_whose_latch_file_is_cut_stands_until_it_is_cleared(kind: Kind) -> None:
+def test_a_robot_whose_latch_file_is_truncated_stands_until_a_clear(kind: Kind) -> None:
     stands_until_released(Host(random.Random(2)), kind, cut)
 
 
@@ -272,7 +272,7 @@ def test_a_limit_lowered_after_a_higher_one_was_written_stays_lowered(tmp_path: 
     assert again.loop.robot.config.limits.linear_speed == 0.6
 
 
-def test_a_stop_is_obeyed_at_once_and_answered_when_the_file_has_it() -> None:
+def test_a_stop_is_obeyed_immediately_and_answered_after_the_file_is_written() -> None:
     host = Host(random.Random(8))
     host.world.run(0.5)
     host.file.slow = True
@@ -284,7 +284,7 @@ def test_a_stop_is_obeyed_at_once_and_answered_when_the_file_has_it() -> None:
     assert len(replies) == 1
 
 
-def test_a_stop_is_answered_within_a_fifth_of_a_second_however_slow_the_disk_is() -> None:
+def test_a_stop_is_answered_within_0_2_s_however_slow_the_disk_is() -> None:
     host = Host(random.Random(9))
     host.world.run(0.5)
     host.file.slow = True
@@ -294,7 +294,7 @@ def test_a_stop_is_answered_within_a_fifth_of_a_second_however_slow_the_disk_is(
     assert len(replies) == 1
 
 
-def test_a_stream_of_stops_withholds_no_other_answer() -> None:
+def test_a_stream_of_stops_delays_no_answer_to_another_request() -> None:
     host = Host(random.Random(12))
     host.world.run(0.5)
     host.file.slow = True
@@ -320,7 +320,7 @@ def test_the_answer_of_a_stop_says_that_it_cannot_be_kept() -> None:
 
 
 @pytest.mark.parametrize("hangs", [False, True])
-def test_the_last_answers_wait_for_the_file_but_not_for_ever(hangs: bool) -> None:
+def test_the_answers_before_the_exit_wait_a_limited_time_for_the_file(hangs: bool) -> None:
     host = Host(random.Random(14))
     host.world.run(0.5)
     host.file.slow, host.file.hangs = True, hangs
@@ -331,7 +331,7 @@ def test_the_last_answers_wait_for_the_file_but_not_for_ever(hangs: bool) -> Non
     assert len(replies) == 1
 
 
-def test_a_stop_while_the_bus_closes_is_there_at_the_next_start() -> None:
+def test_a_stop_while_the_bus_closes_is_in_force_at_the_next_start() -> None:
     host = Host(random.Random(15))
     host.world.loop.finish(host.world.instant)
     host.world.bus.arrivals.append(Arrival("stop", True, b"", "", host.world.now_ns, None, ""))
@@ -352,10 +352,10 @@ def test_a_stop_while_the_bus_closes_is_there_at_the_next_start() -> None:
         (ControlLoop, "_publish", False),
     ],
 )
-def test_a_stop_in_the_step_that_a_bug_ends_is_there_at_the_next_start(
+def test_a_stop_in_a_step_that_raises_is_in_force_at_the_next_start(
     monkeypatch: pytest.MonkeyPatch, owner: type, name: str, works: bool, by: str
 ) -> None:
-    """The bug is in the bus's input, in the robot, behind the robot's step, or in publishing."""
+    """The bug is in the bus's input, in the robot, after the robot's step, or in publishing."""
     host = Host(random.Random(16))
     host.patrols(2 * CYCLE_S)
     usual = getattr(owner, name)
@@ -382,7 +382,7 @@ def test_a_stop_in_the_step_that_a_bug_ends_is_there_at_the_next_start(
     assert f"stopped by {who} (native)" in host.world.state.reason
 
 
-def test_a_stop_on_the_way_down_is_there_at_the_next_start() -> None:
+def test_a_stop_during_the_shutdown_is_in_force_at_the_next_start() -> None:
     host = Host(random.Random(5))
     host.patrols(2 * CYCLE_S)
     host.world.loop.shutting_down = True
@@ -394,7 +394,7 @@ def test_a_stop_on_the_way_down_is_there_at_the_next_start() -> None:
     assert host.world.state.mode == "stopped"
 
 
-def test_a_stop_after_the_last_step_is_there_at_the_next_start() -> None:
+def test_a_stop_after_the_last_step_is_in_force_at_the_next_start() -> None:
     host = Host(random.Random(6))
     host.world.bus.arrivals.append(Arrival("stop", True, b"", "", host.world.now_ns, None, ""))
     host.world.loop.finish(host.world.instant)

@@ -32,7 +32,7 @@ def stopped(world: World) -> bool:
 @pytest.mark.variations(6)
 @pytest.mark.parametrize("wheel", range(4))
 @pytest.mark.parametrize("kind", ["stuck", "reversed", "runaway"])
-def test_a_lying_encoder_stops_the_robot_and_is_named(world: World, wheel: int, kind: str) -> None:
+def test_a_faulty_encoder_stops_the_robot_and_is_named(world: World, wheel: int, kind: str) -> None:
     world.drive(0.5, seconds=1.5)
     faults: dict[str, Fault] = {
         "stuck": world.mcu.stuck_encoder(wheel),
@@ -51,7 +51,7 @@ def test_a_lying_encoder_stops_the_robot_and_is_named(world: World, wheel: int, 
     assert world.state.mode == "driving"
 
 
-def test_a_motor_wired_the_other_way_round_is_found_out() -> None:
+def test_a_motor_that_is_wired_in_reverse_is_a_fault() -> None:
     # The simulator wires itself as configured, so this test reverses its encoder alone.
     world = World(Config(mcu=McuConfig(wheels=WheelMap(rear_left="-c"))))
     world.run(0.2)
@@ -85,7 +85,7 @@ def test_repeated_impossible_lines_are_a_fault_within_thirty_milliseconds(world:
 
 
 @pytest.mark.slow
-def test_minutes_of_driving_about_raise_no_false_alarm(world: World) -> None:
+def test_minutes_of_varied_driving_raise_no_false_alarm(world: World) -> None:
     for i in range(30):
         world.hold((-1) ** i * 0.9, (i % 7 - 3) * 1.2, seconds=0.5 + i % 5 * 0.8, hz=10.0)
         world.send(0.0)
@@ -170,7 +170,7 @@ def test_a_bit_flipped_while_the_link_returns_is_no_fault(number: int) -> None:
 
 
 @pytest.mark.slow
-def test_a_bit_flipped_in_the_first_line_after_clear_is_no_fault_and_does_not_turn_the_pose(
+def test_a_bit_error_in_the_first_line_after_clear_is_no_fault_and_turns_no_pose(
     world: World,
 ) -> None:
     for _ in range(3):
@@ -266,7 +266,7 @@ def test_no_hand_latches_a_fault_whatever_the_mode(count: int, world: World) -> 
 
 
 @pytest.mark.parametrize("mode", ["ready", "inactive", "stopped"])
-def test_wheels_turned_by_hand_are_told_at_most_once_a_second_and_counted(
+def test_wheels_turned_by_hand_are_reported_at_most_once_a_second_and_counted(
     world: World, mode: str
 ) -> None:
     enter(world, mode, random.Random(1))
@@ -353,7 +353,7 @@ def test_motors_that_lag_are_no_runaway_when_the_daemon_has_forgotten_their_spee
         (0.2, "silence", 1.06), (0.5, "silence", 1.12), (-1.0, "silence", 1.32),
     ],
 )  # fmt: skip
-def test_a_robot_that_does_not_stop_when_told_is_found_as_soon_as_it_stands_out(
+def test_a_robot_that_does_not_obey_a_stop_is_a_fault_as_soon_as_it_is_evident(
     world: World, linear: float, way: str, within: float
 ) -> None:
     """For the daemon, hands that keep the robot at its speed look like motors that do not obey."""
@@ -371,7 +371,7 @@ def test_a_robot_that_does_not_stop_when_told_is_found_as_soon_as_it_stands_out(
     assert took <= within + 0.021
 
 
-def test_a_robot_found_rolling_after_a_lost_link_is_still_a_runaway(world: World) -> None:
+def test_a_robot_that_still_rolls_after_a_lost_link_is_a_runaway(world: World) -> None:
     """It was driven and has not been at rest since, and an MCU without a watchdog drives on."""
     world.drive(0.5, seconds=1.0)
     mcu = world.mcu
@@ -383,7 +383,7 @@ def test_a_robot_found_rolling_after_a_lost_link_is_still_a_runaway(world: World
     assert "turns faster than commanded" in world.state.reason
 
 
-def test_a_runaway_that_is_cleared_while_it_lasts_is_found_again(world: World) -> None:
+def test_a_runaway_that_is_cleared_while_it_lasts_is_detected_again(world: World) -> None:
     world.drive(0.5, seconds=1.0)
     with world.mcu.pushed(0.5):
         world.run(2.5)
@@ -394,7 +394,7 @@ def test_a_runaway_that_is_cleared_while_it_lasts_is_found_again(world: World) -
 
 @pytest.mark.slow
 @pytest.mark.parametrize("lag", [0.05, 0.2])
-def test_feedback_as_sparse_as_may_be_raises_no_false_alarm_even_with_lines_lost(
+def test_the_sparsest_allowed_feedback_raises_no_false_alarm_even_with_lost_lines(
     lag: float,
 ) -> None:
     config = Config(mcu=McuConfig(reply_period=0.25), sim=SimConfig(motor_time_constant=lag))

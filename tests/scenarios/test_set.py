@@ -88,7 +88,7 @@ def test_a_raised_limit_is_reached_by_the_acceleration() -> None:
     assert speeds[-1][1] == pytest.approx(1.0)
 
 
-def test_a_limit_of_zero_brings_it_to_rest(world: World) -> None:
+def test_a_speed_limit_of_zero_brings_the_robot_to_rest(world: World) -> None:
     world.drive(0.5, seconds=1.0)
     assert sets(world, limits__linear_speed=0.0).success
     world.hold(0.5, seconds=1.0)
@@ -96,7 +96,7 @@ def test_a_limit_of_zero_brings_it_to_rest(world: World) -> None:
     assert world.state.mode == "driving"
 
 
-def test_what_is_set_is_in_config_and_in_the_log_with_who_asked_and_what_it_was(
+def test_a_setting_is_in_config_and_in_the_log_with_its_client_and_old_value(
     world: World,
 ) -> None:
     payload = b'{"settings": {"limits.linear_speed": 0.8, "rates.state": 5}}'
@@ -110,7 +110,7 @@ def test_what_is_set_is_in_config_and_in_the_log_with_who_asked_and_what_it_was(
     assert (config(world).limits.linear_speed, config(world).rates.state) == (0.8, 5.0)
 
 
-def test_several_settings_one_after_the_other_are_each_told(world: World) -> None:
+def test_each_of_several_settings_is_reported(world: World) -> None:
     for speed in (0.9, 0.8, 0.7):
         sets(world, limits__linear_speed=speed)
     told = [event.text for event in world.events if event.name == "set"]
@@ -129,7 +129,7 @@ def test_a_refused_change_changes_nothing_and_says_why(world: World) -> None:
     assert not [event for event in world.events if event.name == "set"]
 
 
-def test_a_payload_that_is_none_is_answered_with_one_that_is(world: World) -> None:
+def test_an_empty_payload_is_answered_with_an_example_of_a_valid_one(world: World) -> None:
     for payload in (b"", b"{}", b'{"settings": {"limits.linear_speed": null}}'):
         reply = world.call("set", payload)
         assert not reply.success
@@ -137,7 +137,7 @@ def test_a_payload_that_is_none_is_answered_with_one_that_is(world: World) -> No
 
 
 @pytest.mark.slow
-def test_the_wheels_limit_waits_until_the_robot_stands_and_the_guard_goes_by_it() -> None:
+def test_the_wheel_speed_limit_changes_only_at_rest_and_the_guard_uses_it() -> None:
     world = World(Config(limits=LimitsConfig(linear_speed=3.0, wheel_speed=10.0)))
     world.run(0.2)
     world.drive(3.0, seconds=1.0)
@@ -155,7 +155,7 @@ def test_the_wheels_limit_waits_until_the_robot_stands_and_the_guard_goes_by_it(
 
 
 @pytest.mark.slow
-def test_braking_set_softer_behind_a_lowered_limit_waits_until_the_robot_is_that_slow(
+def test_softer_braking_is_refused_until_the_robot_is_below_a_lowered_limit(
     world: World,
 ) -> None:
     world.drive(1.0, seconds=2.0)
@@ -167,7 +167,7 @@ def test_braking_set_softer_behind_a_lowered_limit_waits_until_the_robot_is_that
     assert world.state.linear == pytest.approx(0.0, abs=0.02)
 
 
-def test_a_longer_timeout_holds_and_a_new_one_wants_neutral_first(world: World) -> None:
+def test_a_new_timeout_requires_neutral_first_and_is_then_in_force(world: World) -> None:
     world.drive(0.3, seconds=0.5)
     assert not sets(world, commands__sources__app__timeout=0.6).success
     world.run(1.0)
@@ -182,7 +182,7 @@ def test_a_longer_timeout_holds_and_a_new_one_wants_neutral_first(world: World) 
     assert world.state.mode == "ready"
 
 
-def test_who_is_in_the_midst_of_sending_is_not_forgotten_by_a_new_timeout(world: World) -> None:
+def test_a_sender_that_is_sending_is_not_forgotten_by_a_new_timeout(world: World) -> None:
     stuck = Speaker(world, "plain")
     stuck.open()
     for verb in ("stop", "clear"):
@@ -197,7 +197,7 @@ def test_who_is_in_the_midst_of_sending_is_not_forgotten_by_a_new_timeout(world:
     assert "send a zero first" in world.state.reason
 
 
-def test_a_clock_stays_known_when_the_pause_changes(world: World) -> None:
+def test_a_sender_s_clock_stays_known_when_the_neutral_pause_changes(world: World) -> None:
     speaker = Speaker(world, "signed")
     speaker.open()
     world.run(1.5)
@@ -215,7 +215,7 @@ def test_a_clock_stays_known_when_the_pause_changes(world: World) -> None:
 
 
 @pytest.mark.slow
-def test_a_new_pause_counts_for_senders_that_are_known(world: World) -> None:
+def test_a_new_neutral_pause_is_in_force_for_known_senders(world: World) -> None:
     speaker = Speaker(world, "plain")
     speaker.open()
     world.run(1.5)
@@ -226,7 +226,7 @@ def test_a_new_pause_counts_for_senders_that_are_known(world: World) -> None:
         assert world.state.mode == mode, world.state.reason
 
 
-def test_rates_and_covariances_hold_from_the_next_message_on(world: World) -> None:
+def test_rates_and_covariances_are_in_force_from_the_next_message_on(world: World) -> None:
     diagonal: list[float | str] = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
     assert sets(
         world,
@@ -254,7 +254,7 @@ def test_noise_set_higher_makes_the_pose_less_certain(world: World) -> None:
     assert grows() > 20 * little
 
 
-def test_setting_what_is_so_already_says_so(world: World) -> None:
+def test_setting_the_present_value_is_answered_with_nothing_changes(world: World) -> None:
     reply = sets(world, limits__linear_speed=1.0)
     assert (reply.success, reply.message) == (
         True,
@@ -264,7 +264,7 @@ def test_setting_what_is_so_already_says_so(world: World) -> None:
 
 @pytest.mark.parametrize("via", ["bridge"])
 @pytest.mark.parametrize("service", rcl.SETTING)
-def test_ros_sets_parameters_the_same_way(world: World, service: str, via: Via) -> None:
+def test_ros_parameters_change_the_same_settings(world: World, service: str, via: Via) -> None:
     def ask(name: str, value: float) -> rcl.SetParametersResult:
         wish = rcl.Parameter(name, rcl.ParameterValue(rcl.DOUBLE, double_value=value))
         payload = Cdr(rcl.SetRequest).encode(rcl.SetRequest([wish]))

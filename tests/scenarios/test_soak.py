@@ -179,7 +179,7 @@ def start_over(world: World, kind: str, dice: random.Random) -> World:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [8, more(48), long(1_000, 1800)])
-def test_nothing_moves_before_neutral_after_whatever_started_over(count: int) -> None:
+def test_the_robot_does_not_move_before_neutral_after_any_kind_of_restart(count: int) -> None:
     dice, kept, seen = random.Random(2), 0, Counter[str]()
     world = World()
     world.run(0.3)
@@ -360,7 +360,7 @@ def empty(world: World) -> int:
 
 
 @pytest.mark.parametrize("minutes", [slow(5), long(24 * 60, 3600)])
-def test_a_day_with_a_fault_every_minute_leaves_nothing_unexplained_and_no_memory(
+def test_a_day_with_a_fault_every_minute_is_explained_and_leaks_no_memory(
     minutes: int,
 ) -> None:
     # the silence is not that of a late simulator
@@ -479,7 +479,7 @@ def poured_out(dice: random.Random, way: Way, running: bool) -> bool:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [3, more(24), long(500, 1800)])
-def test_no_backlog_moves_a_robot_that_never_heard_its_sender_nor_one_that_knows_it(
+def test_no_backlog_moves_the_robot_for_a_new_or_a_known_sender(
     count: int,
 ) -> None:
     dice, kept, seen = random.Random(7), 0, Counter[str]()
@@ -494,7 +494,7 @@ def test_no_backlog_moves_a_robot_that_never_heard_its_sender_nor_one_that_knows
 
 @pytest.mark.slow
 @pytest.mark.parametrize("way", STAMPED)
-def test_a_replay_at_the_pace_it_was_sent_counts_of_one_never_heard_as_a_clock_that_is_behind(
+def test_a_replay_in_real_time_by_a_new_sender_looks_like_a_clock_that_is_behind(
     way: Way,
 ) -> None:
     """Nothing distinguishes the two.
@@ -582,7 +582,7 @@ def stepped(dice: random.Random, way: Way, ahead: float, step: float) -> str:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [2, more(16), long(400, 1800)])
-def test_a_sender_s_clock_may_be_anything_and_be_set_at_any_time(count: int) -> None:
+def test_a_sender_s_clock_may_have_any_offset_and_be_adjusted_at_any_time(count: int) -> None:
     dice, wrong = random.Random(8), Counter[str]()
     for trial in range(count):
         way = FOREIGN[trial % len(FOREIGN)]
@@ -599,7 +599,7 @@ def test_a_sender_s_clock_may_be_anything_and_be_set_at_any_time(count: int) -> 
 @pytest.mark.slow
 @pytest.mark.parametrize("rate", [0.92, slow(1.08)])
 @pytest.mark.parametrize("way", FOREIGN)
-def test_a_sender_whose_clock_is_slewed_drives_on_or_again_after_a_zero(
+def test_a_sender_whose_clock_is_slewed_keeps_driving_or_drives_again_after_a_zero(
     way: Way, rate: float
 ) -> None:
     world = World()
@@ -691,7 +691,7 @@ def stuck(dice: random.Random, way: Way, hz: float, kind: str) -> bool:
         ),
     ],
 )
-def test_who_never_lets_go_never_drives_on_by_itself(kind: str, count: int) -> None:
+def test_a_sender_that_never_returns_to_neutral_never_drives_again(kind: str, count: int) -> None:
     dice, found = random.Random(9), Counter[str]()
     ways: tuple[Way, ...] = (*STAMPED, "plain", "bridge")
     for trial in range(count * len(RATES_HZ)):
@@ -705,7 +705,7 @@ def test_who_never_lets_go_never_drives_on_by_itself(kind: str, count: int) -> N
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("way", SHARED)
 @pytest.mark.parametrize("count", [4, more(12)])
-def test_another_s_zeros_while_one_that_looks_like_it_is_stalled_do_not_set_that_off(
+def test_zeros_of_another_sender_do_not_arm_a_stalled_sender_that_looks_the_same(
     count: int, way: Way
 ) -> None:
     dice, found = random.Random(10), 0

@@ -89,7 +89,9 @@ def test_the_robot_slows_down_by_its_deceleration_while_it_keeps_driving(world: 
 @pytest.mark.slow
 @each("first", ["limit", "set"])
 @each("value", [0.2, 0.5])
-def test_of_a_limit_and_a_set_the_lower_one_wins_in_either_order(first: str, value: float) -> None:
+def test_the_lower_of_a_speed_limit_and_a_setting_wins_in_either_order(
+    first: str, value: float
+) -> None:
     world = World()
     world.run(0.2)
     if first == "limit":
@@ -137,7 +139,7 @@ def test_a_bad_message_is_counted_and_shown_and_leaves_the_limit_as_it_was(paylo
     assert config(world).limits.linear_speed == 0.3
 
 
-def test_a_limit_moves_nothing_and_a_stop_stays(world: World) -> None:
+def test_a_speed_limit_neither_moves_the_robot_nor_clears_a_stop(world: World) -> None:
     assert world.call("stop").success
     limit(world, 0.3)
     limit(world, 0.0)
@@ -182,7 +184,7 @@ def test_a_restart_forgets_the_limit_and_keeps_the_lower_setting_of_the_operator
 
 @each("obeyed", [True, False])
 @each("lifts", [True, False])
-def test_a_bug_in_the_step_that_changes_the_limit_does_not_keep_the_limit(
+def test_a_speed_limit_is_not_stored_if_its_step_raises(
     lifts: bool, obeyed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No message would lift a limit that the latch file has."""
@@ -221,7 +223,7 @@ def test_a_zone_writes_no_latch_file(tmp_path: Path) -> None:
     assert robot.latches.read(START).lowered == {"limits.linear_speed": 0.6}
 
 
-def test_a_zone_is_no_difference_from_the_file(tmp_path: Path) -> None:
+def test_a_zone_limit_is_not_reported_as_a_difference_from_the_file(tmp_path: Path) -> None:
     robot = Memory(tmp_path / "acsard.toml", "")
     world = robot.start()
     file = world.loop._settings_file

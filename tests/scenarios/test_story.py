@@ -476,7 +476,7 @@ def is_near(line: Line, incident: Incident) -> bool:
 
 
 @pytest.mark.parametrize("output", ["show", "report", "export"])
-def test_one_output_alone_tells_what_happened_when_why_and_by_which_client(
+def test_one_output_alone_reports_each_event_with_time_reason_and_client(
     output: str, story: Story
 ) -> None:
     lines = story.outputs[output]
@@ -515,7 +515,7 @@ def test_show_and_export_of_a_part_have_the_same_lines(
 def test_show_and_export_of_a_damaged_recording_have_the_same_lines(
     story: Story, tmp_path: Path
 ) -> None:
-    """The export has no messages of the steps behind the damage, but their events."""
+    """The export has no messages of the steps after the damage, but it has their events."""
     bad, new = tmp_path / "bad.mcap", tmp_path / "new.mcap"
     data = bytearray(listed(story.where)[0].read_bytes())
     begin, end = chunks(data)[4]

@@ -42,7 +42,9 @@ def called(where: Path, log: str, *words: str, text: str = "# mine\n") -> int:
     return int(args.main(args))
 
 
-def test_people_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_result_is_printed_as_text_and_the_file_stays(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert called(tmp_path, GOOD) == 0
     out = capsys.readouterr().out
     assert "wheel_separation_multiplier" in out
@@ -112,7 +114,7 @@ def test_a_distance_measures_the_wheels(tmp_path: Path, capsys: pytest.CaptureFi
 
 
 @pytest.mark.slow
-def test_of_two_logs_put_together_a_distance_is_the_straight_one_s(
+def test_in_two_joined_logs_the_distance_belongs_to_the_straight_drive(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     straight = usual(plan=[(1, 0, 0), (10, 0.4, 0), (1, 0, 0)])
@@ -138,7 +140,7 @@ def test_a_refusal_ends_with_failure_and_an_object(
     assert (tmp_path / "acsard.toml").read_text() == "# mine\n"
 
 
-def test_a_refusal_has_what_was_told_of_the_log(
+def test_a_refusal_contains_the_notes_about_the_log(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rows = [f"{i / 100},1,1,0.1" for i in range(500)]
@@ -226,7 +228,7 @@ def test_the_files_of_a_bag_are_one_log(tmp_path: Path, capsys: pytest.CaptureFi
         ("bag_0.mcap.zstd", b"\x28\xb5\x2f\xfd" + bytes(100), "zstd -d"),
     ],
 )
-def test_another_kind_of_bag_is_told_with_the_command_that_converts_it(
+def test_another_kind_of_bag_is_refused_with_the_command_that_converts_it(
     name: str, data: bytes, why: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "bag").mkdir()
@@ -237,7 +239,7 @@ def test_another_kind_of_bag_is_told_with_the_command_that_converts_it(
     assert "deploy/calibration/README.md" in capsys.readouterr().out
 
 
-def test_a_directory_that_is_no_bag_is_told(tmp_path: Path) -> None:
+def test_a_directory_that_is_not_a_bag_is_refused(tmp_path: Path) -> None:
     with pytest.raises(MendableError, match="directory contains no MCAP file"):
         of_bag(tmp_path, tmp_path)
 
@@ -331,7 +333,7 @@ def driving(*words: str) -> int:
         (["--yes", "--json-lines"], "with --json-lines a program asks them"),
     ],
 )
-def test_what_cannot_be_meant_is_said_before_anything_is_connected_to(
+def test_contradictory_options_are_refused_before_a_connection_is_made(
     words: list[str], why: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -340,6 +342,6 @@ def test_what_cannot_be_meant_is_said_before_anything_is_connected_to(
         driving(*words)
 
 
-def test_without_a_daemon_it_is_said_where_none_is(tmp_path: Path) -> None:
+def test_without_a_daemon_the_verb_ends_as_unreachable(tmp_path: Path) -> None:
     with pytest.raises(UnreachableError):
         driving("--yes", "--connect", "tcp/127.0.0.1:9")

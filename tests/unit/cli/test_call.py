@@ -17,7 +17,7 @@ from tests.each import each
         (["set_pose", "1", "-2", "0.5", "--id", "*"], ["`acsard call set_pose 1 -2 0.5 --id"]),
     ],
 )
-def test_what_is_not_for_many_says_why_and_what_to_type_instead(
+def test_a_call_that_is_not_for_several_robots_is_refused_with_alternatives(
     words: list[str], instead: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["call", *words]) == Exit.USAGE

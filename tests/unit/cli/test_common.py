@@ -48,7 +48,7 @@ def _places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Places:
     return places
 
 
-def test_the_places_are_here_and_etc() -> None:
+def test_the_file_is_searched_in_the_working_directory_and_in_etc() -> None:
     assert [str(place) for place in PLACES] == ["acsard.toml", "/etc/acsard/acsard.toml"]
 
 
@@ -69,14 +69,14 @@ def test_the_file_here_wins_over_etc(places: Places) -> None:
     assert find(None) == ("acsard.toml", places.here.read_bytes())
 
 
-def test_etc_comes_last(places: Places) -> None:
+def test_the_file_in_etc_is_used_last(places: Places) -> None:
     places.fill()
     places.here.unlink()
     assert find(None) == (str(places.etc), places.etc.read_bytes())
 
 
 @pytest.mark.usefixtures("places")
-def test_without_a_file_there_are_the_defaults() -> None:
+def test_without_a_file_the_defaults_are_used() -> None:
     assert find(None) == ("built-in defaults", b"")
     assert load(None) == ("built-in defaults", Config())
 
@@ -159,7 +159,7 @@ def test_a_value_of_an_option_is_blamed_on_the_option_and_not_on_the_file(
     assert told.endswith(f"acsard: 1 problem in {place.partition(':')[0]}\n")
 
 
-def test_problems_of_the_file_and_of_an_option_are_told_apart(
+def test_problems_of_the_file_and_of_an_option_are_distinguished(
     places: Places, capsys: pytest.CaptureFixture[str]
 ) -> None:
     places.here.write_text("[control]\nrate = 5\n")
@@ -199,13 +199,13 @@ def test_a_tool_talks_to_the_robot_of_the_configuration(places: Places) -> None:
     assert asked(places.option) == ("tcp/[::1]:9", "r7", "")
 
 
-def test_its_options_win_over_the_configuration(places: Places) -> None:
+def test_the_options_of_a_tool_win_over_the_configuration(places: Places) -> None:
     places.fill()
     assert asked(places.option, "tcp/10.0.0.1:1", "r8") == ("tcp/10.0.0.1:1", "r8", "")
     assert asked(places.option, robot_id="r8") == ("tcp/127.0.0.1:7448", "r8", "")
 
 
-def test_a_tool_goes_where_a_daemon_that_is_a_client_goes(places: Places) -> None:
+def test_a_tool_connects_to_the_router_of_a_daemon_in_client_mode(places: Places) -> None:
     places.option.write_text(
         '[bus]\nmode = "client"\nlisten = ["tcp/127.0.0.1:8"]\nconnect = ["tcp/127.0.0.1:7447"]\n'
     )
@@ -225,7 +225,7 @@ def test_a_certificate_goes_with_a_tls_endpoint_only(
     assert asked(places.option, "tls/robot:7449", tls="/home/b")[2] == "/home/b"
 
 
-def test_a_tool_without_an_address_says_so(tmp_path: Path) -> None:
+def test_a_tool_without_an_address_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "a.toml"
     file.write_text("[bus]\nlisten = []\n")
     with pytest.raises(MendableError) as caught:
@@ -233,7 +233,7 @@ def test_a_tool_without_an_address_says_so(tmp_path: Path) -> None:
     assert caught.value.code is Exit.BAD_CONFIG
 
 
-def test_a_key_that_nobody_has_is_warned_of_but_not_a_stranger_s_command(
+def test_an_unknown_key_causes_a_warning_and_a_command_key_of_any_source_does_not(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     for key in ("odom", "cmd/stranger", "json/odom", "wheel_cmd/x"):
@@ -257,7 +257,9 @@ def test_a_key_that_nobody_has_is_warned_of_but_not_a_stranger_s_command(
         ("alive", "acsard fleet"),
     ],
 )
-def test_what_is_never_published_says_what_to_type_instead(key: str, instead: str) -> None:
+def test_following_a_key_that_is_never_published_is_refused_with_an_alternative(
+    key: str, instead: str
+) -> None:
     with pytest.raises(UsageError, match=instead):
         require_followed(key)
 
@@ -273,12 +275,12 @@ def test_what_is_never_published_says_what_to_type_instead(key: str, instead: st
         ("schema/*", "get queries only one"),
     ],
 )
-def test_what_answers_nothing_or_acts_is_not_asked(key: str, instead: str) -> None:
+def test_querying_a_key_that_never_answers_or_acts_is_refused(key: str, instead: str) -> None:
     with pytest.raises(UsageError, match=instead):
         require_asked(key)
 
 
-def test_what_is_published_is_followed_and_asked_and_so_is_what_is_not_in_the_table() -> None:
+def test_published_and_unknown_keys_may_be_followed_and_queried() -> None:
     for key in ("odom", "state", "nonsense", "schema", "cmd/app/x/y"):
         require_followed(key)
         require_asked(key)
@@ -287,7 +289,7 @@ def test_what_is_published_is_followed_and_asked_and_so_is_what_is_not_in_the_ta
     require_asked("config")
 
 
-def test_it_is_recorded_where_the_option_the_file_or_the_service_says_in_this_order(
+def test_the_record_directory_is_from_the_option_the_file_or_the_service_in_this_order(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     said = b'[record]\ndirectory = "/file"'
@@ -298,7 +300,7 @@ def test_it_is_recorded_where_the_option_the_file_or_the_service_says_in_this_or
     assert found == ["/option", "/file", "/service"]
 
 
-def test_where_it_is_recorded_is_told_whole_to_who_stands_elsewhere(
+def test_a_relative_record_directory_becomes_an_absolute_path(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -306,7 +308,7 @@ def test_where_it_is_recorded_is_told_whole_to_who_stands_elsewhere(
     assert named.record.directory == str(tmp_path / "box")
 
 
-def test_who_has_no_file_to_write_to_is_sent_to_the_robot(places: Places) -> None:
+def test_without_a_file_a_write_is_refused_and_names_the_file_on_the_robot(places: Places) -> None:
     with pytest.raises(MendableError) as raised:
         writable(None)
     assert "on the robot" in str(raised.value)
@@ -342,7 +344,7 @@ def test_write_leaves_the_reference_file_of_a_clone_as_git_has_it(
 
 
 @each("text", ["x", "", "0", "-1", "1.5", "²"])
-def test_a_count_that_is_none_is_refused_with_what_to_write(text: str) -> None:
+def test_an_invalid_count_is_refused_with_the_valid_range(text: str) -> None:
     assert count("12") == 12
     with pytest.raises(argparse.ArgumentTypeError) as raised:
         count(text)

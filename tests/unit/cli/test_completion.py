@@ -167,7 +167,7 @@ def test_every_shell_knows_every_verb_and_takes_its_script(
         subprocess.run([shell, "-n", str(script)], check=True, timeout=30.0)
 
 
-def test_the_man_page_says_what_help_says(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_man_page_contains_the_help_of_the_verbs(capsys: pytest.CaptureFixture[str]) -> None:
     page = printed(capsys, "man").replace("\\-", "-").replace("\\", "")
     assert page.startswith(".TH ACSARD")
     words = ("acsard service uninstall", "--purge", "acsard tls renew", "exit codes: 0 done")
@@ -178,7 +178,7 @@ def test_the_man_page_says_what_help_says(capsys: pytest.CaptureFixture[str]) ->
     ("words", "library"),
     [(["completion", "bash"], "shtab"), (["man"], "argparse_manpage.manpage")],
 )
-def test_without_its_library_it_tells_what_to_type(
+def test_without_its_library_completion_prints_the_install_command(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     words: list[str],

@@ -35,16 +35,16 @@ def test_a_whole_message_is_shown_in_full() -> None:
 
 
 @pytest.mark.parametrize("encoding", ["", "application/cdr"])
-def test_cdr_does_not_say_its_type_and_is_shown_as_the_bytes_it_is(encoding: str) -> None:
+def test_cdr_without_a_known_type_is_shown_as_its_bytes(encoding: str) -> None:
     payload = encode(Twist(Vector3(0.5), Vector3(z=0.2)), "cdr")
     assert msgspec.json.decode(json_line(encoding, payload)) == {"undecodable": repr(payload)}
 
 
-def test_white_space_between_is_dropped() -> None:
+def test_white_space_in_json_is_removed() -> None:
     assert json_line("", b' {"a" : 1,\n "b": [1, 2]}\n') == '{"a":1,"b":[1,2]}'
 
 
-def test_an_encoding_may_name_json_that_is_no_object() -> None:
+def test_a_json_payload_may_be_a_list() -> None:
     assert json_line("application/json", b"[1, 2]") == "[1,2]"
 
 
@@ -74,7 +74,7 @@ def test_a_number_that_is_not_finite_is_null() -> None:
         ("application/cdr", b"\x81\xa1a\x01"),
     ],
 )
-def test_what_cannot_be_decoded_is_shown_as_the_bytes_it_is(encoding: str, payload: bytes) -> None:
+def test_an_undecodable_payload_is_shown_as_its_bytes(encoding: str, payload: bytes) -> None:
     assert msgspec.json.decode(json_line(encoding, payload)) == {"undecodable": repr(payload)}
 
 
@@ -127,7 +127,7 @@ def test_a_number_of_messages_counts_for_each_robot(
     assert "".join(msgspec.json.decode(line)["robot"] for line in lines) == shown
 
 
-def test_a_robot_that_talks_on_does_not_hide_the_silence_of_another(
+def test_a_robot_that_publishes_does_not_hide_the_silence_of_another(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert printed("ab", "aaab", 1, timeout=-1.0) == 1
@@ -145,14 +145,14 @@ def test_a_key_without_a_short_form_is_refused_with_those_that_have_one(
 
 @each("form", ["json", "msgpack"])
 @each("whose", ["", "robot1"])
-def test_a_short_line_says_whose_it_is_of_many(form: Format, whose: str) -> None:
+def test_a_short_line_of_several_robots_begins_with_the_robot(form: Format, whose: str) -> None:
     twist = TwistStamped(Header(), Twist(Vector3(0.5), Vector3(z=0.2)))
     payload = encode(twist, form)
     line = _shown(Decoder(TwistStamped), encoding_name(form, "TwistStamped"), payload, whose)
     assert line == f"{whose}{': ' if whose else ''}forward +0.50 m/s  turn +0.20 rad/s"
 
 
-def test_what_cannot_be_shortened_is_shown_as_the_json_it_is() -> None:
+def test_a_message_without_a_short_form_is_shown_as_its_json() -> None:
     decoder = Decoder(TwistStamped)
     assert _shown(decoder, "", b'{"a": 1}', "") == '{"a":1}'
     assert msgspec.json.decode(_shown(decoder, "", b"\xff", "")) == {"undecodable": repr(b"\xff")}

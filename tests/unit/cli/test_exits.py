@@ -31,7 +31,7 @@ PROMISED = [
 
 
 @each(("kind", "builtin", "code"), PROMISED)
-def test_an_error_is_of_a_family_of_pythons_and_has_its_code(
+def test_each_error_has_a_builtin_base_class_and_an_exit_code(
     kind: type[MendableError], builtin: type[Exception], code: int
 ) -> None:
     error = kind("it is so; mend it")
@@ -40,7 +40,7 @@ def test_an_error_is_of_a_family_of_pythons_and_has_its_code(
     assert str(error) == "it is so; mend it"
 
 
-def test_no_family_is_without_a_code() -> None:
+def test_every_error_class_has_an_exit_code() -> None:
     kinds = {kind for kind in vars(errors).values() if isinstance(kind, type)}
     families = {kind for kind in kinds if issubclass(kind, MendableError)} - {
         MendableError,
@@ -91,7 +91,7 @@ def test_an_option_may_stand_between_two_arguments(between: str, behind: str) ->
     assert known.parse_args(between.split()) == known.parse_args(behind.split())
 
 
-def test_one_word_too_many_is_named_behind_an_option_too(
+def test_an_unexpected_word_after_an_option_is_named_too(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     with pytest.raises(SystemExit) as ended:

@@ -26,7 +26,7 @@ def test_without_its_library_it_says_which_extra_to_install(
     assert told.value.code == Exit.FAILURE
 
 
-def test_beyond_this_machine_it_does_not_listen() -> None:
+def test_the_server_refuses_to_listen_beyond_this_machine() -> None:
     with pytest.raises(UsageError, match="has no authentication"):
         foxglove.main(argparse.Namespace(address="0.0.0.0:8765"))
 
@@ -47,7 +47,9 @@ def test_an_address_of_this_machine_is_taken(text: str, address: tuple[str, int]
 
 
 @pytest.mark.parametrize("text", ["0.0.0.0:8765", "192.168.1.5:8765", "8.8.8.8:80"])
-def test_beyond_this_machine_is_refused_with_the_reason_and_the_tunnel(text: str) -> None:
+def test_an_address_beyond_this_machine_is_refused_and_the_message_names_a_tunnel(
+    text: str,
+) -> None:
     port = text.rpartition(":")[2]
     with pytest.raises(UsageError, match="has no authentication") as refused:
         foxglove.loopback(text)
@@ -58,7 +60,7 @@ def test_beyond_this_machine_is_refused_with_the_reason_and_the_tunnel(text: str
 
 
 @each("text", ["", "8765", "127.0.0.1", "robot:8765", "127.0.0.1:x", "[::1]:8765"])
-def test_what_is_no_address_is_told_how_to_write_one(text: str) -> None:
+def test_an_invalid_address_is_refused_with_an_example(text: str) -> None:
     with pytest.raises(UsageError, match=r"write it like 127\.0\.0\.1:8765"):
         foxglove.loopback(text)
 

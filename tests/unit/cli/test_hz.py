@@ -12,7 +12,7 @@ def test_fewer_than_two_messages_have_no_rate(times: list[float]) -> None:
     assert rate(times) == {"count": len(times), "hz": 0.0}
 
 
-def test_three_messages_worked_by_hand() -> None:
+def test_the_figures_of_three_messages_equal_those_computed_by_hand() -> None:
     # The gaps are 10 and 20 ms: mean 15, deviation 5, and the 99th percentile lies 99 % of the way
     # up.
     assert rate([1.0, 1.01, 1.03]) == {

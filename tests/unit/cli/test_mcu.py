@@ -99,7 +99,7 @@ REAL = "[mcu]\nport = '/dev/acsar_mcu'\n"
 
 @pytest.mark.slow
 @pytest.mark.parametrize("how", [["--yes"], ["--yes", "--json"]])
-def test_what_the_simulator_shows_is_not_offered_for_a_robot_s_file(
+def test_findings_of_the_simulator_are_not_offered_for_a_robot_s_file(
     tmp_path: Path, how: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert called(tmp_path, "--port", "sim", *how, text=REAL) == 0
@@ -113,7 +113,7 @@ def test_what_the_simulator_shows_is_not_offered_for_a_robot_s_file(
         assert "encoder_counts =" not in out
 
 
-def test_nor_is_it_written_there_and_that_is_said_before_anything_is_checked(
+def test_write_of_simulator_findings_to_a_robot_s_file_is_refused_before_the_check(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(UsageError, match=r"cannot change .*/dev/acsar_mcu"):
@@ -122,7 +122,7 @@ def test_nor_is_it_written_there_and_that_is_said_before_anything_is_checked(
     assert (tmp_path / "acsard.toml").read_text() == REAL
 
 
-def test_findings_are_told_also_when_the_file_cannot_be_written(
+def test_findings_are_printed_also_if_the_file_cannot_be_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*given: object) -> None:
@@ -135,7 +135,7 @@ def test_findings_are_told_also_when_the_file_cannot_be_written(
     assert (tmp_path / "acsard.toml").read_text() == ""
 
 
-def test_write_without_a_file_is_told_before_anything_moves(
+def test_write_without_a_file_is_refused_before_anything_moves(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -165,7 +165,7 @@ def test_without_a_terminal_and_without_yes_it_refuses(
 
 @pytest.mark.parametrize("text", ["", "[mcu]\nport = 'sim'\n"])
 @pytest.mark.parametrize("words", [[], ["--yes"], ["--yes", "--wheels-are-lifted", "--json"]])
-def test_the_simulator_is_never_taken_for_a_board(
+def test_the_simulator_is_never_reported_as_a_board(
     tmp_path: Path, text: str, words: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(UsageError, match="acsard ports") as end:
@@ -275,7 +275,7 @@ def test_progress_does_not_go_into_a_pipe(
     assert on_terminal(80, lambda: called(tmp_path, *check), monkeypatch) == ""
 
 
-def test_yes_and_a_program_that_asks_are_not_both(tmp_path: Path) -> None:
+def test_yes_and_json_lines_exclude_each_other(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="--json-lines") as end:
         called(tmp_path, "--port", "sim", "--yes", "--json-lines")
     assert end.value.code == Exit.USAGE
@@ -290,7 +290,7 @@ def test_q_and_the_end_of_the_input_end_the_check(
         TerminalPrompt().ask("lifted?", ("lifted",))
 
 
-def test_who_is_asked_whether_the_wheels_are_lifted_is_told_the_way_out(
+def test_the_question_about_lifted_wheels_says_how_to_quit(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "stdin", io.StringIO("q\n"))
@@ -309,7 +309,7 @@ def test_who_is_asked_whether_the_wheels_are_lifted_is_told_the_way_out(
         (signal.SIGTSTP, SystemExit),
     ],
 )
-def test_a_signal_ends_it_once_and_a_second_one_does_not_disturb_the_zeros(
+def test_a_second_signal_does_not_interrupt_the_final_zeros(
     number: signal.Signals, end: type[BaseException]
 ) -> None:
     before = signal.getsignal(number)

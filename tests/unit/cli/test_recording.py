@@ -95,7 +95,7 @@ def test_a_client_with_the_name_of_a_fault_marks_no_recording() -> None:
     assert not is_serious("start, 1 wheel fault (stopped by x, 1 fault)")
 
 
-def test_the_list_takes_only_the_recordings_of_a_time(tmp_path: Path) -> None:
+def test_the_list_can_be_restricted_to_a_range_of_time(tmp_path: Path) -> None:
     """The three recordings are a day apart, and the last one is not finished."""
     for number in (1, 2, 3):
         noon_ns = int(time.mktime((2027, 1, 14 + number, 12, 0, 0, 0, 0, -1))) * NS_PER_S
@@ -121,7 +121,7 @@ def test_the_list_takes_only_the_recordings_of_a_time(tmp_path: Path) -> None:
         assert numbers or "no recordings from 2027-01-18 00:00:00 in" in out
 
 
-def test_the_list_takes_no_seconds_and_a_replay_no_time(where: Path) -> None:
+def test_the_list_refuses_seconds_and_replay_and_recover_refuse_a_time(where: Path) -> None:
     code, _, err = log(where, "--from", "5")
     assert (code, "count from the beginning of one recording" in err) == (Exit.USAGE, True)
     for words in (["replay", "1"], ["recover", "1", "new.mcap"]):
@@ -149,7 +149,7 @@ def test_the_configuration_names_the_directory_of_the_recordings(
 
 
 @pytest.mark.slow
-def test_the_list_tells_a_start_from_a_file_that_goes_on(tmp_path: Path) -> None:
+def test_the_list_distinguishes_a_start_from_a_continued_recording(tmp_path: Path) -> None:
     """The files are whole, truncated, recovered into a second file, and recovered in place."""
     tape, world = recorded_world(every=200)
     world.drive(0.5, seconds=4.0)
@@ -171,7 +171,7 @@ def test_the_list_tells_a_start_from_a_file_that_goes_on(tmp_path: Path) -> None
         assert ("start" in row) is starts
 
 
-def test_where_nothing_was_ever_recorded_it_says_what_records(tmp_path: Path) -> None:
+def test_without_recordings_the_message_says_how_to_record(tmp_path: Path) -> None:
     code, out, err = log(tmp_path / "never")
     assert (code, out) == (1, "")
     assert "nothing is recorded in" in err
@@ -273,7 +273,7 @@ def test_a_time_of_day_is_found_over_midnight_for_a_table_and_for_pictures(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cut", [False, True])
-def test_what_a_kill_has_cut_says_so_once_it_is_whole(
+def test_a_recording_that_a_kill_truncated_is_reported_as_such(
     cut: bool, where: Path, tmp_path: Path
 ) -> None:
     part = tmp_path / "000002-20270115T080000Z.mcap.part"
@@ -300,7 +300,7 @@ def test_what_a_kill_has_cut_says_so_once_it_is_whole(
     assert (told in log(tmp_path, "show", str(copy))[1]) is cut
 
 
-def test_what_a_stranger_recorded_moves_no_cursor(tmp_path: Path) -> None:
+def test_recorded_texts_cannot_send_control_characters_to_the_terminal(tmp_path: Path) -> None:
     tape = Tape()
     World(recorder=tape).run(0.3)
     inputs, outputs, left = tape.taken[5]
@@ -328,7 +328,7 @@ def test_a_text_that_is_not_a_time_is_refused_with_examples(
     assert (code, words in err) == (Exit.USAGE, True)
 
 
-def test_a_replay_says_that_all_is_the_same(where: Path) -> None:
+def test_a_replay_without_differences_reports_equal_counts(where: Path) -> None:
     code, out, err = log(where, "replay", "1")
     assert (code, err) == (0, "")
     same, _, rest = out.partition(" lines are the same, ")
@@ -350,13 +350,13 @@ def test_a_replay_says_what_it_has_compared(where: Path) -> None:
         assert word in told
 
 
-def test_a_replay_of_what_was_cut_says_so(where: Path) -> None:
+def test_a_replay_of_a_truncated_recording_reports_the_missing_end(where: Path) -> None:
     code, _, err = log(where, "replay")  # without a name it takes the newest
     assert code == 0
     assert "no end" in err
 
 
-def test_with_another_configuration_it_tells_what_would_have_been(
+def test_a_replay_with_another_configuration_reports_the_differences(
     where: Path, tmp_path: Path
 ) -> None:
     other = tmp_path / "slow.toml"
@@ -369,7 +369,7 @@ def test_with_another_configuration_it_tells_what_would_have_been(
     assert f"{fastest} replayed" in out
 
 
-def test_it_tells_which_limits_are_others_what_they_do_and_that_the_wheels_knew_nothing_of_it(
+def test_a_replay_names_changed_limits_their_effect_and_a_fault_they_might_avoid(
     where: Path, tmp_path: Path
 ) -> None:
     other = tmp_path / "slow.toml"
@@ -390,7 +390,7 @@ def test_it_tells_which_limits_are_others_what_they_do_and_that_the_wheels_knew_
     assert "a robot with this configuration might not have had that fault" in out
 
 
-def test_settings_that_change_no_line_are_told_all_the_same(where: Path, tmp_path: Path) -> None:
+def test_settings_that_change_no_line_are_reported_too(where: Path, tmp_path: Path) -> None:
     same = tmp_path / "same.toml"
     same.write_text("[rates]\nstate = 5.0\n")
     code, out, _ = log(where, "replay", "1", "--config", str(same))
@@ -399,7 +399,9 @@ def test_settings_that_change_no_line_are_told_all_the_same(where: Path, tmp_pat
     assert out.splitlines()[-1].startswith("changed settings: rates.state was 10.0, is 5.0")
 
 
-def test_what_was_cut_is_written_as_a_finished_file(where: Path, tmp_path: Path) -> None:
+def test_recover_writes_a_truncated_recording_as_a_finished_file(
+    where: Path, tmp_path: Path
+) -> None:
     new = tmp_path / "new.mcap"
     (cut,) = where.glob("*.part")
     code, out, _ = log(where, "recover", str(cut), str(new))
@@ -410,7 +412,7 @@ def test_what_was_cut_is_written_as_a_finished_file(where: Path, tmp_path: Path)
     assert log(where, "recover", str(cut), str(tmp_path / "none" / "x"))[0] == 1
 
 
-def test_what_is_recovered_stands_there_whole_or_not_at_all_and_over_no_recording(
+def test_recover_writes_a_whole_file_or_none_and_overwrites_no_recording(
     where: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     new = tmp_path / "new.mcap"
@@ -441,7 +443,7 @@ def test_what_is_recovered_stands_there_whole_or_not_at_all_and_over_no_recordin
     assert sorted(one.name for one in tmp_path.iterdir() if one.is_file()) == ["mine", "new.mcap"]
 
 
-def test_recover_replaces_its_own_earlier_result_only_on_request_and_says_so(
+def test_recover_replaces_its_earlier_result_only_with_force_and_reports_it(
     where: Path, tmp_path: Path
 ) -> None:
     new = tmp_path / "new.mcap"
@@ -485,7 +487,7 @@ def harmed(data: bytes, dice: random.Random) -> bytes:
 
 
 @pytest.mark.slow
-def test_no_verb_has_more_than_words_for_what_was_cut_or_damaged(tmp_path: Path) -> None:
+def test_no_verb_raises_on_truncated_or_damaged_recordings(tmp_path: Path) -> None:
     """The recordings begin at a start, begin with a saved state, or end by an internal error."""
     tape, dice, ends = Tape(every=200), random.Random(6), Counter[int]()
     world = World(recorder=tape)
@@ -520,7 +522,7 @@ def test_no_verb_has_more_than_words_for_what_was_cut_or_damaged(tmp_path: Path)
     assert (code, "  stop: " in out, "Traceback" in err) == (Exit.OK, True, False)
 
 
-def test_what_is_not_there_is_reported(tmp_path: Path) -> None:
+def test_a_missing_recording_is_reported(tmp_path: Path) -> None:
     assert log(tmp_path)[:2] == (0, f"no recordings in {tmp_path}")
     code, _, err = log(tmp_path, "show")
     assert (code, "no recording in" in err) == (1, True)
@@ -531,7 +533,7 @@ def test_what_is_not_there_is_reported(tmp_path: Path) -> None:
     assert (code, "not a recording of acsard" in err) == (1, True)
 
 
-def test_it_looks_where_the_service_records() -> None:
+def test_the_default_directory_is_that_of_the_service() -> None:
     unit = Path(__file__).parents[3] / "deploy/systemd/acsard.service"
     says = dict(row.partition("=")[::2] for row in unit.read_text().splitlines() if "=" in row)
     state = Path("/var/lib") / says["StateDirectory"]

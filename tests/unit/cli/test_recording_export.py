@@ -46,7 +46,7 @@ def export(where: Path, *words: str) -> int:
         (("--rosbag2",), "000007-20270115T080000Z.rosbag2"),
     ],
 )
-def test_the_newest_becomes_a_file_beside_you_with_a_name_of_its_own(
+def test_the_newest_recording_is_exported_to_a_named_file_in_the_working_directory(
     words: tuple[str, ...], name: str, where: Path, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert export(where, *words) == 0
@@ -86,7 +86,7 @@ def test_a_name_without_a_known_suffix_is_taken(where: Path, here: Path) -> None
 
 
 @pytest.mark.slow
-def test_a_number_and_a_name_are_taken_and_what_is_there_stays(
+def test_export_takes_a_number_and_a_name_and_overwrites_no_file(
     where: Path, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert export(where, "7", "mine") == 0
@@ -100,7 +100,7 @@ def test_a_number_and_a_name_are_taken_and_what_is_there_stays(
     assert (here / "mine").read_bytes().startswith(b"t [s],")
 
 
-def test_a_part_of_it_by_seconds(where: Path, here: Path) -> None:
+def test_a_range_of_seconds_exports_only_that_part(where: Path, here: Path) -> None:
     assert export(where, "7", "a.csv", "--csv") == 0
     assert export(where, "7", "b.csv", "--csv", "--from", "0.5", "--to", "1") == 0
     whole, part = ((here / name).read_text().splitlines() for name in ("a.csv", "b.csv"))
@@ -109,7 +109,7 @@ def test_a_part_of_it_by_seconds(where: Path, here: Path) -> None:
     assert 0.2 < len(part) / len(whole) < 0.5
 
 
-def test_another_configuration_computes_odometry_anew(where: Path, here: Path) -> None:
+def test_another_configuration_computes_the_odometry_again(where: Path, here: Path) -> None:
     (here / "other.toml").write_text("[drive]\nwheel_radius = 0.1\n")
     assert export(where, "7", "a.csv", "--csv") == 0
     assert export(where, "7", "b.csv", "--csv", "--config", "other.toml") == 0
@@ -124,7 +124,7 @@ def test_another_configuration_computes_odometry_anew(where: Path, here: Path) -
     ("new", "words"),
     [("nowhere/a.mcap", "No such file or directory"), ("/proc/a.mcap", "cannot write /proc/a")],
 )
-def test_where_nothing_can_be_written_it_says_so(
+def test_an_unwritable_path_is_reported(
     new: str, words: str, where: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert export(where, "7", new) in (1, 77)
@@ -133,7 +133,7 @@ def test_where_nothing_can_be_written_it_says_so(
     assert words in error
 
 
-def test_what_was_cut_is_written_as_far_as_it_is_whole(
+def test_a_truncated_recording_is_exported_up_to_its_end(
     where: Path, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cut = here / "cut.mcap.part"
@@ -145,7 +145,7 @@ def test_what_was_cut_is_written_as_far_as_it_is_whole(
     assert summary is not None
 
 
-def test_what_is_no_recording_is_refused(
+def test_a_file_that_is_not_a_recording_is_refused(
     where: Path, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert export(where, "7", "new.mcap") == 0

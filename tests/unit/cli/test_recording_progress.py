@@ -30,7 +30,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     "verb", ["replay", pytest.param("report", marks=SLOW), pytest.param("export", marks=SLOW)]
 )
-def test_it_says_how_far_it_is(
+def test_the_progress_is_shown_on_a_terminal(
     verb: str, recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     words = [
@@ -44,7 +44,7 @@ def test_it_says_how_far_it_is(
     assert told.endswith("\r\x1b[K")
 
 
-def test_into_a_pipe_it_says_nothing_of_it(
+def test_no_progress_is_written_into_a_pipe(
     recorded: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["recording", "replay", str(recorded)]) == 0

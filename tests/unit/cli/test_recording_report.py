@@ -73,7 +73,7 @@ def test_nothing_is_overwritten_without_force(tmp_path: Path) -> None:
     assert new.stat().st_size > 1e6
 
 
-def test_a_recording_never_goes_not_even_by_force(tmp_path: Path) -> None:
+def test_a_report_never_overwrites_a_recording_even_with_force(tmp_path: Path) -> None:
     new = tmp_path / "other"
     shutil.copy(QUIET, new)
     code, _, err = report(QUIET, new, "--force")
@@ -85,7 +85,7 @@ def test_a_recording_never_goes_not_even_by_force(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_what_was_there_goes_only_when_all_of_the_new_one_is(tmp_path: Path) -> None:
+def test_an_old_report_is_replaced_only_by_a_complete_new_one(tmp_path: Path) -> None:
     new = tmp_path / "here.html"
     new.write_text("mine")
     assert report(QUIET, new, "--force", "--from", "9999")[0] == 1
@@ -98,7 +98,7 @@ def test_what_was_there_goes_only_when_all_of_the_new_one_is(tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_a_part_of_the_time_and_what_was_cut(tmp_path: Path) -> None:
+def test_a_report_of_a_range_says_that_the_recording_is_truncated(tmp_path: Path) -> None:
     cut, new = tmp_path / "cut.mcap", tmp_path / "cut.html"
     shutil.copy(QUIET, cut)
     cut.write_bytes(cut.read_bytes()[:-4000])
@@ -111,7 +111,7 @@ def test_a_part_of_the_time_and_what_was_cut(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_what_is_damaged_is_left_out_and_said(tmp_path: Path) -> None:
+def test_a_damaged_section_is_left_out_and_reported(tmp_path: Path) -> None:
     bad, new = tmp_path / "bad.mcap", tmp_path / "bad.html"
     data = bytearray((RECORDINGS / "faults.mcap").read_bytes())
     (begin, end), _ = chunks(data)
@@ -127,7 +127,7 @@ def test_what_is_damaged_is_left_out_and_said(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_of_a_time_without_steps_there_is_no_report(tmp_path: Path) -> None:
+def test_a_range_without_steps_makes_no_report(tmp_path: Path) -> None:
     new = tmp_path / "none.html"
     code, _, err = report(QUIET, new, "--from", "9999")
     assert code == 1
@@ -135,7 +135,9 @@ def test_of_a_time_without_steps_there_is_no_report(tmp_path: Path) -> None:
     assert not new.exists()
 
 
-def test_without_the_library_it_says_what_to_type(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_library_the_message_says_how_to_install_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setitem(sys.modules, "plotly.offline", None)
     code, _, err = report(QUIET)
     assert code == 1

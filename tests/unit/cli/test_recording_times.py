@@ -322,7 +322,7 @@ def test_the_help_says_where_seconds_are_a_time(
     assert ("number of seconds" in told) == bool(verb)
 
 
-def test_a_recording_without_a_step_in_the_range_says_so(ring: Ring) -> None:
+def test_a_recording_without_a_step_in_the_range_is_reported(ring: Ring) -> None:
     where, _, _ = ring
     code, out, err = recording(where, "show", "3", "--from", "9999")
     assert (code, out, "has no step in that span of time" in err) == (1, "", True)

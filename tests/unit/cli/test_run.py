@@ -32,7 +32,7 @@ def test_the_options_are_the_keys_of_the_configuration() -> None:
     assert config.bus.connect == ("tcp/[::1]:2",)
 
 
-def test_the_doctor_knows_all_that_options_set() -> None:
+def test_the_doctor_knows_every_key_that_options_set() -> None:
     given = given_by("--port", "x", "--baud-rate", "9600", "--id", "r", "--namespace", "n",
                      "--record", "d", "--listen", "tcp/127.0.0.1:1", "--connect", "tcp/127.0.0.1:2",
                      )  # fmt: skip
@@ -58,7 +58,7 @@ def test_one_option_changes_its_own_table_only(words: list[str], table: str) -> 
     assert changed == [table]
 
 
-def test_the_banner_tells_a_simulator_from_a_robot() -> None:
+def test_the_banner_distinguishes_a_simulator_from_a_robot() -> None:
     simulated = run.banner(Config(), "acsard.toml", "/dev/pts/3")
     config = Config(mcu=McuConfig(port="/dev/ttyUSB0"))
     real = run.banner(config, "acsard.toml", "/dev/ttyUSB0")
@@ -93,7 +93,7 @@ def test_the_banner_s_tools_reach_this_daemon_and_no_other() -> None:
     assert f"acsard call stop{options} " in told
 
 
-def test_where_a_person_looks_on_the_page_is_served_unless_it_is_not_wanted_or_not_there(
+def test_on_a_terminal_the_page_is_served_unless_it_is_disabled_or_missing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.delenv("INVOCATION_ID", raising=False)

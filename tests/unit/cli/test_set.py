@@ -39,7 +39,7 @@ def test_a_value_is_written_as_in_the_file_and_a_bare_word_is_a_text(
     assert type(found["log.level"]) is type(value)
 
 
-def test_several_settings_are_pairs_one_after_the_other() -> None:
+def test_several_settings_are_a_list_of_key_value_pairs() -> None:
     assert pairs(["rates.state", "5", "log.level", "info"]) == {
         "rates.state": 5,
         "log.level": "info",
@@ -47,7 +47,7 @@ def test_several_settings_are_pairs_one_after_the_other() -> None:
     assert pairs([]) == {}
 
 
-def test_a_key_without_a_value_is_told_how_to_write_it() -> None:
+def test_a_key_without_a_value_is_refused_with_the_syntax() -> None:
     with pytest.raises(UsageError, match=r"pairs of KEY VALUE"):
         pairs(["limits.linear_speed"])
 

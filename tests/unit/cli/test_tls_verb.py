@@ -96,13 +96,13 @@ def test_init_makes_an_authority_the_robots_certificate_and_one_for_each_role(ma
     assert set(files(made)) == {*expected, *each, "ca-key.pem"}
 
 
-def test_only_the_owner_may_read_a_key_and_everybody_a_certificate(made: Path) -> None:
+def test_only_the_owner_may_read_a_key_and_every_user_a_certificate(made: Path) -> None:
     for name in files(made):
         mode = stat.S_IMODE((made / name).stat().st_mode)
         assert mode == (0o600 if "key" in name else 0o644), name
 
 
-def test_each_place_has_the_certificate_of_the_one_authority(made: Path) -> None:
+def test_each_directory_has_the_certificate_of_the_authority(made: Path) -> None:
     authority = (made / "ca.pem").read_bytes()
     for place in PLACES:
         assert (made / place / "ca.pem").read_bytes() == authority
@@ -117,7 +117,9 @@ def test_a_key_belongs_to_its_certificate(made: Path, place: str) -> None:
 
 
 @each(("place", "name"), [(".", "robot"), *((f"clients/{role}", role) for role in ROLES)])
-def test_the_common_name_is_whose_it_is(made: Path, place: str, name: str) -> None:
+def test_the_common_name_of_a_certificate_is_the_name_of_its_owner(
+    made: Path, place: str, name: str
+) -> None:
     assert common_name(certificate(made / place).subject) == name
 
 
@@ -204,9 +206,7 @@ def test_a_key_is_never_readable_by_others_not_even_while_it_is_written(own: Pat
             assert stat.S_IMODE((own / name).stat().st_mode) == 0o600, name
 
 
-def test_a_key_is_not_written_through_a_link_that_lies_in_its_place(
-    own: Path, tmp_path: Path
-) -> None:
+def test_a_key_is_not_written_through_a_symbolic_link(own: Path, tmp_path: Path) -> None:
     elsewhere = tmp_path / "elsewhere"
     elsewhere.write_text("untouched")
     (own / "key.pem").unlink()
@@ -231,7 +231,9 @@ def test_init_overwrites_nothing_without_force(
     assert "acsard tls add" in said.err
 
 
-def test_init_with_force_makes_an_authority_that_the_old_certificates_are_not_of(own: Path) -> None:
+def test_init_with_force_makes_a_new_authority_that_did_not_sign_old_certificates(
+    own: Path,
+) -> None:
     old = certificate(own / "clients/operator")
     assert tls("init", "--force", "--directory", str(own)) == 0
     with pytest.raises(InvalidSignature):
@@ -239,7 +241,7 @@ def test_init_with_force_makes_an_authority_that_the_old_certificates_are_not_of
     certificate(own / "clients/operator").verify_directly_issued_by(certificate(own, "ca.pem"))
 
 
-def test_add_makes_one_more_by_the_same_authority_and_touches_nothing_else(own: Path) -> None:
+def test_add_issues_one_certificate_by_the_same_authority_and_changes_no_file(own: Path) -> None:
     before = files(own)
     assert tls("add", "anna", "--role", "operator", "--directory", str(own), "--days", "7") == 0
     after = files(own)
@@ -294,7 +296,7 @@ def test_the_lines_init_prints_are_a_configuration_that_lets_the_roles_in(
         ("anna+ben: the_old.one@home", "viewer"),
     ],
 )
-def test_the_lines_add_prints_are_a_configuration_that_lets_it_in(
+def test_the_lines_that_add_prints_give_the_new_certificate_its_role(
     own: Path, capsys: pytest.CaptureFixture[str], role: str, name: str
 ) -> None:
     assert tls("add", name, "--role", role, "--directory", str(own)) == 0
@@ -335,7 +337,7 @@ def test_the_lines_add_prints_are_a_configuration_that_lets_it_in(
     ],
     ids=ascii,
 )
-def test_what_cannot_name_a_certificate_is_refused_in_words_and_leaves_nothing(
+def test_an_invalid_certificate_name_is_refused_and_leaves_no_file(
     own: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:
     before = sorted(own.parent.rglob("*"))
@@ -345,7 +347,7 @@ def test_what_cannot_name_a_certificate_is_refused_in_words_and_leaves_nothing(
 
 
 @pytest.mark.parametrize("days", ["0", "-1", "99999999", "soon"])
-def test_days_that_no_certificate_can_hold_are_refused_in_words_and_leave_nothing(
+def test_an_invalid_number_of_days_is_refused_and_leaves_no_file(
     own: Path, capsys: pytest.CaptureFixture[str], days: str
 ) -> None:
     before = sorted(own.parent.rglob("*"))
@@ -356,7 +358,7 @@ def test_days_that_no_certificate_can_hold_are_refused_in_words_and_leave_nothin
     assert sorted(own.parent.rglob("*")) == before
 
 
-def test_an_address_that_is_none_is_refused_in_words_and_leaves_nothing(
+def test_an_invalid_address_is_refused_and_leaves_no_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ("--directory", str(tmp_path / "tls"), "--address", "r\u00f6bot")
@@ -365,12 +367,12 @@ def test_an_address_that_is_none_is_refused_in_words_and_leaves_nothing(
     assert files(tmp_path) == {}
 
 
-def test_a_role_that_is_none_is_refused(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unknown_role_is_refused(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert tls("add", "anna", "--role", "king", "--directory", str(own)) == Exit.USAGE
     assert "viewer" in capsys.readouterr().err
 
 
-def test_add_without_an_authority_says_what_makes_one(
+def test_add_without_an_authority_names_the_command_that_makes_one(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ("--role", "viewer", "--directory", str(tmp_path / "none"))
@@ -380,7 +382,7 @@ def test_add_without_an_authority_says_what_makes_one(
 
 
 @pytest.mark.parametrize("name", ["ca.pem", "ca-key.pem"])
-def test_add_with_a_broken_authority_says_so(
+def test_add_with_a_broken_authority_is_refused_with_the_reason(
     own: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:
     (own / name).write_text("not what it should be")
@@ -408,7 +410,7 @@ sys.exit(main(["tls", *sys.argv[1:]]))
 
 @pytest.fixture
 def locked() -> Iterator[Path]:
-    """Yield a directory that everyone may enter but nobody may write to.
+    """Yield a directory that every user may enter and no user may write to.
 
     It is not inside a directory that only root may enter.
     """
@@ -478,7 +480,7 @@ def test_init_writes_a_configuration_where_there_is_none(tmp_path: Path) -> None
     assert parse(file.read_bytes()).bus.tls == str(tmp_path / "tls")
 
 
-def test_renew_makes_the_robot_s_certificate_anew_with_its_names_and_leaves_all_others(
+def test_renew_replaces_only_the_robot_s_certificate_and_keeps_its_names(
     own: Path,
 ) -> None:
     before, old, names = files(own), certificate(own), names_of(own)
@@ -577,7 +579,7 @@ def test_without_the_authority_s_key_the_message_asks_for_it(
     assert "has no ca-key.pem: first copy the key of the" in capsys.readouterr().err
 
 
-def test_add_prints_a_list_that_keeps_who_is_there(
+def test_add_prints_a_list_that_keeps_the_present_names(
     own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "acsard.toml"
@@ -650,7 +652,7 @@ def test_an_encrypted_authority_s_password_is_asked_for(own: Path) -> None:
 
 
 @pytest.mark.slow
-def test_an_encrypted_authority_without_a_terminal_says_so(own: Path) -> None:
+def test_an_encrypted_authority_without_a_terminal_is_refused_with_the_reason(own: Path) -> None:
     encrypt(own, b"secret")
     words = [sys.executable, "-m", "acsard", "tls", "renew", "--directory", str(own)]
     done = subprocess.run(words, input="secret\n", capture_output=True, text=True, timeout=30.0)
@@ -680,7 +682,7 @@ def test_the_printed_lines_are_those_that_write_writes(
 
 
 @pytest.mark.parametrize("write", [True, False])
-def test_init_prints_how_this_robot_is_asked_by_its_id(
+def test_init_prints_how_to_query_this_robot_by_its_id(
     write: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -27,7 +27,7 @@ def test_every_ros_name_is_listed_with_what_it_stands_for() -> None:
             assert row.note.startswith(f"as {name.native}")
 
 
-def test_a_name_of_a_source_that_is_not_configured_is_said_to_be_refused() -> None:
+def test_a_topic_of_an_unconfigured_source_is_listed_as_refused() -> None:
     config = Config(commands=CommandsConfig(sources=(Source("nav", 10),)))
     notes = {row.key: row.note for row in ros_table(config).topics}
     assert notes["/cmd_vel"] == "as cmd/nav"
@@ -48,16 +48,16 @@ def test_a_published_name_has_the_rate_of_its_native_key() -> None:
 
 
 @pytest.mark.parametrize(("bridge", "rmw"), [(True, False), (False, True)])
-def test_one_tree_is_enough_to_be_listed(bridge: bool, rmw: bool) -> None:
+def test_topics_are_listed_if_either_ros_tree_is_enabled(bridge: bool, rmw: bool) -> None:
     assert ros_table(Config(ros=RosConfig(bridge=bridge, rmw=rmw))).topics
 
 
-def test_without_any_tree_there_is_nothing_to_list() -> None:
+def test_without_a_ros_tree_no_topics_are_listed() -> None:
     assert ros_table(Config(ros=RosConfig(bridge=False, rmw=False))).topics == []
 
 
 @pytest.mark.slow
-def test_no_verb_but_the_one_that_is_called_is_loaded() -> None:
+def test_only_the_module_of_the_called_verb_is_loaded() -> None:
     code = "import sys\nfrom acsard.cli import main\nmain(['topics'])\nprint(*sys.modules)"
     run = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60.0, check=True

@@ -23,7 +23,7 @@ def await_end() -> None:
         time.sleep(0.001)
 
 
-def test_a_wait_is_explained_in_one_line_that_is_no_output(
+def test_a_wait_is_explained_in_one_line_on_stderr(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     with explained(lambda: "waiting for\x1b[2J acsard/ghost/state", after_s=0.0):
@@ -35,7 +35,7 @@ def test_a_wait_is_explained_in_one_line_that_is_no_output(
     assert told.err.strip().isprintable()
 
 
-def test_what_has_come_is_not_explained(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_wait_that_a_message_ended_is_not_explained(capsys: pytest.CaptureFixture[str]) -> None:
     with explained(lambda: "why", after_s=NEVER_S) as heard:
         assert not ended()
         heard()
@@ -43,7 +43,9 @@ def test_what_has_come_is_not_explained(capsys: pytest.CaptureFixture[str]) -> N
     assert capsys.readouterr().err == ""
 
 
-def test_what_comes_while_it_looks_is_not_explained(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_message_during_the_diagnosis_suppresses_the_explanation(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     looking, come = threading.Event(), threading.Event()
 
     def look() -> str:
@@ -59,7 +61,7 @@ def test_what_comes_while_it_looks_is_not_explained(capsys: pytest.CaptureFixtur
     assert capsys.readouterr().err == ""
 
 
-def test_who_leaves_leaves_nobody_behind() -> None:
+def test_leaving_the_context_ends_the_waiting_thread() -> None:
     with explained(lambda: "why", after_s=NEVER_S):
         pass
     await_end()
@@ -96,7 +98,7 @@ def test_each_silence_is_explained_once(capsys: pytest.CaptureFixture[str]) -> N
     assert capsys.readouterr().err == ""
 
 
-def test_a_silence_in_which_nothing_is_wrong_is_looked_at_again(
+def test_a_silence_without_a_found_cause_is_diagnosed_again(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     found = iter(["", "", "the way to it is cut"])

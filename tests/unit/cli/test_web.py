@@ -13,7 +13,7 @@ from acsard.machine.authority import Authority
 from tests.each import each
 
 
-def test_an_invitation_that_nobody_could_follow_names_the_file_that_was_read(
+def test_an_invitation_without_a_reachable_address_names_the_file_that_was_read(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -75,7 +75,7 @@ def test_the_option_tls_gives_the_certificate_of_an_https_address_in_the_file(
         (("--hours", "1", "--days", "1"), "not allowed with"),
     ],
 )
-def test_how_long_a_token_lasts_is_whole_and_said_once(
+def test_an_invalid_or_repeated_lifetime_of_a_token_is_refused_with_a_hint(
     words: tuple[str, ...], hint: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit):
@@ -85,7 +85,7 @@ def test_how_long_a_token_lasts_is_whole_and_said_once(
 
 @each("option", ["--name phone", "--days 3", "--hours 3"])
 @each("doing", ["", "--tokens", "--revoke phone"])
-def test_the_options_of_an_invitation_need_one(
+def test_the_options_of_an_invitation_require_invite(
     option: str, doing: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["web", *doing.split(), *option.split()]) == Exit.USAGE

@@ -23,7 +23,7 @@ from tests.scenarios.world import World
         (asyncio.CancelledError(), ""),
     ],
 )
-def test_the_black_box_hears_by_what_it_ends_and_hides_nothing_of_it(
+def test_the_recording_ends_with_the_error_of_the_daemon_and_the_error_is_raised(
     error: BaseException, cut: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recorder, "CLOSE_S", 20.0)

@@ -64,7 +64,7 @@ def file(tmp_path: Path, started: Started) -> LatchFile:
     return started(tmp_path)[0]
 
 
-def test_without_a_file_it_is_the_first_start_and_the_file_is_there_then(
+def test_a_first_start_has_no_latches_and_creates_the_file(
     tmp_path: Path, started: Started
 ) -> None:
     file, latches = started(tmp_path / "state" / "acsard")
@@ -208,7 +208,7 @@ def test_the_latch_file_is_in_the_first_place_that_is_set() -> None:
     assert place(config(Path("~/mine")), {}) == Path.home() / "mine" / NAME
 
 
-def test_two_robots_in_one_directory_keep_apart(tmp_path: Path, started: Started) -> None:
+def test_two_robots_in_one_directory_have_separate_files(tmp_path: Path, started: Started) -> None:
     started(tmp_path)[0].keep(STOP)
     two = replace(config(tmp_path), robot=replace(Config().robot, id="two"))
     other = LatchFile(two, {})
@@ -216,7 +216,7 @@ def test_two_robots_in_one_directory_keep_apart(tmp_path: Path, started: Started
     end(other)
 
 
-def test_a_file_that_another_daemon_keeps_is_not_overwritten_after_a_slow_start(
+def test_a_slow_start_does_not_overwrite_the_file_of_another_daemon(
     tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first, _ = started(tmp_path)
@@ -249,7 +249,7 @@ def test_the_temporary_file_of_a_killed_write_is_removed(tmp_path: Path, started
     assert not list(tmp_path.glob(f".{NAME}.*"))
 
 
-def test_a_file_system_without_locks_keeps_latches_all_the_same(
+def test_a_file_system_without_locks_still_keeps_latches(
     tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def without(*words: object) -> None:
@@ -289,7 +289,7 @@ def stuck(monkeypatch: pytest.MonkeyPatch) -> Iterator[Stuck]:
     disk.goes.set()
 
 
-def test_only_the_newest_is_written_when_the_disk_takes_again(
+def test_only_the_newest_latches_are_written_when_the_disk_works_again(
     file: LatchFile, stuck: Stuck, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "replace", stuck.replace)
@@ -338,7 +338,7 @@ def test_latches_are_held_from_the_rename_on(
     syncs.set()
 
 
-def test_latches_that_come_with_the_end_are_written(
+def test_latches_that_arrive_while_the_file_closes_are_written(
     tmp_path: Path, file: LatchFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pop = file._box.pop
@@ -356,7 +356,7 @@ def test_latches_that_come_with_the_end_are_written(
     assert (tmp_path / NAME).read_bytes() == encode("acsar", STOP)
 
 
-def test_each_write_waits_for_the_file_and_for_its_name(
+def test_each_write_syncs_the_file_and_its_directory(
     tmp_path: Path, file: LatchFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     synced: list[Path] = []
@@ -366,13 +366,13 @@ def test_each_write_waits_for_the_file_and_for_its_name(
     assert synced[-2:] == [tmp_path / NAME, tmp_path]
 
 
-def test_to_wait_ends_once_the_latches_are_held(file: LatchFile) -> None:
+def test_a_wait_ends_when_the_latches_are_held(file: LatchFile) -> None:
     file.keep(STOP)
     file.wait(STOP, 10.0)
     assert file.holds(STOP)
 
 
-def test_to_wait_for_a_stuck_disk_ends_when_the_time_is_over(
+def test_a_wait_for_a_stuck_disk_ends_after_its_timeout(
     file: LatchFile, stuck: Stuck, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "replace", stuck.replace)
@@ -383,7 +383,7 @@ def test_to_wait_for_a_stuck_disk_ends_when_the_time_is_over(
     assert not file.holds(STOP)
 
 
-def test_to_wait_for_a_disk_that_fails_is_over_at_once(
+def test_a_wait_for_a_failing_disk_ends_immediately(
     file: LatchFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "replace", full)
@@ -394,7 +394,7 @@ def test_to_wait_for_a_disk_that_fails_is_over_at_once(
     assert time.monotonic() - began < 5.0
 
 
-def test_the_end_waits_for_a_stuck_disk_only_for_its_time(
+def test_the_close_waits_for_a_stuck_disk_only_until_its_timeout(
     file: LatchFile, stuck: Stuck, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "replace", stuck.replace)
@@ -594,7 +594,7 @@ def test_a_file_that_was_not_read_at_the_start_is_read_before_it_is_written(
     assert after == replace(OFF, fault=FAULT.fault, lowered=both).after_restart()
 
 
-def test_a_first_look_that_begins_after_the_start_gave_up_changes_nothing(
+def test_a_first_read_that_begins_after_the_start_gave_up_changes_nothing(
     tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / NAME).write_bytes(encode("acsar", OFF))
@@ -632,7 +632,7 @@ def test_a_name_that_cannot_be_looked_up_is_not_a_first_start(
     assert os.strerror(number) in latches.stop.why
 
 
-def test_a_disk_that_hangs_later_is_reported_once_and_so_is_its_answer(
+def test_a_disk_that_hangs_later_is_reported_once_and_so_is_its_recovery(
     tmp_path: Path, started: Started, stuck: Stuck, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file, first = started(tmp_path)
@@ -658,7 +658,7 @@ def test_a_disk_that_hangs_later_is_reported_once_and_so_is_its_answer(
     ]
 
 
-def test_a_disk_that_hangs_and_then_fails_is_not_said_to_keep_again(
+def test_a_disk_that_hangs_and_then_fails_is_not_reported_as_recovered(
     tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     goes = threading.Event()
@@ -681,7 +681,7 @@ def test_a_disk_that_hangs_and_then_fails_is_not_said_to_keep_again(
     assert "No space left" in event.text
 
 
-def test_a_disk_that_fills_up_is_reported_once_and_tried_until_it_takes(
+def test_a_full_disk_is_reported_once_and_retried_until_a_write_succeeds(
     tmp_path: Path, file: LatchFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "RETRY_S", 0.01)

@@ -52,7 +52,7 @@ def test_the_file_is_json_that_a_person_can_read() -> None:
     assert text.endswith("\n}\n")
 
 
-def test_a_text_of_a_stranger_is_kept_up_to_500_characters() -> None:
+def test_a_client_s_text_is_stored_up_to_500_characters() -> None:
     for length in (499, 500, 501):
         latches = Latches(stop=replace(STOP, by="j" * length))
         stop = decode("acsar", encode("acsar", latches)).stop
@@ -60,14 +60,14 @@ def test_a_text_of_a_stranger_is_kept_up_to_500_characters() -> None:
         assert len(stop.by) == min(length, 500)
 
 
-def test_all_latches_come_back_marked_as_kept() -> None:
+def test_all_decoded_latches_are_marked_as_kept() -> None:
     assert decode("acsar", encode("acsar", ALL)) == ALL.after_restart()
     assert decode("acsar", encode("acsar", Latches())) == Latches()
 
 
 @each("depth", [1, 2, 300])
 @each("name", ["stop", "fault", "inactive"])
-def test_an_earlier_cause_with_causes_of_its_own_is_damage(name: str, depth: int) -> None:
+def test_an_earlier_cause_with_earlier_causes_of_its_own_is_refused(name: str, depth: int) -> None:
     one = json.dumps(json.loads(encode("acsar", Latches(stop=STOP)))["latches"]["stop"])
     nested = one
     for _ in range(depth):
@@ -84,7 +84,7 @@ def test_an_earlier_cause_with_causes_of_its_own_is_damage(name: str, depth: int
 
 
 @given(several)
-def test_no_text_of_a_stranger_loses_a_latch(latches: Latches) -> None:
+def test_no_text_of_a_client_loses_a_latch(latches: Latches) -> None:
     data = encode("acsar", Latches(latches.stop, latches.fault, latches.inactive))
     after = decode("acsar", data)
     assert len(data) < MAX_BYTES
@@ -174,7 +174,7 @@ def test_a_wall_clock_that_was_never_set_gives_a_stop_the_number_0(wall_ns: int)
     assert latches.stop.number == 0
 
 
-def test_a_stop_that_is_latched_already_stays() -> None:
+def test_a_stop_by_the_daemon_does_not_replace_a_latched_stop() -> None:
     assert stopped(ALL, "the file cannot be read", NOW) is ALL
 
 
@@ -192,7 +192,7 @@ def test_each_latch_of_a_file_that_cannot_be_written_takes_a_new_number() -> Non
     assert made.lowered == ALL.lowered
 
 
-def test_two_such_starts_with_a_wall_clock_that_went_back_give_different_numbers() -> None:
+def test_two_unwritable_starts_with_a_wall_clock_set_back_have_different_numbers() -> None:
     """Otherwise a clear of what the first one latched releases a stop that the crash has lost."""
     wall_ns = NOW.wall_ns - 40_828_000_000_000
     starts = [doubted(ALL, "", Instant(mono_ns, wall_ns)) for mono_ns in (76 * 10**9, 78 * 10**9)]
@@ -231,7 +231,7 @@ class Keeper:
         return [Event("latch_file", "the disk is full", "warning")]
 
 
-def test_only_latches_that_changed_are_handed_over() -> None:
+def test_only_changed_latches_are_handed_to_the_keeper() -> None:
     keeper, first = Keeper(), Latches()
     handover = Handover(first, keeper)
     handover.take(first)
@@ -242,7 +242,7 @@ def test_only_latches_that_changed_are_handed_over() -> None:
     assert handover.latches is ALL
 
 
-def test_latches_are_held_once_the_keeper_holds_these() -> None:
+def test_latches_are_held_once_the_keeper_holds_them() -> None:
     keeper = Keeper()
     handover = Handover(Latches(), keeper)
     handover.take(ALL)
@@ -273,7 +273,7 @@ def test_a_stop_that_no_step_served_keeps_the_causes_of_the_stop_before_it() -> 
     ]  # fmt: skip
 
 
-def test_every_cause_of_a_stop_is_in_the_file_and_cut_off_like_the_others() -> None:
+def test_every_cause_of_a_stop_is_in_the_file_with_at_most_500_characters() -> None:
     life = Lifecycle(active=True)
     life.stop("a" * 600, 1, NOW)
     life.press("a bumper is pressed", NOW)
@@ -299,7 +299,7 @@ def test_a_stop_that_no_step_served_is_newer_than_the_stop_before_it(ahead: int)
 
 
 def test_a_stop_that_no_step_served_is_newer_than_a_stop_that_was_released() -> None:
-    """The wall clock went back, and the released stop had the number behind `INACTIVE`."""
+    """The wall clock went back, and the released stop had the number after that of `INACTIVE`."""
     keeper, now = Keeper(), Instant(NOW.mono_ns, NOW.wall_ns - 9 * NS_PER_S)
     life = Lifecycle(active=True, latches=Latches(inactive=INACTIVE))
     life.stop("joe", 1, Instant(1, now.wall_ns))
@@ -312,7 +312,7 @@ def test_a_stop_that_no_step_served_is_newer_than_a_stop_that_was_released() -> 
     assert latches.stop.number > seen
 
 
-def test_without_such_a_stop_the_latches_are_handed_over_as_they_are() -> None:
+def test_without_an_unserved_stop_the_latches_are_handed_over_unchanged() -> None:
     keeper = Keeper()
     Handover(Latches(), keeper).take_stops(ALL, [], NOW)
     assert keeper.given == [ALL]
@@ -325,20 +325,20 @@ def test_a_stop_without_a_name_is_stopped_by_a_request() -> None:
     assert keeper.given[0].stop.why == "stopped by request"
 
 
-def test_on_the_way_down_the_keeper_has_the_time_in_which_a_stop_is_answered() -> None:
+def test_at_shutdown_the_handover_waits_for_the_keeper_up_to_the_answer_timeout() -> None:
     keeper = Keeper()
     handover = Handover(ALL, keeper)
     handover.wait()
     assert keeper.waits == [(ALL, ANSWER_NS / NS_PER_S)]
 
 
-def test_the_events_and_the_trouble_are_those_of_the_keeper() -> None:
+def test_the_handover_reports_the_events_and_the_trouble_of_the_keeper() -> None:
     handover = Handover(Latches(), keeper := Keeper())
     assert handover.news() == keeper.news()
     assert handover.trouble == keeper.trouble
 
 
-def test_without_a_keeper_nothing_waits_and_nothing_is_in_trouble() -> None:
+def test_without_a_keeper_the_handover_never_waits_and_reports_no_trouble() -> None:
     handover = Handover(Latches(), None)
     handover.take(ALL)
     handover.wait()

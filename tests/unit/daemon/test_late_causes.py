@@ -143,7 +143,7 @@ def test_a_slow_processor_delays_no_thread_that_slept(conditions: Conditions) ->
     assert len(causes(Lateness(30 * MS, Scheduled(20 * MS, 0), Reading(), after))[0]) == 1
 
 
-def test_a_disk_delays_no_thread_that_ran_and_none_that_did_not_use_it() -> None:
+def test_a_disk_is_no_cause_for_a_thread_that_ran_or_did_not_use_the_disk() -> None:
     after = Reading(disk_ns=250 * MS, own_bytes=4096)
     assert causes(Lateness(30 * MS, Scheduled(), Reading(), after))[0] == ("disk",)
     assert causes(Lateness(30 * MS, Scheduled(25 * MS, 0), Reading(), after))[0] == ()
@@ -151,19 +151,21 @@ def test_a_disk_delays_no_thread_that_ran_and_none_that_did_not_use_it() -> None
     assert causes(Lateness(30 * MS, Scheduled(), Reading(), others))[0] == ()
 
 
-def test_the_thread_s_own_delay_at_a_disk_needs_no_other_proof() -> None:
+def test_the_thread_s_own_disk_delay_is_enough_to_name_the_disk() -> None:
     after = Reading(own_disk_ns=20 * MS)
     assert causes(Lateness(30 * MS, Scheduled(), Reading(), after))[0] == ("disk",)
     assert causes(Lateness(50 * MS, Scheduled(), Reading(), after))[0] == ()
 
 
 @pytest.mark.parametrize(("stolen_ms", "named"), [(10, False), (20, False), (30, True)])
-def test_one_or_two_ticks_of_steal_time_are_usual(stolen_ms: int, named: bool) -> None:
+def test_one_or_two_ticks_of_steal_time_are_not_named_as_a_cause(
+    stolen_ms: int, named: bool
+) -> None:
     late = Lateness(12 * MS, Scheduled(), Reading(0, (5, 5)), Reading(0, (5, 5 + stolen_ms * MS)))
     assert causes(late)[0] == (("steal",) if named else ())
 
 
-def test_two_causes_at_once_are_both_named() -> None:
+def test_two_simultaneous_causes_are_both_named() -> None:
     conditions = Conditions(slow_clock=SlowClock("powersave", 600, 1500))
     hog = Program(812, "hog", 150 * MS)
     late = Lateness(50 * MS, Scheduled(0, 50 * MS), Reading(), Reading(conditions=conditions), hog)
@@ -173,7 +175,7 @@ def test_two_causes_at_once_are_both_named() -> None:
     assert "for 0.05 s, most of all the program hog (pid 812)" in clause
 
 
-def test_a_real_time_program_is_called_so() -> None:
+def test_a_real_time_program_is_reported_as_real_time() -> None:
     hog = Program(812, "hog", 150 * MS, -21)
     late = Lateness(50 * MS, Scheduled(0, 50 * MS), Reading(), Reading(), hog)
     assert "the real-time program hog (pid 812)" in causes(late)[1]
@@ -200,13 +202,13 @@ def test_the_event_has_the_duration_and_the_cause_with_its_advice() -> None:
         "23 times; the last: late: {}",
     ],
 )
-def test_the_cause_is_found_in_each_form_of_a_line(line: str) -> None:
+def test_the_cause_is_parsed_from_each_form_of_a_log_line(line: str) -> None:
     cause = "by 0.06 s, because the processor is hot (cool it: now), and it is slow (speed it)"
     assert cause_in(line.format(cause)) == cause
     assert cause_in("11 x missed: 11 in a row") == ""
 
 
-def test_the_causes_that_are_present_need_no_lateness() -> None:
+def test_present_causes_are_listed_without_a_late_period() -> None:
     before, second = Reading(0, (0, 0)), 1000 * MS
     assert present(before, before, second) == []
     low = replace(before, conditions=Conditions(undervoltage=True, throttled=1))

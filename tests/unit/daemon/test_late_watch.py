@@ -107,7 +107,7 @@ def test_neither_a_punctual_period_nor_an_unknown_cause_is_an_event(
         assert watch.news() == []
 
 
-def test_the_first_report_of_a_cause_is_news_and_its_repetition_is_not(
+def test_only_the_first_report_of_a_cause_is_marked_as_new(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     with watching(monkeypatch) as (watch, kernel):
@@ -132,7 +132,7 @@ def test_a_lateness_is_compared_with_the_reading_before_it_began(
         assert "suspended for 1.00 s" in reported(watch).text
 
 
-def test_a_lateness_from_before_the_first_reading_is_not_judged(
+def test_a_late_period_that_began_before_the_first_reading_is_not_reported(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     began_ns = clock.mono_ns()
@@ -144,7 +144,9 @@ def test_a_lateness_from_before_the_first_reading_is_not_judged(
         assert watch.news() == []
 
 
-def test_of_several_late_periods_the_worst_one_is_judged(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_cause_is_determined_for_the_worst_of_several_late_periods(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     with watching(monkeypatch) as (watch, kernel):
         kernel.reading = Reading(asleep_ns=1000 * MS)
         for late_ms in (20, 50, 30):
@@ -177,7 +179,7 @@ def test_reports_are_a_second_apart(monkeypatch: pytest.MonkeyPatch) -> None:
         assert moments[1] - moments[0] >= 0.9
 
 
-def test_the_loop_s_times_are_those_between_two_periods() -> None:
+def test_the_loop_s_scheduler_times_are_the_differences_between_two_periods() -> None:
     late = late_watch.Late(0, 30 * MS, b"1000 200 3\n", b"1500 900 5\n")
     assert late.loop == Scheduled(500, 700)
 

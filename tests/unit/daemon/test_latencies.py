@@ -37,7 +37,7 @@ def order_statistic(values: list[float], share: float) -> float:
     return sorted(values)[max(0, math.ceil(share * len(values)) - 1)]
 
 
-def test_nothing_measured_is_all_zeros() -> None:
+def test_an_empty_histogram_has_only_zeros() -> None:
     assert Histogram().spread() == Spread(0, 0.0, 0.0, 0.0)
 
 
@@ -70,7 +70,7 @@ def test_two_outliers_in_a_hundred_show_in_the_99th_percentile() -> None:
     assert spread.p99 == pytest.approx(5000.0, rel=0.13)
 
 
-def test_what_lies_beyond_the_decades_falls_into_the_end_buckets() -> None:
+def test_measurements_beyond_the_decades_are_counted_in_the_end_buckets() -> None:
     assert spread_of([0.001]).p50 == 0.001
     assert spread_of([3e9]).p50 == pytest.approx(10.0**DECADES)
     assert spread_of([3e9]).max == 3e9
@@ -84,18 +84,18 @@ def step_time(stopwatch: Stopwatch, now_ns: int) -> Measured:
     return stopwatch.measured(now_ns)["step_time"]
 
 
-def test_every_figure_is_there_from_the_start() -> None:
+def test_every_figure_is_reported_from_the_start() -> None:
     assert Stopwatch().measured(0) == dict.fromkeys(NAMES, Measured(Spread(), Spread()))
 
 
-def test_a_measurement_counts_for_both() -> None:
+def test_a_new_measurement_counts_since_the_start_and_in_the_last_minute() -> None:
     stopwatch = Stopwatch()
     stopwatch.figures["step_time"].add(NS_PER_S, 250 * US)
     one = step_time(stopwatch, NS_PER_S)
     assert one.since_start == one.last_minute == Spread(1, 250.0, 250.0, 250.0)
 
 
-def test_after_a_minute_it_counts_for_the_start_alone() -> None:
+def test_a_measurement_older_than_a_minute_counts_only_since_the_start() -> None:
     stopwatch = Stopwatch()
     stopwatch.figures["step_time"].add(0, 250 * US)
     assert step_time(stopwatch, MINUTE_NS - 1).last_minute.count == 1
@@ -103,7 +103,7 @@ def test_after_a_minute_it_counts_for_the_start_alone() -> None:
     assert (one.since_start.count, one.last_minute.count) == (1, 0)
 
 
-def test_a_pause_of_any_length_leaves_nothing_old_in_the_minute() -> None:
+def test_after_a_pause_of_any_length_the_last_minute_has_no_old_measurements() -> None:
     for pause in range(1, 3 * SLOTS):
         stopwatch = Stopwatch()
         for slot in range(SLOTS):
@@ -113,7 +113,7 @@ def test_a_pause_of_any_length_leaves_nothing_old_in_the_minute() -> None:
         assert step_time(stopwatch, now_ns).last_minute.count == left
 
 
-def test_what_is_told_is_at_most_a_second_old() -> None:
+def test_reported_figures_are_at_most_a_second_old() -> None:
     stopwatch = Stopwatch()
     stopwatch.figures["step_time"].add(0, 100 * US)
     assert step_time(stopwatch, 0).since_start.count == 1
@@ -123,7 +123,7 @@ def test_what_is_told_is_at_most_a_second_old() -> None:
 
 
 @given(st.lists(st.tuples(st.integers(0, 20 * NS_PER_S), st.integers(0, 10**9)), max_size=60))
-def test_the_minute_is_what_a_histogram_of_its_measurements_says(
+def test_the_last_minute_equals_a_histogram_of_its_measurements(
     measurements: list[tuple[int, int]],
 ) -> None:
     stopwatch, now_ns, kept = Stopwatch(), 0, []
@@ -155,7 +155,7 @@ def test_a_day_takes_no_more_memory_than_a_minute() -> None:
     assert size(stopwatch) == after_a_minute
 
 
-def test_what_happened_counts_for_a_minute_and_then_no_more() -> None:
+def test_an_occurrence_counts_for_a_minute_and_then_no_longer() -> None:
     happened = LastMinute()
     assert happened.count(0) == 0
     happened.add(0, 3)
@@ -167,7 +167,7 @@ def test_what_happened_counts_for_a_minute_and_then_no_more() -> None:
     assert happened.count(MINUTE_NS + SLOT_NS) == 0
 
 
-def test_counting_by_the_minute_takes_no_more_room_with_the_hours() -> None:
+def test_a_count_of_the_last_minute_takes_constant_memory() -> None:
     happened = LastMinute()
     for second in range(3600):
         happened.add(second * NS_PER_S, 1)

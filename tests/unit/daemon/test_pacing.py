@@ -57,13 +57,13 @@ def test_every_period_has_its_line() -> None:
     assert all(paced.ticks(number * PERIOD_NS) for number in range(5))
 
 
-def test_a_line_at_once_keeps_the_gap() -> None:
+def test_an_early_line_keeps_the_minimum_gap() -> None:
     paced = ticked()
     assert not paced.at_once(GAP_NS - 1)
     assert paced.at_once(GAP_NS)
 
 
-def test_the_gap_counts_from_when_the_line_left() -> None:
+def test_the_minimum_gap_begins_when_the_last_line_is_sent() -> None:
     paced = Paced()
     paced.pace.period_ended(0)
     paced.pace.note(True, True, True, False, False)
@@ -72,21 +72,21 @@ def test_the_gap_counts_from_when_the_line_left() -> None:
     assert paced.at_once(2 * MS + GAP_NS)
 
 
-def test_a_line_at_once_takes_the_next_periods_place() -> None:
+def test_an_early_line_replaces_the_line_of_the_next_period() -> None:
     paced = ticked()
     assert paced.hears(6 * MS)
-    assert not paced.hears(9 * MS), "only one"
+    assert not paced.hears(9 * MS), "one early line in a period"
     assert not paced.ticks(10 * MS)
     assert paced.ticks(20 * MS)
 
 
-def test_after_missed_periods_the_clocks_line_goes_in_any_case() -> None:
+def test_after_missed_periods_the_periodic_line_is_sent_even_after_an_early_one() -> None:
     paced = ticked()
     assert paced.hears(6 * MS)
     assert paced.ticks(50 * MS, missed=4)
 
 
-def test_a_line_that_could_not_go_leaves_the_period_its_own() -> None:
+def test_a_failed_early_line_does_not_replace_the_periodic_line() -> None:
     paced = ticked()
     assert paced.hears(6 * MS, goes=False)
     assert not paced.hears(7 * MS), "one try a period"
@@ -96,23 +96,23 @@ def test_a_line_that_could_not_go_leaves_the_period_its_own() -> None:
     assert paced.pace.listens
 
 
-def test_what_comes_too_soon_is_sent_as_soon_as_the_gap_has_passed() -> None:
+def test_a_command_within_the_minimum_gap_is_sent_as_soon_as_the_gap_has_passed() -> None:
     paced = ticked()
     assert not paced.hears(1 * MS)
     assert paced.retry_ns == GAP_NS
-    assert not paced.pace.listens, "it is awake for the newest command anyway"
+    assert not paced.pace.listens, "the retry sends the newest command anyway"
     assert paced.hears(GAP_NS)
     assert paced.retry_ns is None
 
 
-def test_there_is_nothing_to_retry_without_news() -> None:
+def test_without_a_changed_command_there_is_no_retry() -> None:
     paced = ticked()
     paced.hears(1 * MS, news=False)
     assert paced.retry_ns is None
     assert paced.pace.listens
 
 
-def test_a_stranger_wakes_it_only_so_often_a_period() -> None:
+def test_messages_without_effect_wake_the_loop_a_limited_number_of_times_a_period() -> None:
     paced = ticked()
     for _ in range(IDLE_WAKES):
         paced.hears(5 * MS, news=False)
@@ -123,11 +123,11 @@ def test_a_stranger_wakes_it_only_so_often_a_period() -> None:
     assert paced.pace.listens
 
 
-def test_the_line_before_the_first_is_long_ago() -> None:
+def test_the_first_line_needs_no_gap() -> None:
     assert Paced().at_once(0)
 
 
-def test_where_the_next_period_comes_before_the_gap_has_passed_nobody_is_woken() -> None:
+def test_no_early_line_is_scheduled_if_the_next_period_comes_within_the_gap() -> None:
     paced = Paced(period_ns=GAP_NS)
     paced.ticks(0)
     assert not paced.pace.listens
@@ -136,7 +136,7 @@ def test_where_the_next_period_comes_before_the_gap_has_passed_nobody_is_woken()
 
 
 @given(st.lists(st.tuples(st.integers(1, 12), st.booleans(), st.booleans()), max_size=200))
-def test_no_traffic_makes_more_lines_than_the_clock_or_closer_ones(
+def test_no_traffic_makes_more_lines_than_periods_or_lines_within_the_gap(
     wakes: list[tuple[int, bool, bool]],
 ) -> None:
     pace, now_ns, due_ns, periods = Pace(WIRE_NS, PERIOD_NS), 0, PERIOD_NS, 0

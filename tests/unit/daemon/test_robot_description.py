@@ -32,7 +32,7 @@ def written(where: Path, text: str | bytes) -> Path:
     return file
 
 
-def test_no_file_is_no_description() -> None:
+def test_without_a_file_the_description_is_empty() -> None:
     assert robot_description("") == ""
 
 
@@ -51,7 +51,7 @@ def test_a_missing_file_is_refused_with_both_fixes(tmp_path: Path) -> None:
     assert 'ros.urdf = ""' in text
 
 
-def test_what_is_not_a_file_is_not_read(tmp_path: Path) -> None:
+def test_a_path_that_is_not_a_regular_file_is_not_read(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     for name in (tmp_path, tmp_path / "pipe"):
         assert "not a regular file" in refusal(name)
@@ -78,11 +78,11 @@ def test_what_is_not_a_file_is_not_read(tmp_path: Path) -> None:
         ('<?xml version="1.0"?>\n<!DOCTYPE robot SYSTEM "urdf.dtd"><robot/>', "document type"),
     ],
 )
-def test_a_file_that_is_no_urdf_is_refused(text: str | bytes, said: str, tmp_path: Path) -> None:
+def test_a_file_that_is_not_urdf_is_refused(text: str | bytes, said: str, tmp_path: Path) -> None:
     assert said in refusal(written(tmp_path, text))
 
 
-def test_a_urdf_that_only_names_xacro_is_one(tmp_path: Path) -> None:
+def test_a_urdf_with_only_the_xacro_namespace_is_accepted(tmp_path: Path) -> None:
     """The output of xacro keeps the name of its namespace."""
     text = '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name="r7"/>'
     assert robot_description(str(written(tmp_path, text))) == text

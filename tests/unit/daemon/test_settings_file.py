@@ -83,7 +83,9 @@ def test_an_edited_file_is_compared_again(file: Path, started: Started) -> None:
     until(lambda: made.differ == "")
 
 
-def test_an_option_of_the_daemon_is_no_difference(file: Path, started: Started) -> None:
+def test_an_option_of_the_daemon_is_not_reported_as_a_difference(
+    file: Path, started: Started
+) -> None:
     options: dict[str, object] = {"linear_speed": 0.4}
     config = parse(TEXT.encode(), {"limits": options})
     made = started(file, config, options)
@@ -196,7 +198,7 @@ def test_a_setting_that_the_robot_refuses_is_not_written(file: Path, made: Setti
     assert file.read_text() == TEXT
 
 
-def test_an_answer_to_another_request_is_not_for_the_file(started: Started) -> None:
+def test_an_answer_to_another_request_does_not_change_the_file(started: Started) -> None:
     assert not started(None, Config(), {}).obeyed(OBEYED)
 
 
@@ -252,7 +254,7 @@ def test_nothing_is_set_if_the_daemon_has_no_file(started: Started) -> None:
 
 
 @pytest.mark.slow
-def test_a_file_beside_tracked_ones_is_changed(tmp_path: Path, started: Started) -> None:
+def test_an_untracked_file_beside_tracked_ones_is_changed(tmp_path: Path, started: Started) -> None:
     other, file = tmp_path / "tracked.toml", tmp_path / "acsard.toml"
     other.write_text(TEXT)
     tracked(other)
@@ -291,7 +293,9 @@ def test_a_file_that_changes_between_check_and_writing_keeps_both_changes(
 
 
 @pytest.mark.slow
-def test_a_failure_after_the_robot_has_obeyed_is_no_success(file: Path, made: SettingsFile) -> None:
+def test_a_failed_write_after_the_robot_has_obeyed_is_reported_as_a_failure(
+    file: Path, made: SettingsFile
+) -> None:
     check(made)
     read_only(file)
     assert made.obeyed(OBEYED)
@@ -332,7 +336,7 @@ def test_a_disk_that_hangs_gets_an_answer_and_a_late_result_changes_nothing(
 
 
 @pytest.mark.slow
-def test_a_request_that_the_robot_has_is_not_reported_as_not_set(made: SettingsFile) -> None:
+def test_a_request_that_the_robot_received_is_not_reported_as_not_set(made: SettingsFile) -> None:
     """While a speed limit is in force, a `set` may wait for the step after the one before it."""
     check(made)
     assert made.results(module.PATIENCE_NS + 1, []) == []
@@ -448,7 +452,7 @@ def test_a_change_that_the_robot_has_obeyed_is_written_before_the_next_check(
 
 
 @pytest.mark.slow
-def test_an_editor_that_writes_while_the_change_is_computed_loses_nothing(
+def test_an_edit_during_the_computation_of_a_change_is_not_lost(
     file: Path, made: SettingsFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     texts = ["# second\n"]

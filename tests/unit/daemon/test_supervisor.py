@@ -26,14 +26,14 @@ async def told(kind: Kind = GATEWAY) -> Event:
     return await first
 
 
-def test_without_a_program_to_start(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_program_that_cannot_be_started_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "executable", "/nowhere/python")
     event = asyncio.run(told())
     assert (event.name, event.level) == ("gateway_ended", "warning")
     assert "could not be started" in event.text
 
 
-def test_without_room_for_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_thread_that_cannot_be_started_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     def full(thread: threading.Thread) -> None:
         raise RuntimeError("can't start new thread")
 
@@ -49,7 +49,9 @@ def program(monkeypatch: pytest.MonkeyPatch, where: Path, text: str) -> None:
     monkeypatch.setattr(sys, "executable", str(file))
 
 
-def test_one_that_falls_silent_is_ended(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_program_that_falls_silent_is_killed(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setattr("acsard.host.child.SILENT_NS", 0)
     pid = tmp_path / "pid"
     stops = f"import os; os.write(0, b'.'); open({str(pid)!r}, 'w').write(str(os.getpid())); "
@@ -60,7 +62,7 @@ def test_one_that_falls_silent_is_ended(monkeypatch: pytest.MonkeyPatch, tmp_pat
 
 
 @pytest.mark.parametrize("code", [2, 78])
-def test_a_router_that_cannot_be_one_is_not_tried_again(
+def test_a_router_that_cannot_start_is_not_restarted(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, code: int
 ) -> None:
     program(monkeypatch, tmp_path, f"raise SystemExit({code})")
@@ -91,7 +93,7 @@ def test_a_router_that_once_ran_is_started_again_when_its_files_are_wrong(
 
 
 @pytest.mark.parametrize(("kind", "code"), [(GATEWAY, 78), (ROUTER, 75), (ROUTER, 1)])
-def test_one_that_may_be_opened_later_is_tried_again(
+def test_a_program_that_may_start_later_is_restarted(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, kind: Kind, code: int
 ) -> None:
     program(monkeypatch, tmp_path, f"raise SystemExit({code})")

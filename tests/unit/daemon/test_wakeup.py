@@ -41,9 +41,7 @@ def goes_off(kernel: Kernel, one: Ticker, late_ns: int = 0) -> Period:
 
 
 @pytest.mark.parametrize("rate", [0.92, 1.0, 1.08])
-def test_while_the_timer_is_slewed_no_period_is_lost_nor_does_it_drift(
-    kernel: Kernel, rate: float
-) -> None:
+def test_a_slewed_timer_neither_loses_a_period_nor_drifts(kernel: Kernel, rate: float) -> None:
     one = Ticker(PERIOD_NS, lambda: None)
     kernel.rate = rate
     start_ns = kernel.now_ns
@@ -61,7 +59,7 @@ def test_periods_that_were_missed_are_counted_from_the_first(kernel: Kernel) -> 
     assert goes_off(kernel, one) == Period(1, start_ns + 5 * PERIOD_NS)
 
 
-def test_a_timer_that_goes_off_again_before_it_is_heard_ends_no_period_twice(
+def test_a_timer_that_expires_again_before_it_is_read_ends_no_period_twice(
     kernel: Kernel,
 ) -> None:
     woken: list[int] = []
@@ -76,7 +74,7 @@ def test_a_timer_that_goes_off_again_before_it_is_heard_ends_no_period_twice(
     assert one.take(kernel.now_ns).expired == 0
 
 
-def test_what_is_due_is_told_to_whoever_wakes_us_first(kernel: Kernel) -> None:
+def test_expired_periods_are_counted_also_if_a_command_wakes_the_loop_first(kernel: Kernel) -> None:
     """After a stall, the loop may get a waiting command before it gets the timer."""
     one = Ticker(PERIOD_NS, lambda: None)
     start_ns = kernel.now_ns
@@ -115,7 +113,7 @@ def test_an_alarm_that_went_off_too_early_may_be_set_for_the_same_time_again(
     assert woken == [1]
 
 
-def test_what_went_off_before_it_was_set_anew_wakes_nobody(kernel: Kernel) -> None:
+def test_an_expiry_from_before_the_timer_was_set_again_wakes_nothing(kernel: Kernel) -> None:
     woken: list[int] = []
     one = Ticker(PERIOD_NS, lambda: woken.append(1))
     one.start(kernel.now_ns)
@@ -125,7 +123,7 @@ def test_what_went_off_before_it_was_set_anew_wakes_nobody(kernel: Kernel) -> No
     assert one.take(kernel.now_ns).expired == 0
 
 
-async def test_a_flood_of_stops_gets_one_step_before_the_period_takes_the_rest() -> None:
+async def test_in_a_flood_of_stops_one_step_is_early_and_the_period_takes_the_rest() -> None:
     wakeup, waiting, steps = Wakeup(), 0, list[int]()
     ends = False
 
@@ -149,6 +147,6 @@ async def test_a_flood_of_stops_gets_one_step_before_the_period_takes_the_rest()
     waiting += 1
     wakeup.stop()
     await asyncio.sleep(0.01)
-    assert steps[2:] == [1], "the next stop gets a step at once again"
+    assert steps[2:] == [1], "the next stop gets an early step again"
     wakeup()
     await running

@@ -117,7 +117,7 @@ def test_a_viewer_that_leaves_while_its_message_is_decoded_sends_nothing_more(
     assert not viewers.drives.driving()
 
 
-def test_a_stamp_is_passed_on_and_the_zeros_around_go_by_the_same_clock(viewers: Viewers) -> None:
+def test_a_stamp_is_passed_on_and_the_added_zeros_use_the_same_clock(viewers: Viewers) -> None:
     long_ago_ns = clock.now().wall_ns - 100 * NS_PER_S
     viewers.publish(1, TwistStamped(Header(Time.from_ns(long_ago_ns)), AHEAD))
     viewers.heard(1, 2)
@@ -139,7 +139,7 @@ def test_a_plain_twist_has_the_time_of_its_receipt(viewers: Viewers) -> None:
         assert abs(one.stamp_ns - before_ns) < HOLD_S * NS_PER_S
 
 
-def test_what_waited_behind_another_s_bus_that_is_locked_is_too_old_to_go(
+def test_a_command_that_waited_for_another_viewer_s_locked_bus_is_dropped(
     viewers: Viewers,
 ) -> None:
     for viewer in viewers.sessions:
@@ -171,7 +171,9 @@ def test_a_viewer_does_not_drive_after_a_suspend(
     assert not viewers.drives.driving()
 
 
-def test_a_bus_that_fails_one_viewer_is_told_and_fails_no_other(viewers: Viewers) -> None:
+def test_a_bus_that_fails_for_one_viewer_is_reported_and_serves_the_others(
+    viewers: Viewers,
+) -> None:
     viewers.sessions[1].broken = True
     viewers.publish(1, AHEAD)
     until(lambda: said(viewers.notices), HOLD_S, "that the bus takes nothing")
@@ -184,11 +186,11 @@ def test_a_bus_that_fails_one_viewer_is_told_and_fails_no_other(viewers: Viewers
 
 
 @each(("rate", "slow"), [(1.0, True), (2.0, True), (5.0, False), (20.0, False)])
-def test_a_panel_that_publishes_too_seldom_is_known(rate: float, slow: bool) -> None:
+def test_a_panel_that_publishes_too_seldom_is_detected(rate: float, slow: bool) -> None:
     assert told_slow(NS_PER_S / rate) is slow
 
 
-def test_single_presses_are_no_slow_panel() -> None:
+def test_single_presses_are_not_reported_as_a_slow_panel() -> None:
     assert not told_slow(4.0 * NS_PER_S)
 
 
@@ -212,14 +214,14 @@ STAMPED = TwistStamped(Header(Time(5)), MESSAGE)
 
 @pytest.mark.parametrize("name", ["geometry_msgs/Twist", "geometry_msgs/msg/Twist"])
 @pytest.mark.parametrize("form", ["json", "cdr"])
-def test_a_panel_s_twist_is_read(name: str, form: str) -> None:
+def test_a_panel_s_twist_is_decoded(name: str, form: str) -> None:
     encoding = encoding_of(form, name)
     found = wish(encoding, encode(MESSAGE, "json" if form == "json" else "cdr"))
     assert found == Wish(values.Twist(0.3, -0.2))
 
 
 @pytest.mark.parametrize("form", ["json", "cdr"])
-def test_a_stamped_one_too_with_its_stamp(form: str) -> None:
+def test_a_panel_s_stamped_twist_is_decoded_with_its_stamp(form: str) -> None:
     encoding = encoding_of(form, "geometry_msgs/msg/TwistStamped")
     found = wish(encoding, encode(STAMPED, "json" if form == "json" else "cdr"))
     assert found == Wish(values.Twist(0.3, -0.2), 5 * NS_PER_S)
@@ -235,7 +237,9 @@ def test_a_stamped_one_too_with_its_stamp(form: str) -> None:
         ("", "geometry_msgs/Twist"),
     ],
 )
-def test_what_drives_nothing_is_told_before_it_is_sent(form: str, name: str) -> None:
+def test_a_topic_type_that_cannot_drive_is_refused_when_it_is_advertised(
+    form: str, name: str
+) -> None:
     with pytest.raises(DecodeError, match=r"use geometry_msgs/msg/Twist|use json or cdr"):
         encoding_of(form, name)
 
@@ -253,7 +257,7 @@ def test_what_drives_nothing_is_told_before_it_is_sent(form: str, name: str) -> 
         b'{"linear": {"x": 1}, "angular": {}}' + b" " * 5000,
     ],
 )
-def test_what_is_no_twist_is_refused(payload: bytes) -> None:
+def test_a_payload_that_is_not_a_twist_is_refused(payload: bytes) -> None:
     with pytest.raises(DecodeError):
         wish(encoding_of("json", "geometry_msgs/Twist"), payload)
 

@@ -36,7 +36,7 @@ def shown(notices: Notices, *, newcomers: bool = False) -> list[str]:
     return list(server.shown)
 
 
-def test_a_text_is_repeated_only_after_a_while_and_a_lasting_one_always(
+def test_a_notice_is_repeated_only_after_a_while_and_a_lasting_one_always(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     notices, again_ns = Notices(lambda text: None, lambda: None), int(NS_PER_S / AGAIN.hz)
@@ -47,7 +47,7 @@ def test_a_text_is_repeated_only_after_a_while_and_a_lasting_one_always(
     assert shown(notices) == ["too slow", "gone", "gone", "too slow", "gone"]
 
 
-def test_a_newcomer_gets_the_statuses_that_last_until_they_are_over() -> None:
+def test_a_new_viewer_gets_the_lasting_statuses_until_they_are_over() -> None:
     notices = Notices(lambda text: None, lambda: None)
     notices.say("error", "daemon", "gone", stays="daemon")
     notices.say("info", "set", "done")
@@ -70,7 +70,7 @@ def test_the_newest_notices_wait_for_the_viewers_and_each_wakes_the_main_thread(
 # why commands do not drive
 
 
-def test_the_first_moment_is_no_news() -> None:
+def test_an_objection_is_reported_only_after_a_delay() -> None:
     told = Objections()
     assert not told.look(WHY, 0)
     assert not told.look(WHY, OBJECTS_NS - 1)
@@ -78,7 +78,7 @@ def test_the_first_moment_is_no_news() -> None:
     assert told.told == WHY
 
 
-def test_the_condition_is_reported_once_and_taken_back_when_over() -> None:
+def test_an_objection_is_reported_once_and_withdrawn_when_it_is_over() -> None:
     told = Objections()
     changes = [told.look(WHY if n < 20 else "", n * OBJECTS_NS) for n in range(30)]
     assert changes.count(True) == 2
@@ -87,7 +87,7 @@ def test_the_condition_is_reported_once_and_taken_back_when_over() -> None:
     assert told.told == ""
 
 
-def test_another_reason_is_reported_at_once() -> None:
+def test_another_objection_is_reported_without_a_delay() -> None:
     told = Objections()
     told.look(WHY, 0)
     told.look(WHY, OBJECTS_NS)
@@ -95,6 +95,6 @@ def test_another_reason_is_reported_at_once() -> None:
     assert told.told == "fault"
 
 
-def test_what_is_over_soon_is_never_told() -> None:
+def test_an_objection_that_is_over_soon_is_never_reported() -> None:
     told = Objections()
     assert not any(told.look(WHY if n % 2 else "", n * (OBJECTS_NS - 1)) for n in range(20))

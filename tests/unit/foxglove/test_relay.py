@@ -40,7 +40,7 @@ def names(news: News, said: Events) -> list[str]:
     return [line.name for line in news.of(said)]
 
 
-def test_who_opens_the_log_gets_all_that_is_still_known() -> None:
+def test_the_first_answer_gives_all_stored_events() -> None:
     lines = News().of(events(3))
     assert [(line.stamp.sec, line.level, line.name) for line in lines] == [
         (0, 30, "mode0"),
@@ -52,26 +52,26 @@ def test_who_opens_the_log_gets_all_that_is_still_known() -> None:
 
 
 @each(("before", "now"), [(3, 4), (3, 3), (0, 5), (19, 23), (40, 60), (40, 55)])
-def test_each_is_reported_once(before: int, now: int) -> None:
+def test_each_event_is_reported_once(before: int, now: int) -> None:
     news = News()
     news.of(events(before))
     assert names(news, events(now)) == [f"mode{n}" for n in range(before, now)]
 
 
-def test_those_that_nobody_kept_are_gone() -> None:
+def test_events_that_the_daemon_no_longer_stores_are_skipped() -> None:
     news = News()
     news.of(events(10))
     assert names(news, events(100)) == [f"mode{n}" for n in range(80, 100)]
 
 
-def test_an_answer_that_is_older_than_what_came_by_itself_tells_nothing() -> None:
+def test_an_answer_older_than_the_last_message_reports_no_event() -> None:
     news = News()
     news.of(events(10))
     assert names(news, events(9)) == []
     assert names(news, events(11)) == ["mode10"]
 
 
-def test_one_that_goes_on_brings_nothing_old_back() -> None:
+def test_an_event_that_is_updated_does_not_report_older_events_again() -> None:
     news, fault = News(), events(1).events[0]
     missed = LogEvent(Time(5), "periods_missed", "warning", "3 more periods", "", 1)
     news.of(Events(Time(5), 2, [fault, missed]))
@@ -79,7 +79,7 @@ def test_one_that_goes_on_brings_nothing_old_back() -> None:
     assert names(news, Events(Time(8), 4, [fault, later])) == ["periods_missed"]
 
 
-def test_another_daemon_begins_anew() -> None:
+def test_a_restarted_daemon_s_events_are_reported_from_the_first() -> None:
     news = News()
     news.of(events(10))
     later = replace(events(2, "second"), stamp=Time(11))
@@ -114,7 +114,7 @@ def test_a_source_commands_on_its_native_keys_and_those_of_ros() -> None:
     assert len(nav) == 4 + 1 + 2  # over rmw, a topic with two types has two keys
 
 
-def test_all_keys_of_ros_that_command_are_somebody_s() -> None:
+def test_every_ros_command_key_belongs_to_a_source() -> None:
     ros = RosConfig()
     heard = {key for source in SOURCES.values() for key in found(source, ros)}
     others = ("imu", "speed_limit")
@@ -137,7 +137,7 @@ def test_a_twist_is_reported_with_the_time_it_came(
 
 
 @pytest.mark.parametrize("message", [TWIST, STAMPED], ids=["plain", "stamped"])
-def test_a_twist_of_ros_is_told_alike(message: Twist | TwistStamped) -> None:
+def test_a_twist_over_ros_is_decoded_the_same_way(message: Twist | TwistStamped) -> None:
     name = f"geometry_msgs::msg::dds_::{type(message).__name__}_"
     every = found("nav", RosConfig()).items()
     fit = [way for key, way in every if way.via == "bridge" or f"/{name}/" in key]
@@ -147,7 +147,7 @@ def test_a_twist_of_ros_is_told_alike(message: Twist | TwistStamped) -> None:
 
 
 @pytest.mark.parametrize("form", FORMATS)
-def test_wheel_speeds_are_told_as_the_twist_they_are(form: Format) -> None:
+def test_wheel_speeds_are_shown_as_the_equivalent_twist(form: Format) -> None:
     wheels = JointState(name=NAMES, velocity=[6.0] * 4)
     told = read(encode(wheels, form), Way("wheel_cmd/ros2_control"))
     assert told.twist.linear.x == pytest.approx(0.3)
@@ -175,6 +175,8 @@ def test_wheels_and_frame_are_those_of_this_robot() -> None:
         (encode(TWIST, "json"), False),
     ],
 )
-def test_what_the_daemon_refuses_is_no_command_here(payload: bytes, put: bool) -> None:
+def test_a_payload_that_the_daemon_refuses_is_not_shown_as_a_command(
+    payload: bytes, put: bool
+) -> None:
     with pytest.raises(DecodeError):
         read(payload, put=put)

@@ -24,12 +24,12 @@ def test_each_source_has_a_topic_of_its_own() -> None:
     assert found["/log"] == "events"
 
 
-def test_a_namespace_is_in_front_of_all() -> None:
+def test_a_namespace_precedes_every_topic() -> None:
     config = replace(Config(), ros=replace(Config().ros, namespace="robot1"))
     assert all(topic.startswith("/robot1/") for topic in topics(config))
 
 
-def test_what_the_robot_does_not_say_is_not_offered() -> None:
+def test_topics_that_the_robot_does_not_publish_are_not_offered() -> None:
     quiet = replace(Config(), odometry=replace(Config().odometry, publish_tf=False))
     assert "/tf" in topics(Config())
     assert "/tf" not in topics(quiet)

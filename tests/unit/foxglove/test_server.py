@@ -100,7 +100,7 @@ def test_a_change_that_fails_gives_the_viewers_the_present_value_and_the_reason(
     assert words() == ["not set: no answer from the daemon"]
 
 
-def test_changes_beyond_the_limit_are_refused_in_words() -> None:
+def test_changes_beyond_the_limit_are_refused_with_a_reason() -> None:
     robot = Robot()
     made, words = of_robot(robot)
     for _ in range(WISHES + 1):
@@ -128,7 +128,7 @@ def test_without_a_follower_the_robot_is_not_queried(monkeypatch: pytest.MonkeyP
     assert made.refresh(here=True) == {}
 
 
-def test_they_are_the_settings_that_may_be_set_and_no_others() -> None:
+def test_the_parameters_are_exactly_the_settings_that_may_be_set() -> None:
     single = {key for key in LIVE if "*" not in key}
     timeouts = {
         f"commands.sources.{name}.timeout"
@@ -137,7 +137,7 @@ def test_they_are_the_settings_that_may_be_set_and_no_others() -> None:
     assert set(NOW) == single | timeouts
 
 
-def test_lists_are_lists_as_the_protocol_wants_them() -> None:
+def test_parameter_values_have_only_types_of_the_protocol() -> None:
     assert {type(value) for value in NOW.values()} <= {float, int, str, bool, list}
 
 
@@ -149,11 +149,11 @@ def test_lists_are_lists_as_the_protocol_wants_them() -> None:
         (["rates.odom", "no.such"], {"rates.odom"}),
     ],
 )
-def test_who_names_none_gets_all(names: list[str], found: set[str]) -> None:
+def test_a_request_gets_the_named_parameters_or_all(names: list[str], found: set[str]) -> None:
     assert set(asked(NOW, names)) == found
 
 
-def test_changes_are_the_settings_with_another_value() -> None:
+def test_changes_are_only_settings_with_another_value() -> None:
     later = NOW | {"rates.odom": 50.0, "log.level": "debug"}
     assert changes(NOW, later) == {"rates.odom": 50.0, "log.level": "debug"}
     assert changes(later, later) == {}

@@ -86,7 +86,7 @@ def program(monkeypatch: pytest.MonkeyPatch) -> Iterator[Program]:
     program.close()
 
 
-def test_a_number_is_asked_for_until_it_is_one_within_its_bounds(program: Program) -> None:
+def test_a_number_is_asked_for_until_it_is_valid_and_within_its_bounds(program: Program) -> None:
     program.answers = ["far", 0.1, -2, None, "1,75"]
     with program.hears(JsonPrompt()) as person:
         assert person.number(DISTANCE) == 1.75
@@ -97,7 +97,7 @@ def test_a_number_is_asked_for_until_it_is_one_within_its_bounds(program: Progra
     }  # fmt: skip
 
 
-def test_no_value_is_what_is_usual(program: Program) -> None:
+def test_an_empty_answer_is_the_default(program: Program) -> None:
     program.answers = [None]
     with program.hears(JsonPrompt()) as person:
         assert person.number(OPTIONAL) == 0.0
@@ -115,7 +115,7 @@ def test_nothing_but_start_starts_a_leg_and_no_key_from_before_stops_it(program:
     assert program.said[1]["wrong"] == "answer with one of: start"
 
 
-def test_a_key_on_the_heels_of_the_start_stops(program: Program) -> None:
+def test_a_key_right_after_the_start_stops(program: Program) -> None:
     def both(number: int) -> None:
         program.say({"answer": number, "value": "start"}, {"key": True})
 
@@ -126,7 +126,7 @@ def test_a_key_on_the_heels_of_the_start_stops(program: Program) -> None:
         assert person.keys(0.01) == ""
 
 
-def test_what_is_no_answer_to_what_is_asked_leaves_the_question_open(program: Program) -> None:
+def test_a_line_that_does_not_answer_the_question_leaves_it_open(program: Program) -> None:
     def noise(number: int) -> None:
         program.say(raw=b'\xff\n[]\n{"answer": "1"}\n{"answer": 1, "value": {}}\n\n')
         program.say({"answer": number + 1, "value": "start"}, {"answer": -1}, {})
@@ -143,13 +143,13 @@ def interrupted(program: Program, do: Callable[[], object]) -> None:
         do()
 
 
-def test_the_end_of_the_input_ends_it_also_while_nothing_is_asked(program: Program) -> None:
+def test_the_end_of_the_input_ends_the_prompt_also_without_a_question(program: Program) -> None:
     with program.hears(JsonPrompt()) as person:
         program.answers = [lambda number: program.hang_up()]
         interrupted(program, lambda: person.ask("lifted?", ("lifted",)))
 
 
-def test_it_ends_although_nobody_is_there_to_be_told(
+def test_the_prompt_ends_even_if_standard_error_is_closed(
     program: Program, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The parent program has died, so its end of standard error is closed as well."""
@@ -162,7 +162,7 @@ def test_it_ends_although_nobody_is_there_to_be_told(
         interrupted(program, lambda: person.ask("lifted?", ("lifted",)))
 
 
-def test_it_ends_although_nobody_reads_what_it_asks(program: Program) -> None:
+def test_the_prompt_ends_even_if_its_output_is_not_read(program: Program) -> None:
     """The parent program hangs while its pipe is full, and later disappears."""
     reader, writer = os.pipe()
     fcntl.fcntl(writer, fcntl.F_SETPIPE_SZ, 4096)
@@ -176,7 +176,7 @@ def test_it_ends_although_nobody_reads_what_it_asks(program: Program) -> None:
         os.read(reader, 4096)
 
 
-def test_what_is_nested_too_deep_leaves_the_question_open(program: Program) -> None:
+def test_a_line_with_too_deep_nesting_leaves_the_question_open(program: Program) -> None:
     with program.hears(JsonPrompt()) as person:
 
         def nested(number: int) -> None:
@@ -187,7 +187,9 @@ def test_what_is_nested_too_deep_leaves_the_question_open(program: Program) -> N
         assert person.ask("lifted?", ("lifted",)) == "lifted"
 
 
-def test_a_line_without_an_end_ends_it(program: Program, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_line_without_an_end_ends_the_prompt(
+    program: Program, capfd: pytest.CaptureFixture[str]
+) -> None:
     with program.hears(JsonPrompt()) as person:
 
         def flood(number: int) -> None:
@@ -199,7 +201,7 @@ def test_a_line_without_an_end_ends_it(program: Program, capfd: pytest.CaptureFi
     assert "a line on standard input has more than 65536 bytes" in capfd.readouterr().err
 
 
-def test_silence_ends_what_moves_and_signs_of_life_do_not(
+def test_silence_of_the_program_ends_a_motion_and_keepalives_continue_it(
     program: Program, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(json_prompt, "HEARD_S", 0.25)
@@ -216,7 +218,7 @@ def test_silence_ends_what_moves_and_signs_of_life_do_not(
     )
 
 
-def test_a_question_waits_for_a_person_for_as_long_as_he_takes(
+def test_a_question_waits_without_a_timeout(
     program: Program, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(json_prompt, "HEARD_S", 0.05)
@@ -231,7 +233,7 @@ def test_a_question_waits_for_a_person_for_as_long_as_he_takes(
         assert person.number(DISTANCE) == 1.0
 
 
-def test_what_is_found_is_told_as_it_is_made_with_how_far_it_is(program: Program) -> None:
+def test_findings_are_reported_as_they_are_made_with_the_progress(program: Program) -> None:
     with program.hears(JsonPrompt()) as person:
         person.begin("port sim", simulated=True)
         person.doing("a motor turns")
@@ -257,7 +259,7 @@ OFFERED = {"mcu.baud_rate": 57600}
 
 
 @pytest.mark.parametrize(("answer", "text"), [("write", "57600"), ("leave", "# mine\n")])
-def test_the_lines_are_written_when_that_is_wanted(
+def test_the_offered_lines_are_written_only_if_the_answer_is_write(
     program: Program, tmp_path: Path, answer: str, text: str
 ) -> None:
     file = tmp_path / "acsard.toml"
@@ -270,7 +272,7 @@ def test_the_lines_are_written_when_that_is_wanted(
     assert text in file.read_text()
 
 
-def test_what_cannot_be_written_is_not_asked_for_and_says_why(
+def test_an_unwritable_result_is_not_offered_and_has_a_reason(
     program: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

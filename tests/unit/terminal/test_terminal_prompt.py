@@ -49,7 +49,7 @@ def types(monkeypatch: pytest.MonkeyPatch) -> Iterator[Types]:
     os.close(master)
 
 
-def test_a_number_is_asked_for_until_it_is_one_within_its_bounds(
+def test_a_number_is_asked_for_until_it_is_valid_and_within_its_bounds(
     types: Types, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with one_by_one():
@@ -60,7 +60,7 @@ def test_a_number_is_asked_for_until_it_is_one_within_its_bounds(
     assert capsys.readouterr().err.count("from 0.5 to 3") == 4
 
 
-def test_enter_alone_is_what_is_usual(types: Types) -> None:
+def test_enter_alone_is_the_default(types: Types) -> None:
     with one_by_one():
         person = TerminalPrompt()
         types("\n")
@@ -68,9 +68,7 @@ def test_enter_alone_is_what_is_usual(types: Types) -> None:
 
 
 @pytest.mark.parametrize("asked", [lambda p: p.number(DISTANCE), lambda p: p.start("Go.")])
-def test_q_leaves_wherever_it_is_asked(
-    types: Types, asked: Callable[[TerminalPrompt], object]
-) -> None:
+def test_q_quits_at_every_question(types: Types, asked: Callable[[TerminalPrompt], object]) -> None:
     with one_by_one():
         person = TerminalPrompt()
         types("q\n")
@@ -95,7 +93,7 @@ def test_nothing_but_enter_starts_a_leg(types: Types) -> None:
         assert person.keys(5.0) == " "
 
 
-def test_keys_come_one_by_one_and_the_terminal_is_left_as_it_was(types: Types) -> None:
+def test_keys_are_read_singly_and_the_terminal_mode_is_restored(types: Types) -> None:
     before = termios.tcgetattr(sys.stdin)
     with one_by_one():
         person = TerminalPrompt()
@@ -105,21 +103,21 @@ def test_keys_come_one_by_one_and_the_terminal_is_left_as_it_was(types: Types) -
     assert termios.tcgetattr(sys.stdin) == before
 
 
-def test_nobody_measures_nothing() -> None:
+def test_without_a_prompt_an_optional_number_is_0_and_a_required_one_is_an_error() -> None:
     assert NoPrompt().number(OPTIONAL) == 0.0
     with pytest.raises(NobodyError, match=re.escape("leave --yes out")):
         NoPrompt().number(DISTANCE)
 
 
 @pytest.mark.parametrize(("as_json", "shown"), [(False, "robot acsar\n"), (True, "")])
-def test_the_subject_is_left_out_of_the_output_of_one_object(
+def test_the_subject_is_not_printed_if_the_output_is_one_json_object(
     as_json: bool, shown: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     TerminalPrompt(as_json).begin("robot acsar", simulated=False)
     assert capsys.readouterr().out == shown
 
 
-def test_a_row_has_the_verdict_what_it_means_and_the_mend() -> None:
+def test_a_row_has_the_verdict_the_meaning_and_the_remedy() -> None:
     finding = Finding("watchdog", "FAIL", "none", "it drives on " * 20, "give it one")
     head, *rest = plain(row(finding), width=100).splitlines()
     assert head == "FAIL    watchdog               none"

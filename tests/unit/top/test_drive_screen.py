@@ -36,7 +36,7 @@ def texts(seen: Teleop, width: int, height: int | None = 24) -> list[str]:
 
 
 @each("width", WIDTHS)
-def test_at_every_width_the_reason_is_whole_the_pose_has_units_and_the_help_is_there(
+def test_every_width_shows_the_whole_reason_the_units_of_the_pose_and_the_help(
     width: int,
 ) -> None:
     shown = texts(of(mode="waiting", reason=LONG, x=1.5, y=-2.25, yaw=1.0), width)
@@ -66,7 +66,7 @@ def test_help_stays_on_a_screen_of_few_lines() -> None:
     assert shown[-len(HELP) :] == list(HELP)
 
 
-def test_a_refused_key_that_is_held_is_to_be_let_go() -> None:
+def test_a_refused_key_that_is_held_must_be_released() -> None:
     why = "send a zero first: teleop must send a zero before it can drive"
     told = " ".join(news(replace(SEEN, objection=why), 200))
     assert f"your keys do not drive the robot: {why} (release the key, and press it again)" in told
@@ -89,7 +89,7 @@ def test_a_silence_is_reported_with_its_length() -> None:
 
 
 @each("mode", list(Mode))
-def test_the_mode_is_reported_once(mode: Mode) -> None:
+def test_the_mode_is_not_repeated_in_its_reason(mode: Mode) -> None:
     seen = of(mode=mode.value, reason=f"{mode.value}: because")
     assert texts(seen, 80)[1].split() == [mode.value.upper(), "because"]
     assert news(seen, 80)[0].startswith(f"{mode.value}: because; ")
@@ -104,7 +104,7 @@ def test_without_a_screen_no_word_and_no_figure_is_broken_at_the_edge(width: int
     assert sum("turn -0.60 rad/s" in one for one in said) == 1
 
 
-def test_the_last_word_says_whether_the_robot_stands_and_where() -> None:
+def test_the_final_report_says_whether_the_robot_stands_and_where() -> None:
     still = {"linear": 0.0, "angular": 0.0, "wheels": [0.0] * 4}
     assert told(parting(of(**still), 80)).startswith(
         "drive ended: the robot stands; driving: commanded"
@@ -128,7 +128,9 @@ def test_the_last_word_says_whether_the_robot_stands_and_where() -> None:
     st.integers(20, 200),
     st.integers(1, 60),
 )
-def test_it_holds_whatever_comes(text: str, number: float, width: int, height: int) -> None:
+def test_any_text_and_number_fits_the_screen_and_is_printable(
+    text: str, number: float, width: int, height: int
+) -> None:
     seen = of(mode=text[:9], reason=text, x=number, linear=number, yaw=0.0)
     seen = replace(seen, robot_id=text, objection=text)
     shown = texts(seen, width, height)

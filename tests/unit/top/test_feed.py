@@ -72,14 +72,14 @@ def at(sec: int, lines: int = 1300) -> RobotState:
     return replace(STATE, stamp=Time(sec), counters=counters)
 
 
-def test_the_state_of_this_moment_is_there_without_one_that_comes(robot: Robot) -> None:
+def test_a_query_gets_the_present_state_before_one_is_published(robot: Robot) -> None:
     feed = feed_of(robot)
     assert feed.seen().state is None
     feed.ask()
     assert feed.seen().state == STATE
 
 
-def test_asked_twice_it_has_two_to_take_rates_from(robot: Robot) -> None:
+def test_two_queries_give_two_states_to_compute_rates(robot: Robot) -> None:
     feed = feed_of(robot)
     robot.state = BEFORE
     feed.ask()
@@ -88,7 +88,7 @@ def test_asked_twice_it_has_two_to_take_rates_from(robot: Robot) -> None:
     assert (feed.seen().before, feed.seen().state) == (BEFORE, STATE)
 
 
-def test_what_passed_between_two_states_is_told_by_our_own_clock(robot: Robot) -> None:
+def test_the_time_between_two_states_is_measured_by_the_viewer_s_clock(robot: Robot) -> None:
     feed = feed_of(robot)
     assert feed.seen().passed == 0.0
     feed.ask()
@@ -99,7 +99,7 @@ def test_what_passed_between_two_states_is_told_by_our_own_clock(robot: Robot) -
 
 
 @pytest.mark.parametrize("sec", [999, 1001])
-def test_of_the_answer_and_what_came_meanwhile_the_later_counts(robot: Robot, sec: int) -> None:
+def test_the_later_of_an_answer_and_a_published_state_is_shown(robot: Robot, sec: int) -> None:
     feed = feed_of(robot)
     robot.state = at(1000)
     robot.tells(at(sec, lines=1300 + sec - 1000))
@@ -110,7 +110,7 @@ def test_of_the_answer_and_what_came_meanwhile_the_later_counts(robot: Robot, se
     assert told.stamp == Time(max(1000, sec))
 
 
-def test_a_put_on_a_wildcard_is_no_state(robot: Robot) -> None:
+def test_a_put_on_a_wildcard_is_not_a_state(robot: Robot) -> None:
     feed = feed_of(robot)
     robot.tells(STATE, "acsard/**")
     feed.poll()

@@ -27,7 +27,7 @@ from tests.unit.top.screens import STATE, sample_of
 ROW = Row("robot1", True, replace(STATE, reason="driving: commanded by app"), 0.1, "0.1.0")
 
 
-def test_a_line_has_all_of_a_robot() -> None:
+def test_a_line_has_every_column_of_a_robot() -> None:
     head, line = table([ROW], 120)
     assert head.split() == [one for one in HEADS if one != "BATTERY"]
     assert line.split() == [
@@ -80,7 +80,7 @@ def test_the_column_of_the_battery_is_there_if_a_robot_has_one() -> None:
     assert not any("WARNING" in line for line in lines)
 
 
-def test_the_words_of_each_warning_follow_all_of_them() -> None:
+def test_the_details_of_each_warning_follow_the_list_of_warnings() -> None:
     expiry = "expires in 10 days (certificate of the authority)"
     state = replace(READY, recording_error=FULL, certificate_expiry=expiry, settings_differ=DIFFER)
     (_, line) = table([replace(ROW, state=state)], 300)
@@ -109,7 +109,7 @@ def test_the_reason_of_a_fault_comes_before_the_warnings() -> None:
     assert "  a wheel is stuck; WARNING: settings differ; settings: limits" in line
 
 
-def test_a_warning_that_the_reason_says_is_not_repeated() -> None:
+def test_a_warning_that_is_in_the_reason_is_not_repeated() -> None:
     why = "emergency stop pressed at the robot; release it at the robot, then call srv/clear"
     state = replace(STATE, mode="stopped", reason=why, emergency_stop="pressed")
     (_, line) = table([replace(ROW, state=state)], 200)
@@ -155,7 +155,7 @@ def test_a_robot_that_is_gone_or_silent_is_reported(row: Row, words: str) -> Non
     assert table([row], 120)[1].endswith(words)
 
 
-def test_a_narrow_terminal_has_what_matters_most() -> None:
+def test_a_narrow_terminal_shows_the_most_important_columns() -> None:
     head, line = table([ROW], 40)
     assert head.split() == ["ROBOT", "MODE", "M/S", "SEEN", "WHY"]
     assert len(line) <= 40
@@ -180,7 +180,7 @@ def test_two_robots_look_different_at_every_width(ids: tuple[str, str], width: i
         assert [first, second] == sorted(ids)
 
 
-def test_of_a_narrow_name_the_middle_is_left_out_and_why_keeps_its_room() -> None:
+def test_a_long_name_is_shortened_in_the_middle_and_the_reason_keeps_its_width() -> None:
     shown = table(rows_of("warehouse-west-1", "warehouse-west-2"), 40)
     assert [line.split()[0] for line in shown[1:]] == ["wareh…west-1", "wareh…west-2"]
     wide = table(rows_of("robots-in-the-warehouse-west-0-1"), 80)[1]
@@ -202,7 +202,7 @@ IN_NEED = {
 
 
 @each("need", IN_NEED)
-def test_of_more_robots_than_lines_the_one_that_needs_a_person_is_shown(need: str) -> None:
+def test_a_robot_that_needs_help_is_shown_first_if_the_fleet_exceeds_the_screen(need: str) -> None:
     rows = [replace(ROW, robot_id=f"robot{n:02d}") for n in range(29)]
     shown = table([*rows, replace(IN_NEED[need], robot_id="robot99")], 120, 22)
     assert shown[1].startswith("robot99")
@@ -223,7 +223,9 @@ def test_more_robots_than_lines_are_counted() -> None:
 
 
 @given(st.text(max_size=80), st.floats(), st.floats(0, 1e12), st.integers(20, 200))
-def test_it_holds_whatever_comes(text: str, number: float, age: float, width: int) -> None:
+def test_any_text_and_number_fits_the_width_and_is_printable(
+    text: str, number: float, age: float, width: int
+) -> None:
     state = replace(STATE, mode=text, reason=text, link=text, linear=number)
     for line in table([Row(text, True, state, age, text)], width):
         assert len(line) <= width
@@ -285,7 +287,7 @@ def fleet_of(
 INFO = Info("robot1", "0.1", 1, "sim", simulated=True, rate=100.0, listen=[], connect=[])
 
 
-def test_robots_beyond_what_is_kept_are_said_to_be_left_out(session: Session) -> None:
+def test_robots_beyond_the_limit_are_reported_as_left_out(session: Session) -> None:
     fleet = fleet_of(session)
     for number in range(3):
         session.comes(f"robot{number}")
@@ -297,7 +299,9 @@ def test_robots_beyond_what_is_kept_are_said_to_be_left_out(session: Session) ->
     assert "--id" in fleet.more
 
 
-def test_who_is_gone_for_longest_makes_room_for_who_comes(session: Session, clock: Clock) -> None:
+def test_the_robot_that_is_gone_for_longest_makes_room_for_a_new_one(
+    session: Session, clock: Clock
+) -> None:
     fleet = fleet_of(session, ("robot0", "*"))
     for number in range(3):
         session.comes(f"robot{number}")
@@ -309,7 +313,7 @@ def test_who_is_gone_for_longest_makes_room_for_who_comes(session: Session, cloc
     assert fleet.more == ""
 
 
-def test_a_robot_whose_token_goes_is_not_here(session: Session) -> None:
+def test_a_robot_whose_liveliness_token_is_deleted_is_not_present(session: Session) -> None:
     fleet = fleet_of(session)
     session.comes("robot1")
     session.comes("robot1", zenoh.SampleKind.DELETE)
@@ -317,7 +321,7 @@ def test_a_robot_whose_token_goes_is_not_here(session: Session) -> None:
     assert fleet.more == ""
 
 
-def test_the_version_of_a_robot_that_publishes_its_state_often_is_asked_for(
+def test_the_version_of_a_robot_that_publishes_its_state_often_is_queried(
     session: Session, clock: Clock
 ) -> None:
     fleet = fleet_of(session, ("robot1",), ("robot1",))
@@ -352,7 +356,7 @@ def test_a_state_from_before_a_suspend_is_old(
         (("*",), ("robot1",), ("robot1",), False),  # another robot may still appear
     ],
 )
-def test_it_is_whole_once_each_who_was_named_is_here_and_has_said_all(
+def test_the_fleet_is_complete_once_each_named_robot_is_present_and_has_answered(
     session: Session, clock: Clock, ids: tuple[str, ...], answering: tuple[str, ...],
     here: Sequence[str], whole: bool,
 ) -> None:  # fmt: skip
@@ -394,7 +398,7 @@ def told(fleet: Roster, clock: Clock, seconds: float) -> str:
     return table(fleet.rows(), 120)[1]
 
 
-def test_a_robot_whose_state_only_a_storage_still_has_is_gone_and_not_heard(
+def test_a_robot_whose_state_only_a_storage_has_is_gone_and_was_never_seen(
     session: Session, clock: Clock
 ) -> None:
     robot: Any = Remembers(session)

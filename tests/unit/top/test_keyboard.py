@@ -51,14 +51,14 @@ def pressed(key: str, now: float) -> Keyboard:
     return keys
 
 
-def test_it_opens_with_three_zeros_and_falls_silent() -> None:
+def test_the_keyboard_starts_with_three_zeros_and_then_sends_nothing() -> None:
     keys = Keyboard(0.5, 2.0)
     assert [keys.wish(n / 20) for n in range(6)] == [REST] * 3 + [None] * 3
     assert ZEROS == 3
 
 
 @each(("key", "linear", "angular"), MOVES)
-def test_each_key_drives_its_way(key: str, linear: int, angular: int) -> None:
+def test_each_key_drives_in_its_direction(key: str, linear: int, angular: int) -> None:
     keys = pressed(key, 10.0)
     assert keys.wish(10.0) == Twist(0.5 * linear, 2.0 * angular)
 
@@ -100,7 +100,7 @@ def test_two_taps_are_no_held_key() -> None:
     assert keys.wish(10.15 + HOLD_S - 0.001) == Twist(0.5, 0.0)
 
 
-def test_another_key_changes_the_way_at_once() -> None:
+def test_another_key_changes_the_direction_immediately() -> None:
     keys = pressed("i", 10.0)
     keys.press("j", 10.1)
     assert keys.wish(10.1) == Twist(0.0, 2.0)
@@ -108,7 +108,7 @@ def test_another_key_changes_the_way_at_once() -> None:
 
 
 @each("key", [" ", "k", "p", "\x1b", "\x1b[H", "I", "\n", "�", ""])
-def test_any_other_key_stops_at_once(key: str) -> None:
+def test_any_other_key_stops_immediately(key: str) -> None:
     keys = pressed("i", 10.0)
     keys.press(key, 10.1)
     assert [keys.wish(10.1) for _ in range(4)] == [REST] * 3 + [None]
@@ -130,7 +130,7 @@ def test_speed_keys_change_ten_percent_and_do_not_move(
     assert keys.wish(10.0) is None
 
 
-def test_a_speed_key_while_driving_counts_at_once_and_does_not_hold_longer() -> None:
+def test_a_speed_key_while_driving_acts_immediately_and_does_not_extend_the_hold() -> None:
     keys = pressed("u", 10.0)
     keys.press("w", 10.5)
     assert keys.wish(10.5) == Twist(0.5 * 1.1, 2.0)
@@ -153,12 +153,12 @@ def test_a_speed_key_while_driving_counts_at_once_and_does_not_hold_longer() -> 
         ("�,", ["�", ","]),
     ],
 )
-def test_what_a_terminal_gives_is_cut_into_keys(text: str, keys: list[str]) -> None:
+def test_terminal_input_is_split_into_keys(text: str, keys: list[str]) -> None:
     assert split(text) == keys
 
 
 @given(st.text(alphabet="i,k\x1b[ABé", max_size=40))
-def test_cutting_loses_nothing(text: str) -> None:
+def test_the_split_into_keys_loses_no_character(text: str) -> None:
     keys = split(text)
     assert "".join(keys) == text
     assert all(len(key) == 1 or key.startswith("\x1b[") for key in keys)
@@ -332,7 +332,7 @@ def test_a_space_stops_at_the_next_step(monkeypatch: pytest.MonkeyPatch) -> None
     assert robot.sent[-2:] == [0.5, 0.0]
 
 
-def test_the_operator_is_told_that_a_robot_is_silent(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_operator_is_informed_that_a_robot_is_silent(monkeypatch: pytest.MonkeyPatch) -> None:
     robot = Robot(STATE)
     drive = Drive(robot, monkeypatch)
     drive.step("i")
@@ -341,7 +341,7 @@ def test_the_operator_is_told_that_a_robot_is_silent(monkeypatch: pytest.MonkeyP
     assert drive.ride.seen().silent
 
 
-def test_the_operator_is_told_why_keys_have_no_effect(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_operator_is_informed_why_keys_have_no_effect(monkeypatch: pytest.MonkeyPatch) -> None:
     stopped = replace(STATE, mode="stopped", reason="stopped by request", source="")
     robot = Robot(stopped)
     drive = Drive(robot, monkeypatch)

@@ -65,6 +65,6 @@ def test_sources_that_do_not_fit_are_counted() -> None:
     assert any("more: source" in line for line in lines_of(of(sources=many), 40, 24))
 
 
-def test_what_grows_stands_out_here_too() -> None:
+def test_growing_counters_stand_out_on_a_narrow_screen() -> None:
     grown = of(counters=STATE.counters | {"missed_periods": 4})
     assert "\x1b[33mmissed periods 4\x1b[0m" in painted(grown, 40, None)

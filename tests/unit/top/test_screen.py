@@ -34,7 +34,7 @@ It clears the screen, sets the title, is markup, reverses direction, colours and
 # content of the screen
 
 
-def test_the_head_says_who_where_and_how_fresh() -> None:
+def test_the_head_shows_robot_address_version_and_age() -> None:
     head = lines_of(SEEN)[0]
     for told in ("acsar", "tcp/127.0.0.1:7448", "0.1.0", "seen 0.1 s ago", "q quits"):
         assert told in head
@@ -49,16 +49,16 @@ def test_every_mode_has_a_badge_of_its_colour_and_its_reason(mode: Mode) -> None
     assert re.search(rf"\x1b\[[0-9;]*{colour}m {mode.value.upper()} ", painted(seen))
 
 
-def test_trouble_and_driving_look_unlike_anything_else() -> None:
+def test_stopped_and_fault_share_a_style_that_no_other_mode_has() -> None:
     assert MODES["stopped"] == MODES["fault"]
     assert len({MODES[m] for m in ("driving", "ready", "waiting", "stopped", "inactive")}) == 5
 
 
-def test_the_reason_does_not_say_the_mode_again() -> None:
+def test_the_reason_does_not_repeat_the_mode() -> None:
     assert lines_of(SEEN)[1].strip() == "DRIVING   commanded by app"
 
 
-def test_a_long_reason_goes_on_below_and_moves_nothing() -> None:
+def test_a_long_reason_continues_below_and_moves_no_other_line() -> None:
     reason = (
         "the microcontroller's lines come 0.50 s apart; if it reports by its own clock, set "
         "mcu.reply_period = 0.50"
@@ -74,14 +74,14 @@ def test_a_long_reason_goes_on_below_and_moves_nothing() -> None:
 # no state for some time
 
 
-def test_before_the_first_state_it_says_what_it_waits_for() -> None:
+def test_before_the_first_state_the_screen_says_what_it_waits_for() -> None:
     assert lines_of(ScreenData("acsar", "tcp/x:1", None))[1] == (
         "waiting for the first state message of the daemon"
     )
 
 
 @pytest.mark.parametrize("state", [STATE, None])
-def test_silence_is_said_big(state: RobotState | None) -> None:
+def test_a_silent_robot_is_shown_by_three_red_lines(state: RobotState | None) -> None:
     seen = replace(SEEN, state=state, age=3.4, silent=True)
     assert "NOTHING RECEIVED FOR 3 s: does the daemon run?" in lines_of(seen)[2]
     assert painted(seen).count("41m") == 3  # three lines in red
@@ -93,7 +93,7 @@ def test_a_slow_state_is_not_silent_before_its_time() -> None:
     assert "NOTHING RECEIVED FOR 30 s" in lines_of(replace(SEEN, age=30.0, silent=True))[2]
 
 
-def test_what_was_known_before_the_silence_stays_dimmed() -> None:
+def test_the_last_values_before_a_silence_stay_dimmed() -> None:
     seen = replace(SEEN, age=100.0, silent=True)
     assert "NOTHING RECEIVED FOR 1 min 40 s" in lines_of(seen)[2]
     assert "+1.250 m" in line_with("yaw", seen)
@@ -110,7 +110,7 @@ def test_without_a_link_no_old_speed_is_shown(width: int) -> None:
     assert "▲" not in gone
 
 
-def test_messages_of_another_form_are_told_from_silence() -> None:
+def test_undecodable_messages_are_distinguished_from_silence() -> None:
     (told,) = [
         line
         for line in lines_of(replace(SEEN, age=3.0, undecodable=9, silent=True))
@@ -120,7 +120,7 @@ def test_messages_of_another_form_are_told_from_silence() -> None:
 
 
 @each("width", [40, 80])
-def test_a_warning_stands_below_the_mode_with_its_words(width: int) -> None:
+def test_a_warning_is_shown_below_the_mode_with_its_text(width: int) -> None:
     inputs = {"emergency_stop": "released", "bumpers": [False, False]}
     battery = BatterySummary(24.5, 87.0, -1.25, "ok")
     told = lines_of(of(mode="ready", recording_error="disk full", battery=battery, **inputs), width)
@@ -138,7 +138,7 @@ def test_more_warnings_take_one_line_of_a_wide_screen() -> None:
 # any message from the bus
 
 
-def test_a_usual_screen_fits_80_by_24_with_nothing_cut() -> None:
+def test_a_usual_screen_fits_80_by_24_without_truncation() -> None:
     four = [*STATE.sources, SourceState("spare", 1, None, "a command")]
     counters = dict.fromkeys(STATE.counters, 10**7) | {"lines_superseded": 12_345}
     told = lines_of(
@@ -153,12 +153,12 @@ def test_a_usual_screen_fits_80_by_24_with_nothing_cut() -> None:
     assert not any(line.endswith("…") for line in told)
 
 
-def test_a_larger_one_has_air_between_its_parts() -> None:
+def test_a_larger_screen_has_empty_lines_between_its_parts() -> None:
     assert lines_of(SEEN, 116, 40).count("") == 3
     assert lines_of(SEEN, 80, None) == lines_of(SEEN, 80, 40)
 
 
-def test_a_hostile_text_changes_nothing_but_its_own_place() -> None:
+def test_a_hostile_text_changes_only_its_own_field() -> None:
     source = SourceState(ENOUGH, 1, 0.0, ENOUGH)
     hostile = ScreenData(
         ENOUGH,
@@ -212,7 +212,7 @@ states = st.builds(
 @given(
     states, states | st.none(), number, anything, anything, st.integers(1, 140), st.integers(1, 50)
 )
-def test_any_state_fits_any_terminal_and_is_harmless_there(
+def test_any_state_fits_any_terminal_and_is_printable(
     state: RobotState,
     before: RobotState | None,
     age: float,

@@ -30,7 +30,7 @@ def test_a_robot_that_moves_is_a_line_a_second_and_one_at_rest_one_in_ten() -> N
     assert len(told(resting)) == 1
 
 
-def test_another_reason_is_reported_at_once_but_never_more_than_two_lines_a_second() -> None:
+def test_another_reason_is_reported_immediately_up_to_two_lines_a_second() -> None:
     stopped = replace(STATE, mode="stopped", reason="stopped by request")
     found = told([(0.0, STATE), (0.5, stopped), (0.6, STATE), (1.0, STATE)])
     assert [state.mode for state in found] == ["driving", "stopped", "driving"]
@@ -38,7 +38,7 @@ def test_another_reason_is_reported_at_once_but_never_more_than_two_lines_a_seco
     assert len(told(flickering)) <= 20
 
 
-def test_the_help_comes_again_before_news_shoves_it_off_the_terminal() -> None:
+def test_the_help_is_repeated_before_reports_scroll_it_off_the_terminal() -> None:
     page, shown = Page(), list[str]()
     for number in range(100):
         shown += page.with_help([f"news {number}", *["more of it"] * (number % 4)], 24)
@@ -48,7 +48,7 @@ def test_the_help_comes_again_before_news_shoves_it_off_the_terminal() -> None:
     assert shown[-4:-3] == ["news 99"]
 
 
-def test_a_file_has_the_help_once() -> None:
+def test_output_to_a_file_has_the_help_once() -> None:
     page = Page()
     assert page.with_help(["news"], NO_END) == [*HELP, "news"]
     assert page.with_help(["news"] * 1000, NO_END) == ["news"] * 1000

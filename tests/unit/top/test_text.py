@@ -28,7 +28,7 @@ from tests.each import each
         ("Größe 大", "Größe 大"),
     ],
 )
-def test_text_from_the_bus_keeps_what_is_plain_and_nothing_else(text: str, shown: str) -> None:
+def test_text_from_the_bus_keeps_only_printable_characters(text: str, shown: str) -> None:
     assert clean(text) == shown
 
 
@@ -55,7 +55,7 @@ def test_a_count_is_readable_however_large(number: int, text: str) -> None:
         (300, 200, -5.0, "    -/s"),  # the clock was set
     ],
 )
-def test_a_rate_that_cannot_be_told_is_not_made_up(
+def test_an_unknown_rate_is_not_invented(
     later: int, earlier: int, seconds: float, text: str
 ) -> None:
     assert rate(later, earlier, seconds) == text
@@ -72,7 +72,7 @@ def test_a_bar_is_as_long_as_the_value_and_never_longer_than_its_place(
     assert bar(value, 20.0, 6) == drawn
 
 
-def test_lines_are_put_together_to_their_width() -> None:
+def test_columns_are_joined_to_lines_of_the_full_width() -> None:
     line = rule(30, ((0, "pose"), (15, "wheels")))
     assert line.plain == "pose ───────── wheels ────────"
     assert cell_len(ends(labelled("a", "b"), labelled("c", "d"), 40).plain) == 40

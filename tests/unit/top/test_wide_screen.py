@@ -24,7 +24,7 @@ from tests.unit.top.screens import (
 )
 
 
-def test_first_contact_is_counted_beside_the_commands_and_is_no_refusal() -> None:
+def test_commands_of_new_senders_are_counted_as_commands_and_not_as_rejected() -> None:
     counters = {**STATE.counters, "commands_of_new_senders": 40}
     shown = lines_of(replace(SEEN, state=replace(STATE, counters=counters)))
     (line,) = [line for line in shown if "of new senders 40" in line]
@@ -47,13 +47,13 @@ def test_wheels_that_are_not_four_numbers_are_shown_as_far_as_they_go(wheels: li
     assert len(lines_of(of(wheels=wheels))) == 24 - 1
 
 
-def test_sources_tell_priority_age_and_what_they_wait_for() -> None:
+def test_sources_show_priority_age_and_what_they_wait_for() -> None:
     assert line_with("teleop").split() == ["teleop", "100", "never", "a", "command"]
     assert line_with("▶").split() == ["▶", "app", "50", "0.0", "s", "nothing:", "it", "drives"]
     assert "app has priority" in line_with("  nav")
 
 
-def test_a_source_that_is_heard_by_a_stopped_robot_is_not_said_to_drive() -> None:
+def test_a_source_of_a_stopped_robot_is_not_shown_as_driving() -> None:
     seen = of(mode="stopped", reason="stopped by request; call srv/clear")
     assert "▶" not in "".join(lines_of(seen))
     assert "the robot is stopped" in line_with("  app  ", seen)
@@ -92,7 +92,7 @@ def test_missed_periods_are_counted_and_stand_out_while_they_grow() -> None:
     assert "\x1b[33mmissed" not in painted(SEEN)
 
 
-def test_rejects_are_told_by_reason_and_stand_out_while_they_grow() -> None:
+def test_rejects_are_shown_by_reason_and_stand_out_while_they_grow() -> None:
     counters = {"line_malformed": 3, "line_implausible": 12, "command_stale": 4, "line_zero": 0}
     seen = of(counters=counters, refused="source nav: the twist contains NaN or infinity")
     assert line_with("rejected", seen).split(maxsplit=1)[1] == (
@@ -105,12 +105,12 @@ def test_rejects_are_told_by_reason_and_stand_out_while_they_grow() -> None:
 
 
 @each("does", ["used", "silent", "disagrees", "not believed"])
-def test_what_the_gyro_does_is_told_where_there_is_one(does: str) -> None:
+def test_the_state_of_the_gyro_is_shown_if_there_is_one(does: str) -> None:
     assert line_with("gyro", of(gyro=does)).split(maxsplit=1)[1].startswith(does)
     assert not any("gyro" in line for line in lines_of(SEEN))
 
 
-def test_the_track_that_was_learned_stands_beside_the_configured_one() -> None:
+def test_the_learned_track_is_shown_beside_the_configured_one() -> None:
     told = "learned 1.603 ± 0.032 (only reported), configured 1.000 (in use)"
     assert line_with("track", of(gyro="used", effective_track=told)).split(maxsplit=1)[1] == told
     assert not any("track" in line for line in lines_of(of(gyro="used")))
@@ -132,7 +132,7 @@ def test_the_link_is_reported_with_its_port() -> None:
     assert line_with("link ", replace(SEEN, info=None)).startswith("link up ─")
 
 
-def test_the_certificate_is_told_when_there_is_one() -> None:
+def test_the_certificate_is_shown_if_there_is_one() -> None:
     assert "certificate" not in "".join(lines_of(SEEN))
     assert "certificate valid for 700 days" in line_with(
         "link ", of(certificate_expiry="valid for 700 days")
@@ -141,7 +141,7 @@ def test_the_certificate_is_told_when_there_is_one() -> None:
     assert "certificate expired 3 days ago" in line_with("link ", ended)
 
 
-def test_each_figure_is_told_for_the_last_minute_and_since_the_start() -> None:
+def test_each_figure_is_shown_for_the_last_minute_and_since_the_start() -> None:
     for name in NAMES:
         told = re.split(r"\s{2,}|(?<=s) ", line_with(name).removeprefix(name).strip())
         assert told[-6:] == ["63 µs", "891 µs", "9.7 ms", "56 µs", "112 µs", "8.0 ms"]

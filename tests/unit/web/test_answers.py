@@ -39,7 +39,7 @@ def page(tmp_path: Path) -> Path:
     return page
 
 
-def test_a_file_goes_out_with_its_type_and_packed(page: Path) -> None:
+def test_a_file_is_sent_compressed_and_with_its_type(page: Path) -> None:
     file = Files(page).get("index.html")
     assert file is not None
     assert file.kind == "text/html; charset=utf-8"
@@ -48,7 +48,7 @@ def test_a_file_goes_out_with_its_type_and_packed(page: Path) -> None:
     assert len(file.packed) < len(file.body)
 
 
-def test_a_small_one_is_not_packed(page: Path) -> None:
+def test_a_small_file_is_not_compressed(page: Path) -> None:
     file = Files(page).get("small.js")
     assert file is not None
     assert file.packed is None
@@ -61,11 +61,11 @@ def test_a_small_one_is_not_packed(page: Path) -> None:
         "notes.txt", "missing.js", "", ".", "..", "a\0.js", "x" * 5000 + ".js",
     ],
 )  # fmt: skip
-def test_anything_else_is_not_there(page: Path, name: str) -> None:
+def test_any_other_path_is_not_found(page: Path, name: str) -> None:
     assert Files(page).get(name) is None
 
 
-def test_a_changed_file_is_another(page: Path) -> None:
+def test_a_changed_file_is_read_again(page: Path) -> None:
     files = Files(page)
     before = files.get("small.js")
     (page / "small.js").write_text("2")
@@ -76,7 +76,7 @@ def test_a_changed_file_is_another(page: Path) -> None:
     assert (after.body, after.tag != before.tag) == (b"2", True)
 
 
-def test_without_a_directory_there_is_nothing(tmp_path: Path) -> None:
+def test_without_a_directory_no_file_is_found(tmp_path: Path) -> None:
     assert Files(tmp_path / "none").get("index.html") is None
 
 
@@ -109,7 +109,7 @@ def test_a_page_that_the_browser_has_already_keeps_its_policy() -> None:
     assert policies[0].endswith(page.policy)
 
 
-def test_any_other_file_allows_nothing_within_itself() -> None:
+def test_any_other_file_allows_no_inline_script() -> None:
     file = Files().get("main.js")
     assert file is not None
     answer = sent(make_mocked_request("GET", "/page/main.js"), file)
@@ -117,7 +117,7 @@ def test_any_other_file_allows_nothing_within_itself() -> None:
     assert "default-src 'self'" in answer.headers["Content-Security-Policy"]
 
 
-def test_a_page_whose_stop_changed_is_another(page: Path) -> None:
+def test_a_page_whose_stop_script_changed_is_read_again(page: Path) -> None:
     files = Files(page)
     before = files.get("index.html")
     (page / "stop.js").write_text("stop(2)")
@@ -133,7 +133,7 @@ def test_a_page_without_its_stop_is_not_sent(page: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_report_is_unpacked_in_pieces_that_cost_little_memory() -> None:
+def test_a_report_is_decompressed_in_pieces_that_take_little_memory() -> None:
     for body in (b"".join(b"%d " % number for number in range(300_000)), bytes(10_000_000), b""):
         pieces = list(_unpacked(gzip.compress(body)))
         assert b"".join(pieces) == body

@@ -102,7 +102,7 @@ def test_a_row_has_its_value_its_range_and_when_it_may_change() -> None:
     assert "stands" in ROWS["limits.wheel_speed"].when
 
 
-def test_what_is_one_of_some_words_names_them() -> None:
+def test_a_setting_with_fixed_choices_lists_them() -> None:
     row = ROWS["log.level"]
     assert isinstance(row.choices, list)
     assert row.value in row.choices

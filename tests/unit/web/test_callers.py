@@ -43,7 +43,7 @@ MAINTAINER = Who("maintainer", HERE)
         ("::ffff:127.0.0.1", "127.0.0.1"),
     ],
 )
-def test_who_is_at_the_machine_is_here(peer: str, host: str) -> None:
+def test_a_browser_on_the_robot_s_machine_is_local(peer: str, host: str) -> None:
     assert place(Asked(peer, False, host), NAMES) == "here"
     assert place(Asked(peer, True, host), NAMES) == "here"
 
@@ -64,7 +64,7 @@ def test_who_is_at_the_machine_is_here(peer: str, host: str) -> None:
         (Asked("", True, ""), "host"),
     ],
 )
-def test_any_other_name_is_refused(asked: Asked, reason: str) -> None:
+def test_any_other_host_name_is_refused(asked: Asked, reason: str) -> None:
     with pytest.raises(RefusedError) as found:
         place(asked, NAMES)
     assert found.value.reason == reason
@@ -72,14 +72,14 @@ def test_any_other_name_is_refused(asked: Asked, reason: str) -> None:
 
 @each("secure", [False, True])
 @each("host", ["localhost:8080", "robot.local"])
-def test_who_comes_through_a_proxy_is_nobody_we_know(secure: bool, host: str) -> None:
+def test_a_request_through_a_proxy_is_refused(secure: bool, host: str) -> None:
     with pytest.raises(RefusedError, match="proxy") as found:
         place(Asked("127.0.0.1", secure, host, proxied=True), NAMES)
     assert found.value.reason == "proxy"
 
 
 @pytest.mark.parametrize("host", ["robot.local:8443", "Robot.Local", "192.168.1.7:8443"])
-def test_by_https_and_a_name_of_the_robot_s_one_is_away(host: str) -> None:
+def test_https_with_a_name_of_the_robot_is_remote(host: str) -> None:
     assert place(Asked("192.168.1.50", True, host), NAMES) == "away"
     # A client on the machine that uses the public name needs a token like others.
     assert place(Asked("127.0.0.1", True, host), NAMES) == "away"
@@ -95,7 +95,7 @@ def test_by_https_and_a_name_of_the_robot_s_one_is_away(host: str) -> None:
         (False, "localhost:8080", None, "none"),  # typed into the address bar
     ],
 )
-def test_our_own_page_and_programs_may(
+def test_the_robot_s_own_page_and_programs_pass_the_origin_check(
     secure: bool, host: str, origin: str | None, site: str | None
 ) -> None:
     require_own_origin(Asked("127.0.0.1", secure, host, origin, site))
@@ -114,13 +114,13 @@ def test_our_own_page_and_programs_may(
         (None, "same-site"),
     ],
 )
-def test_another_page_may_not(origin: str | None, site: str | None) -> None:
+def test_a_page_of_another_origin_is_refused(origin: str | None, site: str | None) -> None:
     with pytest.raises(RefusedError) as found:
         require_own_origin(Asked("127.0.0.1", False, "localhost:8080", origin, site))
     assert found.value.reason == "origin"
 
 
-def test_a_role_may_what_those_below_it_may() -> None:
+def test_a_role_has_the_permissions_of_the_roles_below_it() -> None:
     viewer, operator = Who("viewer", "tv"), Who("operator", "phone")
     assert [viewer.may("viewer"), viewer.may("operator")] == [True, False]
     assert [operator.may("operator"), operator.may("maintainer")] == [True, False]
@@ -131,7 +131,7 @@ def test_a_role_may_what_those_below_it_may() -> None:
     assert found.value.reason == "role"
 
 
-def test_names_are_told_from_ports_and_loopback_from_names() -> None:
+def test_host_names_are_split_from_ports_and_loopback_addresses_are_recognized() -> None:
     assert [host_name(h) for h in ("A:1", "[::1]:2", "1.2.3.4", "[fe80::1")] == [
         "a", "::1", "1.2.3.4", "fe80::1",
     ]  # fmt: skip
@@ -145,7 +145,7 @@ def test_a_mapped_ipv4_address_is_shown_as_ipv4() -> None:
     assert [unmapped(one) for one in told] == ["192.168.1.7", "192.168.1.7", "::1", *told[3:]]
 
 
-def test_a_page_looks_at_its_own_cookie_first_and_at_no_other_robot_s() -> None:
+def test_a_page_reads_its_own_cookie_first_and_no_other_robot_s_cookie() -> None:
     """A browser sends the cookies of all ports of a host."""
     shown = {
         cookie_name("robot1", 8444): "elsewhere",
@@ -159,7 +159,7 @@ def test_a_page_looks_at_its_own_cookie_first_and_at_no_other_robot_s() -> None:
     assert tokens_in({}, "robot1", 8443) == []
 
 
-def test_of_cookies_without_end_a_few_are_looked_at_and_the_page_s_own_is_one() -> None:
+def test_a_limited_number_of_cookies_is_read_and_includes_the_page_s_own() -> None:
     shown = {cookie_name("robot1", port): str(port) for port in range(9000)}
     told = tokens_in(shown, "robot1", 8443)
     assert (len(told), told[0]) == (MOST_TOKENS, "8443")
@@ -173,7 +173,7 @@ def test_an_ipv6_address_counts_by_its_network_and_an_ipv4_address_by_itself() -
     assert network_of("fe80::1%eth0") == "fe80::/64"
 
 
-def test_only_a_listed_origin_in_full_is_listed() -> None:
+def test_an_origin_is_listed_only_if_all_its_parts_match() -> None:
     origins = {"http://127.0.0.1:5173", "https://panel.example"}
     for origin, listed in {
         "http://127.0.0.1:5173": True,

@@ -49,7 +49,7 @@ def calls_of(
     return Calls(known, ends, sees)
 
 
-async def test_stops_beyond_the_room_wait_for_one_that_is_asked_after_them() -> None:
+async def test_stops_beyond_the_limit_share_the_reply_of_a_stop_sent_after_them() -> None:
     asked: Counter[str] = Counter()
     go = threading.Event()
 
@@ -75,7 +75,7 @@ async def test_stops_beyond_the_room_wait_for_one_that_is_asked_after_them() -> 
     assert asked == {"first": STOPS_AT_ONCE, "later": 1}
 
 
-async def test_one_that_fails_fails_those_who_wait_for_it_and_not_the_next() -> None:
+async def test_a_stop_that_fails_fails_its_waiting_callers_and_not_the_next_stop() -> None:
     go = threading.Event()
 
     def held() -> ServiceReply:
@@ -98,7 +98,7 @@ async def test_one_that_fails_fails_those_who_wait_for_it_and_not_the_next() -> 
         await asyncio.gather(*first)
 
 
-async def test_of_another_robot_only_stop_is_called_and_only_by_an_id_that_one_can_have() -> None:
+async def test_only_stop_may_be_called_on_another_robot_and_only_with_a_valid_id() -> None:
     calls = calls_of(robots(None))
     with pytest.raises(RefusedError, match=r"r2 is not this page's robot.*own page") as told:
         await calls.call(MAINTAINER, "clear", {}, "r2")
@@ -111,7 +111,7 @@ async def test_of_another_robot_only_stop_is_called_and_only_by_an_id_that_one_c
 
 
 @pytest.mark.parametrize("ended", [True, False])
-def test_a_stop_ends_a_check_and_is_done_when_it_has_ended_and_the_daemon_says_so(
+def test_a_stop_succeeds_when_the_check_has_ended_and_the_daemon_has_replied(
     ended: bool,
 ) -> None:
     async def ends() -> Ending:
@@ -138,7 +138,7 @@ def test_a_stop_ends_a_check_and_is_done_when_it_has_ended_and_the_daemon_says_s
     assert told.message == "the check started by phone has ended; stopped"
 
 
-async def test_a_stop_of_another_robot_is_told_to_it_however_many_are_waited_for() -> None:
+async def test_a_stop_of_another_robot_is_sent_however_many_replies_are_pending() -> None:
     held: list[zenoh.Query] = []
     told: list[str] = []
     with zenoh.open(quiet()) as session:
@@ -169,7 +169,7 @@ async def test_a_stop_of_another_robot_is_told_to_it_however_many_are_waited_for
         assert all(reply.success for reply in await asyncio.gather(*first))
 
 
-async def test_stops_of_one_client_to_one_robot_share_the_next_one_and_none_is_lost() -> None:
+async def test_stops_of_one_client_to_one_robot_are_merged_without_a_loss() -> None:
     merged, loop = Merged(), asyncio.get_running_loop()
     sent: list[float] = []
 
@@ -210,9 +210,7 @@ async def test_a_stop_that_comes_as_the_pause_ends_is_sent_and_so_are_the_later_
     assert sent == 3
 
 
-async def test_stops_of_robots_that_do_not_answer_are_few_and_a_robot_that_answers_is_stopped() -> (
-    None
-):
+async def test_stops_to_silent_robots_are_limited_and_an_answering_robot_is_stopped() -> None:
     told: Counter[str] = Counter()
 
     def served(query: zenoh.Query) -> None:

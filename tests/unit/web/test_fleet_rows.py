@@ -127,7 +127,7 @@ async def test_a_robot_is_reported_with_its_version_and_seconds_and_as_gone_when
     fleet.leave(1)
 
 
-async def test_it_is_looked_for_again_when_there_was_no_way_or_the_bus_failed(
+async def test_the_fleet_is_searched_again_after_no_connection_or_a_failed_bus(
     session: zenoh.Session,
 ) -> None:
     with zenoh.open(quiet()) as ended:

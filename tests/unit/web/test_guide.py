@@ -24,7 +24,7 @@ HELD = SerialDevice("/dev/ttyUSB0", [], "ch341", "", "USB Serial", "", [Holder(7
 
 
 @pytest.mark.parametrize("configured", ["/dev/acsar", "/dev/ttyACM0"])
-def test_the_configured_one_stands_under_its_configured_name(
+def test_the_configured_port_is_listed_under_its_configured_name(
     configured: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("acsard.web.guide.serial_devices", lambda: [MEGA, HELD])
@@ -36,13 +36,15 @@ def test_the_configured_one_stands_under_its_configured_name(
     }
 
 
-def test_one_that_is_not_there_is_offered_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_configured_port_that_is_missing_is_offered_as_missing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr("acsard.web.guide.serial_devices", lambda: [MEGA])
     first = boards("/dev/none")[0]
     assert (first.port, first.what) == ("/dev/none", "configured, not there now")
 
 
-def test_the_simulator_is_there_once_whatever_is_configured(
+def test_the_simulator_is_listed_once_whatever_is_configured(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("acsard.web.guide.serial_devices", list)
@@ -50,7 +52,7 @@ def test_the_simulator_is_there_once_whatever_is_configured(
 
 
 @pytest.mark.parametrize("configured", ["sim", "/dev/ttyUSB0"])
-def test_the_configured_one_is_the_first_choice(
+def test_the_configured_port_is_the_first_choice(
     configured: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A page that shows the simulator must not select a real port by itself."""
@@ -83,7 +85,7 @@ def parsed(given: list[str]) -> argparse.Namespace:
     return parser(["calibrate", "mcu"]).parse_args(given)
 
 
-def test_a_check_has_the_port_and_the_file_and_asks() -> None:
+def test_a_check_gets_the_port_and_the_file_and_asks_before_it_moves() -> None:
     args = parsed(words(Begin("check", "/dev/acsar"), REACH, PORTS))
     assert (args.port, args.config) == ("/dev/acsar", REACH.config)
     assert args.json_lines
@@ -91,7 +93,7 @@ def test_a_check_has_the_port_and_the_file_and_asks() -> None:
 
 
 @each("way", ["", *NEEDS])
-def test_a_calibration_goes_to_the_robot_of_the_page_and_asks(way: str) -> None:
+def test_a_calibration_is_of_the_page_s_robot_and_asks_before_it_moves(way: str) -> None:
     positions = "sim/pose" if way == "positions" else ""
     args = parsed(words(Begin("calibrate", "", way, positions), REACH, ()))
     assert (args.connect, args.id, args.tls) == (REACH.endpoint, REACH.robot_id, REACH.tls)
@@ -100,7 +102,7 @@ def test_a_calibration_goes_to_the_robot_of_the_page_and_asks(way: str) -> None:
     assert [args.yes, args.write, args.log] == [False, False, None]
 
 
-def test_what_is_not_known_is_not_given() -> None:
+def test_unknown_values_are_not_passed_as_options() -> None:
     given = words(Begin("calibrate"), Reach("", "tcp/127.0.0.1:7448", "acsar", ""), ())
     assert not any(
         word.startswith(("--config", "--tls", "--method", "--positions")) for word in given
@@ -129,7 +131,7 @@ def test_what_is_not_known_is_not_given() -> None:
         Begin("calibrate", "", "positions", "x" * 81),
     ],
 )
-def test_what_is_not_offered_is_refused_in_words(wish: Begin) -> None:
+def test_a_request_that_was_not_offered_is_refused_with_a_reason(wish: Begin) -> None:
     with pytest.raises(FrameError) as caught:
         words(wish, REACH, PORTS)
     assert caught.value.about == "begin"
@@ -151,17 +153,17 @@ def test_no_text_becomes_an_option_of_its_own(
     }  # fmt: skip
 
 
-def test_the_ways_are_those_there_are() -> None:
+def test_every_calibration_method_has_its_requirements() -> None:
     assert METHODS.keys() == NEEDS.keys()
 
 
-def test_what_is_said_of_the_simulator_tells_of_every_way() -> None:
+def test_the_text_about_the_simulator_mentions_every_method() -> None:
     way, why = SIMULATED
     assert way in NEEDS
     assert [one for one in NEEDS if one not in why] == []
 
 
 @each("key", ["a//b", "a/", "/a", "-a", "a" * 81, "a*", "a b", "a\n"])
-def test_what_is_no_key_is_no_positions(key: str) -> None:
+def test_an_invalid_key_is_refused_as_a_source_of_positions(key: str) -> None:
     assert not KEY.match(key)
     assert KEY.match("sim/pose")

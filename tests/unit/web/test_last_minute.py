@@ -55,7 +55,7 @@ def test_a_row_has_what_each_line_of_the_plots_shows() -> None:
     assert (told.late_p99, told.late_max, told.volts) == ([0.02], [0.08], [24.5])
 
 
-def test_it_is_the_last_minute_and_no_more_however_long_it_goes_on() -> None:
+def test_the_plots_show_only_the_last_minute_of_a_longer_run() -> None:
     told = lived(150.0).plotted(150 * NS_PER_S)
     assert 0.98 * LASTS_NS / STEP_NS < len(told.age) <= LASTS_NS // STEP_NS + 1
     assert max(told.age) <= LASTS_NS // 1_000_000
@@ -65,13 +65,13 @@ def test_it_is_the_last_minute_and_no_more_however_long_it_goes_on() -> None:
 
 
 @each("look_ns", [1_000_000, 30_000_000, 90_000_000, 110_000_000])
-def test_whoever_looks_how_often_it_is_bounded_and_reaches_back_a_minute(look_ns: int) -> None:
+def test_the_plots_are_bounded_and_cover_a_minute_at_any_sampling_interval(look_ns: int) -> None:
     told = lived(100.0, look_ns).plotted(100 * NS_PER_S)
     assert len(told.age) <= ROWS
     assert max(told.age) > 0.98 * LASTS_NS / 1_000_000
 
 
-def test_what_nobody_heard_or_measured_is_none() -> None:
+def test_an_unknown_value_is_null() -> None:
     minute = Minute()
     unknown = replace(STATE, linear=None, angular=None, wheels=[], latencies={})
     minute.add(0, unknown, None)
@@ -80,17 +80,17 @@ def test_what_nobody_heard_or_measured_is_none() -> None:
     assert {value for column in columns(told)[1:] for value in column} == {None}
 
 
-def test_before_anything_was_heard_there_is_nothing() -> None:
+def test_before_the_first_state_the_plots_are_empty() -> None:
     assert {len(column) for column in columns(Minute().plotted(NS_PER_S))} == {0}
 
 
-def test_when_nothing_is_heard_any_more_the_minute_passes() -> None:
+def test_without_new_states_the_plots_become_empty_within_a_minute() -> None:
     minute = lived(10.0)
     assert 0 < len(minute.plotted(65 * NS_PER_S).age) < len(minute.plotted(10 * NS_PER_S).age)
     assert minute.plotted(71 * NS_PER_S).age == []
 
 
-def test_a_whole_minute_is_small() -> None:
+def test_a_whole_minute_is_less_than_32_kib_of_json() -> None:
     """Values have at most three decimals, so that a phone loads them fast."""
     minute = Minute()
     for n in range(1000):

@@ -37,7 +37,7 @@ from acsard.web.limits import (
 )
 
 
-def test_a_token_has_a_share_of_the_pages_from_however_many_addresses_and_leaves_room() -> None:
+def test_a_token_has_a_share_of_the_connections_over_all_its_addresses() -> None:
     seats = Seats()
     told = [seats.enter(f"10.0.0.{n}", "wall") for n in range(CONNECTIONS)]
     assert told.count("") == CONNECTIONS_OF_TOKEN < CONNECTIONS
@@ -47,7 +47,7 @@ def test_a_token_has_a_share_of_the_pages_from_however_many_addresses_and_leaves
     assert not seats.enter("10.0.2.1", "wall")
 
 
-def test_a_token_without_room_takes_no_place_of_its_address() -> None:
+def test_a_refused_token_takes_no_place_of_its_address() -> None:
     seats = Seats()
     for n in range(CONNECTIONS_OF_TOKEN):
         seats.enter(f"10.0.0.{n}", "wall")
@@ -67,7 +67,7 @@ def test_a_token_has_a_share_of_its_address_and_leaves_others_theirs() -> None:
     assert seats.missing("10.0.0.1", "broken") == ""
 
 
-def test_an_address_has_a_share_of_the_pages_with_however_many_tokens() -> None:
+def test_an_address_has_a_share_of_the_connections_over_all_its_tokens() -> None:
     seats = Seats()
     told = [seats.enter("10.0.0.1", f"token{n}") for n in range(CONNECTIONS)]
     assert told.count("") == CONNECTIONS_OF_ONE
@@ -75,7 +75,7 @@ def test_an_address_has_a_share_of_the_pages_with_however_many_tokens() -> None:
     assert not seats.enter("10.0.0.2", "token0")
 
 
-def test_who_is_at_the_machine_has_places_that_nobody_else_takes() -> None:
+def test_local_browsers_have_reserved_connections() -> None:
     seats = Seats()
     for n in range(2 * CONNECTIONS):
         seats.enter(f"127.0.0.{n % 9}", f"token{n}")
@@ -87,13 +87,13 @@ def test_who_is_at_the_machine_has_places_that_nobody_else_takes() -> None:
     assert not seats.enter("::1", "")
 
 
-def test_one_holder_has_his_share_and_leaves_room_for_others() -> None:
+def test_one_holder_has_a_share_and_leaves_room_for_others() -> None:
     shares = Shares(10, 4)
     assert [shares.enter("a", n) for n in range(6)] == [True] * 4 + [False] * 2
     assert shares.enter("b", 9)
 
 
-def test_the_same_thing_again_takes_no_more_room_until_all_have_let_go() -> None:
+def test_a_shared_item_takes_room_once_until_all_holders_have_released_it() -> None:
     shares = Shares(2, 1)
     assert [shares.enter("a", "state") for _ in range(3)] == [True] * 3
     assert shares.enter("b", "state")
@@ -106,7 +106,7 @@ def test_the_same_thing_again_takes_no_more_room_until_all_have_let_go() -> None
     assert shares.enter("d", "tf")
 
 
-def test_the_page_tells_the_places_that_there_are() -> None:
+def test_the_manual_states_the_limits_of_the_connections() -> None:
     page = Path(__file__).parents[3] / "deploy" / "web" / "README.md"
     told = " ".join(page.read_text(encoding="utf-8").split())
     assert (
@@ -134,7 +134,7 @@ def test_the_page_tells_the_places_that_there_are() -> None:
     assert (GUESSES.most / most, GUESSES.hz / hz) == pytest.approx((10, 10))
 
 
-def test_each_token_has_a_pace_of_its_own() -> None:
+def test_each_token_has_its_own_rate_limit() -> None:
     paces, most = Buckets(REQUESTS), int(REQUESTS.most)
     taken = [paces.take("one", 0) for _ in range(most + 1)]
     assert taken == [True] * most + [False]

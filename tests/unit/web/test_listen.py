@@ -48,7 +48,7 @@ def reached(port: int, host: str) -> bool:
     return True
 
 
-def test_an_address_is_read_and_beyond_this_machine_only_https() -> None:
+def test_an_address_is_parsed_and_a_remote_one_must_be_https() -> None:
     assert listens("http://127.0.0.1:8080") == Listen(False, "127.0.0.1", 8080)
     assert listens("https://[::]:8443/") == Listen(True, "::", 8443)
     assert listens("https://[::]:8443").url == f"https://{own_name()}:8443/"
@@ -60,7 +60,7 @@ def test_an_address_is_read_and_beyond_this_machine_only_https() -> None:
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::"])
-def test_an_invitation_has_the_own_certified_addresses_that_are_listened_at(
+def test_an_invitation_has_the_certified_addresses_at_which_the_server_listens(
     host: str, tls: str
 ) -> None:
     told = invitations([Listen(True, host, 8443), Listen(False, "127.0.0.1", 8080)], tls)
@@ -69,13 +69,13 @@ def test_an_invitation_has_the_own_certified_addresses_that_are_listened_at(
     assert told == [f"https://{at}:8443/" for at in (*older, *newer, own_name())]
 
 
-def test_nobody_is_invited_by_ipv4_where_another_has_that_port(tls: str) -> None:
+def test_an_invitation_has_no_ipv4_address_if_another_server_has_that_port(tls: str) -> None:
     told = invitations([Listen(False, "127.0.0.1", 8443), Listen(True, "::", 8443)], tls)
     assert told
     assert not any(f"https://{at}:" in url for at in OWN if ":" not in at for url in told)
 
 
-def test_the_page_says_that_it_is_opened_by_what_is_invited_to(tls: str) -> None:
+def test_the_reported_addresses_of_the_page_are_those_of_an_invitation(tls: str) -> None:
     away, here = Listen(True, "0.0.0.0", 8443), Listen(False, "127.0.0.1", 8080)
     assert opened_by(away, tls) == invitations([away], tls)
     assert f"https://{own_name()}:8443/" in opened_by(away, tls)
@@ -83,7 +83,7 @@ def test_the_page_says_that_it_is_opened_by_what_is_invited_to(tls: str) -> None
 
 
 @pytest.mark.parametrize(("host", "by"), [("0.0.0.0", {"127.0.0.1"}), ("::", {"127.0.0.1", "::1"})])
-def test_what_is_listened_at_everywhere_is_reached_by_what_is_invited_to(
+def test_a_wildcard_address_is_reached_by_ipv4_and_only_the_ipv6_one_by_ipv6(
     host: str, by: set[str]
 ) -> None:
     [(one, opened)] = bound([Listen(True, host, free_port())], next_port=False)
@@ -92,14 +92,14 @@ def test_what_is_listened_at_everywhere_is_reached_by_what_is_invited_to(
 
 
 @pytest.mark.parametrize("first", ["0.0.0.0", "127.0.0.1"])
-def test_both_everywheres_share_a_port(first: str) -> None:
+def test_an_ipv4_address_and_the_ipv6_wildcard_can_share_a_port(first: str) -> None:
     port = free_port()
     for one, opened in bound([Listen(True, at, port) for at in (first, "::")], next_port=False):
         with opened:
             assert reached(one.port, "::1" if one.host == "::" else "127.0.0.1")
 
 
-def test_a_port_that_is_taken_is_told_or_passed_over() -> None:
+def test_a_port_in_use_is_reported_or_the_next_port_is_used() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -121,7 +121,7 @@ def test_https_without_a_certificate_is_reported_and_http_needs_none(tmp_path: P
 
 
 @pytest.mark.parametrize("tls", [(), ("--tls", "nowhere")])
-def test_nobody_is_invited_to_where_the_server_could_not_start(
+def test_an_invitation_is_refused_if_the_server_could_not_start(
     tmp_path: Path, tls: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

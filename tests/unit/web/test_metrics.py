@@ -34,7 +34,7 @@ def parsed(told: str) -> dict[tuple[str, frozenset[tuple[str, str]]], float]:
     return found
 
 
-def test_what_the_robot_says_is_there_with_its_labels() -> None:
+def test_the_state_of_the_robot_becomes_samples_with_labels() -> None:
     got = parsed(text("acsar", "0.1.0+g1a2b3c4d5", STATE, True, 3, {"commands": 4}, {"host": 5}))
     own = ("robot", "acsar")
     assert got["acsard_up", frozenset({own})] == 1
@@ -49,7 +49,7 @@ def test_what_the_robot_says_is_there_with_its_labels() -> None:
     assert got["acsard_page_refused_total", frozenset({own, ("reason", "host")})] == 5
 
 
-def test_a_robot_that_is_not_heard_is_down_and_tells_no_old_speed() -> None:
+def test_a_silent_robot_is_down_and_reports_no_old_speed() -> None:
     got = parsed(text("acsar", "0.1.0+g1a2b3c4d5", STATE, False, 0, {}, {}))
     assert got["acsard_up", frozenset({("robot", "acsar")})] == 0
     assert not any(name == "acsard_linear_speed_mps" for name, _ in got)
@@ -62,7 +62,7 @@ def test_without_feedback_no_speed_is_reported() -> None:
     assert got["acsard_link", frozenset({("robot", "acsar"), ("state", "down")})] == 1
 
 
-def test_what_ends_a_robot_quietly_is_a_sample_of_its_own() -> None:
+def test_each_warning_of_a_later_failure_is_a_sample() -> None:
     own = ("robot", "acsar")
     ends = replace(STATE, certificate_expiry="expires in 10 days", certificate_days=10.0)
     got = parsed(text("acsar", "0.1.0+g1a2b3c4d5", ends, True, 0, {}, {}))
@@ -90,13 +90,13 @@ def test_the_inputs_and_the_battery_of_the_board_are_samples_if_it_reports_them(
     assert not any(word in name for name, _ in none for word in ("emergency", "bumper", "battery"))
 
 
-def test_words_of_a_stranger_stay_within_their_label() -> None:
+def test_a_foreign_text_cannot_leave_its_label() -> None:
     got = parsed(text("acsar", "0.1.0+g1a2b3c4d5", None, False, 0, {'a"b\\c\nd': 1}, {}))
     whats = [dict(labels)["what"] for name, labels in got if name == "acsard_page_total"]
     assert whats == ['a"b\\c\nd']
 
 
-def test_refusals_are_one_line_by_reason_and_told_once() -> None:
+def test_refusals_are_reported_once_in_one_line_by_reason() -> None:
     counts = Counts()
     assert counts.news() is None
     for _ in range(12):
@@ -114,7 +114,7 @@ def test_refusals_are_one_line_by_reason_and_told_once() -> None:
     assert counts.refused() == {"bad_token": 12, "origin": 2}
 
 
-def test_who_was_refused_most_is_named_and_with_the_next_line_anew() -> None:
+def test_each_line_names_the_client_with_the_most_refusals_since_the_last_line() -> None:
     counts = Counts()
     for _ in range(3):
         counts.refuse("role", "192.168.1.50 (tv)")
@@ -131,7 +131,7 @@ def test_who_was_refused_most_is_named_and_with_the_next_line_anew() -> None:
     assert told.text == "1 role; 1 from 192.168.1.7"
 
 
-def test_who_has_many_addresses_makes_no_line_longer() -> None:
+def test_a_client_with_many_addresses_does_not_lengthen_the_line() -> None:
     counts = Counts()
     for n in range(2 * KNOWN):
         counts.refuse("bad_token", f"2001:db8::{n:x}")

@@ -33,7 +33,7 @@ def references(node: Any) -> list[str]:
     return []
 
 
-def test_every_key_to_ask_for_and_every_service_is_described() -> None:
+def test_every_key_that_answers_and_every_service_is_described() -> None:
     paths = WHOLE["paths"]
     for topic in TOPICS:
         path = f"/api/{topic.key.replace('<Type>', '{type}')}"
@@ -51,13 +51,13 @@ def test_every_reference_leads_to_a_schema() -> None:
 
 
 @pytest.mark.slow
-def test_it_is_openapi_as_its_validator_reads_it() -> None:
+def test_the_description_is_valid_openapi() -> None:
     whole: dict[Hashable, Any] = dict(WHOLE.items())
     assert [one.message for one in OpenAPIV31SpecValidator(whole).iter_errors()] == []
 
 
 @pytest.mark.slow
-def test_every_schema_is_one() -> None:
+def test_every_schema_is_valid_json_schema() -> None:
     for schema in WHOLE["components"]["schemas"].values():
         Draft202012Validator.check_schema(schema)
 
@@ -78,7 +78,7 @@ def test_the_page_has_a_message_of_each_kind() -> None:
 
 
 @each("message", [*MESSAGES, "{}", '{"ping": 1, "call": "stop"}', '{"cmd": {}}'])
-def test_what_the_socket_takes_is_what_its_schema_says(message: str) -> None:
+def test_the_socket_accepts_exactly_the_messages_that_its_schema_allows(message: str) -> None:
     meant = {"components": WHOLE["components"], "$ref": f"#/components/schemas/{TO_ROBOT}"}
     try:
         decode(message)
@@ -102,7 +102,7 @@ def test_parameters_in_a_path_are_declared() -> None:
             assert names == {part[1:-1] for part in path.split("/") if part.startswith("{")}
 
 
-def test_no_wildcard_is_the_name_of_a_type() -> None:
+def test_a_wildcard_is_not_a_valid_type_name() -> None:
     name = re.compile(PARAMETERS["type"])
     assert name.fullmatch("Twist")
     assert not any(map(name.fullmatch, ("*", "**", "a$*", "x?fmt=cdr", "a/b", "", "a" * 99)))

@@ -80,7 +80,7 @@ async def become(found: Reports, path: Path, *states: str, stamp: int = 1) -> Re
     return told
 
 
-async def test_it_is_begun_by_who_asks_and_there_when_it_is_done() -> None:
+async def test_a_request_starts_the_report_and_a_later_one_gets_it() -> None:
     found = drawn_by(DRAWS)
     assert found.ask(A, (1, 0)).report == "drawing"
     assert found.drawn("a.mcap") is None
@@ -92,7 +92,7 @@ async def test_it_is_begun_by_who_asks_and_there_when_it_is_done() -> None:
     assert found.drawn("b.mcap") is None
 
 
-async def test_it_says_how_far_it_is_and_another_one_waits() -> None:
+async def test_a_report_has_its_progress_and_a_second_report_waits() -> None:
     found = drawn_by(WAITS)
     found.ask(A, (1, 0))
     async with asyncio.timeout(PATIENCE_S):
@@ -105,7 +105,7 @@ async def test_it_says_how_far_it_is_and_another_one_waits() -> None:
     found.end()
 
 
-async def test_a_recording_that_has_grown_is_drawn_anew_and_one_that_has_not_is_not() -> None:
+async def test_a_report_is_made_again_only_if_its_recording_has_grown() -> None:
     found = drawn_by(DRAWS)
     await become(found, A, "ready")
     assert found.ask(A, (1, 0)).report == "ready"
@@ -129,7 +129,7 @@ async def test_a_recording_that_has_grown_is_drawn_anew_and_one_that_has_not_is_
         (f"import sys; sys.stdout.write('x' * {BYTES + 1})", "draw a part of the recording"),
     ],
 )
-async def test_what_fails_says_why_and_is_tried_anew_when_it_is_asked_for_again(
+async def test_a_failed_report_has_its_reason_and_the_next_request_starts_it_again(
     program: str, why: str
 ) -> None:
     found = drawn_by(program)
@@ -141,12 +141,12 @@ async def test_what_fails_says_why_and_is_tried_anew_when_it_is_asked_for_again(
     found.end()
 
 
-async def test_a_program_that_is_not_there_is_reported() -> None:
+async def test_a_missing_report_program_is_reported() -> None:
     told = await become(Reports(("/nowhere/acsard",)), A, "ready", "failed")
     assert "No such file" in told.text
 
 
-async def test_it_takes_too_long(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_report_that_takes_too_long_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reports, "DRAW_S", 0.05)
     told = await become(drawn_by(WAITS), A, "ready", "failed")
     assert "acsard recording report" in told.text
@@ -161,7 +161,7 @@ print(os.getpriority(os.PRIO_PROCESS, 0), limit, last, flush=True)
 time.sleep(float(sys.argv[1].strip("/")))"""
 
 
-async def test_it_has_the_lowest_priority_and_so_much_memory_and_is_the_first_to_go() -> None:
+async def test_a_report_process_has_low_priority_limited_memory_and_is_killed_first() -> None:
     found = drawn_by(TELLS)
     await become(found, Path("/0"), "ready")
     priority, memory, first = gzip.decompress(found.drawn("0") or b"").split()
@@ -169,7 +169,7 @@ async def test_it_has_the_lowest_priority_and_so_much_memory_and_is_the_first_to
     assert first == b"1000"
 
 
-async def test_what_nobody_asks_for_any_more_is_given_up_and_its_process_ends(
+async def test_a_report_without_further_requests_is_cancelled_and_its_process_ends(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     told = tmp_path / "pid"
@@ -188,7 +188,7 @@ async def test_what_nobody_asks_for_any_more_is_given_up_and_its_process_ends(
     assert found.drawn("a.mcap") is None
 
 
-async def test_who_opens_a_report_keeps_it_for_another_quarter_of_an_hour(
+async def test_an_opened_report_is_kept_for_another_quarter_of_an_hour(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     now_ns = 0

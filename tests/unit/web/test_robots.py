@@ -114,13 +114,15 @@ def test_a_daemon_of_another_version_is_reported_as_such(world: World) -> None:
     assert at <= FIRST_S + 2 * LOOK_S
 
 
-def test_a_robot_that_comes_back_is_here_at_once(world: World) -> None:
+def test_a_robot_that_returns_is_present_without_delay(world: World) -> None:
     found = world.told(10.0, lambda t: None if 2.0 < t < 6.0 else world.state())
     assert [bool(gone) for _, gone in found] == [False, True, False]
     assert found[-1][0] <= 6.0 + 2 * LOOK_S
 
 
-def test_a_robot_whose_last_state_is_from_before_a_suspend_is_silent_at_once(world: World) -> None:
+def test_a_robot_whose_last_state_is_older_than_a_suspend_is_silent_immediately(
+    world: World,
+) -> None:
     def publishes(t: float) -> Any:
         if t < 5.0:
             return world.state()

@@ -23,9 +23,7 @@ def test_only_the_page_s_own_files_and_the_token_are_open_to_strangers() -> None
     assert is_open == {"/", "/favicon.ico", "/page/{name}", "/token"}
 
 
-def test_stops_the_return_of_a_page_and_pictures_wait_beyond_their_rate_and_are_not_refused() -> (
-    None
-):
+def test_stops_reconnections_and_pictures_beyond_their_rate_wait_and_are_not_refused() -> None:
     waiting = {"/api/srv/stop", "/api/whoami", "/ws", "/api/camera"}
     assert {row.path for row in ROUTES if row.waits} == waiting
     assert all(row.rate == REQUESTS for row in ROUTES if row.path not in waiting)

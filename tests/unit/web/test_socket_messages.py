@@ -30,7 +30,7 @@ from tests.each import each
 COMMAND = {"cmd": {"linear_x": 0.2, "angular_z": -0.1}, "stamp": 1763700000123.4}
 
 
-def test_each_kind_is_told_by_its_field() -> None:
+def test_each_kind_of_message_is_recognized_by_its_field() -> None:
     assert decode(json.dumps(COMMAND)) == Command(Wish(0.2, -0.1), 1763700000123.4)
     assert decode('{"subscribe": "odom"}') == Subscribe("odom", 10.0)
     assert decode('{"unsubscribe": "odom", "robot": "b"}') == Unsubscribe("odom", "b")
@@ -105,7 +105,7 @@ def test_a_command_of_two_zeros_moves_nothing() -> None:
         ("[" * 5000 + "]" * 5000, "message"),
     ],
 )
-def test_what_is_none_is_refused_and_says_what_it_was_meant_for(text: str, about: str) -> None:
+def test_an_invalid_message_is_refused_with_the_kind_it_was_meant_as(text: str, about: str) -> None:
     with pytest.raises(FrameError) as caught:
         decode(text)
     assert caught.value.about == about
@@ -113,7 +113,7 @@ def test_what_is_none_is_refused_and_says_what_it_was_meant_for(text: str, about
 
 
 @given(st.text())
-def test_no_text_raises_anything_else(text: str) -> None:
+def test_any_text_decodes_or_raises_a_frame_error(text: str) -> None:
     try:
         decode(text)
     except FrameError:
@@ -121,7 +121,7 @@ def test_no_text_raises_anything_else(text: str) -> None:
 
 
 @given(st.integers(0, len(json.dumps(COMMAND)) - 1), st.characters())
-def test_no_damaged_command_raises_anything_else(at: int, char: str) -> None:
+def test_a_damaged_command_decodes_or_raises_a_frame_error(at: int, char: str) -> None:
     text = json.dumps(COMMAND)
     try:
         decode(text[:at] + char + text[at + 1 :])

@@ -56,7 +56,7 @@ def as_told(message: object) -> Any:
     return msgspec.json.decode(msgspec.json.encode(message))
 
 
-def test_all_that_may_be_followed_is_described() -> None:
+def test_every_key_that_may_be_followed_is_described() -> None:
     assert set(KEYS) == FOLLOWED
     assert {one.removeprefix(VALUE) for one in FRAMES if one.startswith(VALUE)} == {
         key.replace("/", ".") for key in KEYS
@@ -64,27 +64,27 @@ def test_all_that_may_be_followed_is_described() -> None:
 
 
 @each("message", SAID)
-def test_what_is_said_is_as_described_and_nothing_of_it_may_be_missing(message: Struct) -> None:
+def test_each_sent_message_matches_its_schema_only_if_it_is_complete(message: Struct) -> None:
     frame = as_told(message)
     assert kinds([frame]) == {type(message).__name__}
     assert [one for one in spoilt(frame) if taken(one)] == []
 
 
 @each("line", GUIDED)
-def test_what_a_check_or_calibration_says_is_as_described(line: Struct) -> None:
+def test_each_line_of_a_check_or_calibration_is_as_described(line: Struct) -> None:
     assert kinds([as_told({"guide": line})]) == {"Guided", type(line).__name__}
     assert not taken({"guide": {}})
     assert not taken({"guide": as_told(line) | {next(iter(as_told(line))): {"of": "nothing"}}})
 
 
-def test_there_is_an_example_of_each() -> None:
+def test_each_kind_of_sent_message_has_an_example() -> None:
     assert {type(one) for one in SAID} == set(SENT)
     assert {type(one) for one in GUIDED} == set(LINES)
     assert len(GUIDES) == len(LINES)
 
 
 @pytest.mark.parametrize("role", get_args(Role))
-def test_each_role_may_be_greeted_and_no_other(role: Role) -> None:
+def test_a_greeting_may_have_only_an_existing_role(role: Role) -> None:
     hello = as_told(socket_messages.Hello(msgspec.structs.replace(GREETING, role=role)))
     assert taken(hello)
     assert not taken({"hello": hello["hello"] | {"role": "king"}})

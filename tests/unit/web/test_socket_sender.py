@@ -12,7 +12,7 @@ from acsard.web.socket_sender import Following, Outgoing
 from acsard.web.streams import Stream
 
 
-async def test_a_key_that_is_due_soon_does_not_wait_longer_for_what_goes_out_before() -> None:
+async def test_earlier_messages_do_not_delay_a_key_that_is_due_soon() -> None:
     out = Outgoing(web.WebSocketResponse(), make_mocked_request("GET", "/ws"), Counts(), "")
     one = Following("acsar", "state", "acsar", 0.1)
     one.stream = Stream()

@@ -38,7 +38,7 @@ def samples(session: zenoh.Session) -> list[zenoh.Sample]:
     return [heard.recv(), heard.recv()]
 
 
-def test_an_answer_is_there_until_something_is_published(samples: list[zenoh.Sample]) -> None:
+def test_an_answer_is_the_value_until_a_message_is_published(samples: list[zenoh.Sample]) -> None:
     stream = Stream()
     stream.answered(samples[0])
     assert stream.value()[:2] == (1, b"1")
@@ -46,7 +46,7 @@ def test_an_answer_is_there_until_something_is_published(samples: list[zenoh.Sam
     assert stream.value()[:2] == (2, b"2")
 
 
-def test_an_answer_that_was_overtaken_is_left_out(samples: list[zenoh.Sample]) -> None:
+def test_an_answer_older_than_a_published_message_is_ignored(samples: list[zenoh.Sample]) -> None:
     stream = Stream()
     stream.take(samples[1])
     stream.answered(samples[0])
@@ -76,7 +76,7 @@ def test_an_age_is_never_negative(
     assert stream.value()[2] == 0.0
 
 
-def test_what_comes_by_itself_is_not_asked_for_of_another_robot(session: zenoh.Session) -> None:
+def test_periodic_keys_of_another_robot_are_not_queried(session: zenoh.Session) -> None:
     """A router's storage holds the last state of a robot that is off, which would look current."""
 
     async def story(robot: str, key: str) -> bytes:
@@ -98,7 +98,7 @@ def test_what_comes_by_itself_is_not_asked_for_of_another_robot(session: zenoh.S
     storage.undeclare()
 
 
-async def test_what_a_stranger_put_on_a_wildcard_is_not_of_the_key(session: zenoh.Session) -> None:
+async def test_a_put_on_a_wildcard_is_not_a_message_of_the_key(session: zenoh.Session) -> None:
     streams = Streams()
     stream = await streams.follow(Client(session, "acsar", "app"), "acsar", "events")
     for key, said in ((KEY, b"1"), ("acsard/**", b"666"), ("acsard/*/*", b"667"), (KEY, b"2")):

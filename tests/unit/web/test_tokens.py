@@ -14,7 +14,7 @@ from acsard.host.errors import NotPermittedError, UsageError
 from acsard.web.tokens import Token, Vault, owner_in
 
 
-def test_an_invitation_is_somebody_until_it_is_revoked(tmp_path: Path) -> None:
+def test_a_token_is_valid_until_it_is_revoked(tmp_path: Path) -> None:
     keeper, server = Vault(tmp_path / "state", "robot1"), Vault(tmp_path / "state", "robot1")
     assert server.all() == []
     text, _ = keeper.invite("operator", "phone", 30)
@@ -27,7 +27,7 @@ def test_an_invitation_is_somebody_until_it_is_revoked(tmp_path: Path) -> None:
     assert who.token not in server.counting()
 
 
-def test_the_token_itself_is_nowhere_on_the_disk(tmp_path: Path) -> None:
+def test_the_token_itself_is_not_stored_on_the_disk(tmp_path: Path) -> None:
     vault = Vault(tmp_path / "state", "robot1")
     text, _ = vault.invite("viewer", "tv", 1)
     kept = b"".join(path.read_bytes() for path in tmp_path.rglob("*") if path.is_file())
@@ -36,7 +36,7 @@ def test_the_token_itself_is_nowhere_on_the_disk(tmp_path: Path) -> None:
     assert stat.S_IMODE(vault.path.parent.stat().st_mode) == 0o700
 
 
-def test_one_that_has_ended_is_nobody(tmp_path: Path) -> None:
+def test_an_expired_token_is_not_valid(tmp_path: Path) -> None:
     vault = Vault(tmp_path, "robot1")
     text, token = vault.invite("viewer", "tv", 1)
     vault.path.write_bytes(msgspec.json.encode([replace(token, ends=token.made - 1)]))
@@ -45,13 +45,13 @@ def test_one_that_has_ended_is_nobody(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "x", "x" * 10_000, "ü", "\0", "\udcff"])
-def test_what_never_was_a_token_is_nobody(tmp_path: Path, text: str) -> None:
+def test_an_unknown_token_is_not_valid(tmp_path: Path, text: str) -> None:
     vault = Vault(tmp_path, "robot1")
     vault.invite("viewer", "tv", 1)
     assert owner_in(vault.all(), text) is None
 
 
-def test_a_damaged_file_lets_nobody_in(tmp_path: Path) -> None:
+def test_with_a_damaged_file_no_token_is_valid(tmp_path: Path) -> None:
     vault = Vault(tmp_path, "robot1")
     text, _ = vault.invite("maintainer", "me", 1)
     vault.path.write_bytes(vault.path.read_bytes()[:-3])
@@ -69,7 +69,7 @@ def test_a_damaged_file_is_not_written_over(tmp_path: Path) -> None:
     assert vault.path.read_bytes() == damaged
 
 
-def test_who_invites_beside_a_service_is_told_that_it_does_not_know_the_token(
+def test_an_invitation_beside_a_service_warns_that_the_service_lacks_the_token(
     tmp_path: Path,
 ) -> None:
     own, service = Vault(tmp_path / "own", "robot1"), tmp_path / "service"
@@ -79,7 +79,7 @@ def test_who_invites_beside_a_service_is_told_that_it_does_not_know_the_token(
     assert Vault(service, "robot1").unknown_to(service) == ""
 
 
-def test_those_that_count_are_reported_at_once(tmp_path: Path) -> None:
+def test_the_valid_tokens_are_reported_together(tmp_path: Path) -> None:
     vault = Vault(tmp_path, "robot1")
     _, first = vault.invite("viewer", "tv", 1)
     _, second = vault.invite("operator", "phone", 1)
@@ -98,7 +98,7 @@ def test_a_name_is_given_once_and_an_unknown_one_cannot_be_revoked(tmp_path: Pat
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_where_one_may_not_write_it_says_so(tmp_path: Path) -> None:
+def test_a_directory_without_write_permission_is_reported(tmp_path: Path) -> None:
     tmp_path.chmod(0o500)
     with pytest.raises(NotPermittedError, match="sudo"):
         Vault(tmp_path / "state", "robot1").invite("viewer", "tv", 1)
@@ -121,5 +121,5 @@ def test_robots_that_share_the_file_know_their_own_tokens_alone(tmp_path: Path) 
 
 
 @pytest.mark.slow
-def test_what_is_kept_has_no_more_than_it_needs() -> None:
+def test_a_stored_token_has_only_the_necessary_fields() -> None:
     assert Token.__struct_fields__ == ("name", "role", "digest", "made", "ends", "robot")

@@ -27,7 +27,7 @@ PATIENCE_S = 20.0
 AHEAD = Wish(Twist(0.2, 0.0), 1000, steady=True)
 
 
-def test_what_cannot_be_sent_is_dropped_and_the_next_one_is_looked_at() -> None:
+def test_a_command_that_cannot_be_sent_is_dropped_and_the_next_is_processed() -> None:
     def broken() -> Client | None:
         raise OverflowError("no room in 64 bits")
 

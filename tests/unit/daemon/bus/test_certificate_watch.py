@@ -54,7 +54,7 @@ def test_each_further_certificate_is_noticed(files: Files) -> None:
 
 
 @pytest.mark.parametrize("missing", ["certificate.pem", "key.pem"])
-def test_files_that_are_copied_one_after_the_other_count_when_all_are_there(
+def test_files_that_are_copied_one_by_one_count_when_all_are_present(
     files: Files, missing: str
 ) -> None:
     file = files.where / missing
@@ -69,7 +69,7 @@ def test_files_that_are_copied_one_after_the_other_count_when_all_are_there(
     assert [files.renewed() for _ in range(2)] == [False, True]
 
 
-def test_the_files_are_not_looked_at_more_often(
+def test_the_files_are_not_checked_more_often_than_the_interval(
     files: Files, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     files.renewed()
@@ -87,7 +87,7 @@ async def until(look: Callable[[], object]) -> None:
             await asyncio.sleep(0.005)
 
 
-async def test_new_files_and_a_new_router_are_known_and_an_absent_one_takes_nothing_away(
+async def test_new_files_and_a_new_router_are_noticed_and_missing_ones_change_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     authority = Authority.make(tmp_path, "test", 10)
@@ -134,7 +134,7 @@ async def test_a_disk_that_hangs_takes_one_thread(
     task.cancel()
 
 
-async def test_the_robots_own_end_is_left_to_its_gateway(
+async def test_the_expiry_of_the_robots_own_certificate_is_left_to_its_gateway(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     Authority.make(tmp_path, "test", 10).issue(tmp_path, "robot", [], 10)

@@ -33,7 +33,7 @@ def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rooms, "WHOAMI_MORE_S", 0.02)
 
 
-def test_the_highest_role_that_answers_is_the_clients_in_any_order() -> None:
+def test_the_highest_role_that_answers_in_any_order_is_the_role_of_the_client() -> None:
     for count in range(1, len(ROLES) + 1):
         for answering in permutations(ROLES[:count]):
             assert of(*answering).role == ROLES[count - 1]

@@ -42,7 +42,9 @@ def path() -> Iterator[str]:
         (errno.EIO, Exit.FAILURE, "the driver of the serial port did not answer"),
     ],
 )
-def test_each_error_has_its_code_and_its_words(number: int, code: Exit, words: str) -> None:
+def test_each_error_of_the_port_has_an_exit_code_and_a_text(
+    number: int, code: Exit, words: str
+) -> None:
     refused = refusal(
         "/dev/acsar_that_is_not", OSError(number, "the driver of the serial port did not answer")
     )
@@ -51,7 +53,7 @@ def test_each_error_has_its_code_and_its_words(number: int, code: Exit, words: s
     assert words in str(refused)
 
 
-def test_nothing_to_read_is_no_hang_up_and_a_hang_up_is() -> None:
+def test_an_empty_read_is_not_a_hang_up_and_a_hang_up_is_reported() -> None:
     master, slave = pty.openpty()
     device = open_raw(os.ttyname(slave), 115200)
     os.close(slave)
@@ -124,7 +126,7 @@ def test_a_device_that_is_not_a_tty_is_reported() -> None:
     assert refused.value.errno == errno.ENOTTY
 
 
-def test_who_has_the_device_may_still_drain_and_close_it(path: str) -> None:
+def test_a_holder_of_a_closed_device_may_still_drain_and_close_it(path: str) -> None:
     device = open_raw(path, 115200)
     close(device, lost=True, wait_s=5.0)
     assert os.readlink(f"/proc/self/fd/{device.fileno()}") == os.devnull
@@ -133,26 +135,26 @@ def test_who_has_the_device_may_still_drain_and_close_it(path: str) -> None:
     device.close()
 
 
-def test_what_cannot_say_what_it_holds_is_drained_at_once(path: str) -> None:
+def test_a_file_without_an_output_queue_counts_as_drained(path: str) -> None:
     with open(os.devnull) as null:
         assert unsent(null.fileno()) == 0
         assert list(draining(null.fileno(), clock.mono_ns() + 10**9)) == []
 
 
 @pytest.mark.parametrize("name", ["nothing", "file", "."])
-def test_what_is_no_device_is_no_port(tmp_path: Path, name: str) -> None:
+def test_a_path_that_is_not_a_device_is_refused_as_a_port(tmp_path: Path, name: str) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(NoPortError, match=r"`acsard ports` lists"):
         require(str(tmp_path / name))
 
 
-def test_a_device_by_its_stable_name_is_one(tmp_path: Path) -> None:
+def test_a_stable_name_of_a_device_is_accepted_as_a_port(tmp_path: Path) -> None:
     link = tmp_path / "acsar"
     link.symlink_to("/dev/null")
     require(str(link))
 
 
-def test_a_port_that_was_closed_is_read_as_a_lost_one(path: str) -> None:
+def test_a_read_from_a_closed_port_reports_a_lost_device(path: str) -> None:
     device = open_raw(path, 115200)
     device.close()
     with pytest.raises(SerialException):

@@ -46,7 +46,7 @@ def test_with_ftdi_replies_come_in_the_adapters_packets_and_not_line_by_line() -
     assert len(asyncio.run(first_piece(("ftdi",), cut))) % USB_PACKET == 0
 
 
-def test_each_fault_of_several_is_there() -> None:
+def test_several_simulated_faults_act_together() -> None:
     def noisy(piece: bytes) -> bool:
         return b"\x00\xff~ap0.00, bp" in piece
 
