@@ -268,10 +268,7 @@ COMMANDS: dict[str, How] = {
         "tests/simulate/test_simulate.py",
         "test_a_paired_run_finds_no_difference_to_the_same_code_and_names_the_first_one_else",
     ),
-    ".venv/bin/python -m tests.simulate --seed 1 --hours 24 --against ../before "
-    "--adapter tests/simulate/old_product.py": Shown("needs the history, and takes over an hour"),
-    "git worktree add --detach ../before 5450cf70": Shown("needs the history"),
-    'git -C ../before apply "$PWD/tests/simulate/before_the_simulator.patch"': Shown("the same"),
+    "git worktree add --detach ../other HEAD~1": Shown("needs the history"),
     ".venv/bin/coverage run": InCi(".venv/bin/coverage run"),
     ".venv/bin/coverage report": InCi(".venv/bin/coverage report"),
     ".venv/bin/python -m tests.simulate.planted": Shown("takes hours"),

@@ -78,7 +78,7 @@ def test_the_table_has_no_fault_that_is_not_planted_any_more() -> None:
 
 def test_a_change_of_a_judge_changes_the_version() -> None:
     """Each module of the simulator is hashed, unless it cannot change the finding of a seed."""
-    beside = {"__init__", "__main__", "differences", "old_product", "pairs", "shrink", "unjudged"}
+    beside = {"__init__", "__main__", "differences", "pairs", "shrink", "unjudged"}
     planting = {"planted", "planted_cases", "planted_faults"}
     modules = {path.stem for path in TABLE.parent.glob("*.py")}
     tests = {name for name in modules if name.startswith("test_")}

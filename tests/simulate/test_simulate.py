@@ -31,7 +31,6 @@ from tests.simulate.bad_moments import MOMENTS, NEW
 from tests.simulate.board_inputs import Inputs, kinds
 from tests.simulate.course import Course
 from tests.simulate.damage import Damage
-from tests.simulate.differences import CORRECTED, REWORDED
 from tests.simulate.followed import Followed
 from tests.simulate.jerk import Slope
 from tests.simulate.log_lines import LogLines
@@ -1671,19 +1670,6 @@ def test_a_pair_does_not_measure_the_memory_of_a_daemon(monkeypatch: pytest.Monk
     monkeypatch.delattr(Product, "largest")
     endless = {"at": 2.0, "for": 1.0, "do": "board", "fault": ["endless"]}
     assert Unjudged(quiet_with(endless)).played() == ""
-
-
-def test_the_list_names_each_file_that_the_patch_for_the_older_checkout_changes() -> None:
-    patch = (OURS / "tests" / "simulate" / "before_the_simulator.patch").read_text("utf-8")
-    changed = set(re.findall(r"^diff --git a/(\S+) b/", patch, re.MULTILINE))
-    assert changed == {path for _, paths in CORRECTED for path in paths}
-
-
-def test_reworded_phrases_keep_the_new_words() -> None:
-    # A replacement that another entry changes again would be the same on one side only by chance.
-    for _, new in REWORDED:
-        text = new.replace(r"\1", "7")
-        assert pairs.rewritten({"mode": "ready", "reason": text})["reason"] == text
 
 
 def test_a_listed_difference_is_taken_out_on_both_sides() -> None:
