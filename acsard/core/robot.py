@@ -332,8 +332,6 @@ class Robot:
             self._odometry.checks.hear(inputs.gyro)
         if not feedback:
             return ()
-        if session.lateness.ended_s:
-            self._odometry.stall(session.lateness.ended_s)
         estimates: list[Estimate] = []
         for line in feedback:
             estimates += [

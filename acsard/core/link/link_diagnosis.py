@@ -107,9 +107,6 @@ class Lateness:
         """Longest time between two steps since the last good line, s, or 0 if no step was late."""
         self.step_s = 0.0
         """Time between the last two steps, s, if the last step was late. Otherwise 0."""
-        self.ended_s = 0.0
-        """Longest time between two steps in the silence that the last step ended, s. 0 if the last
-        step ended no silence, or if no step in the silence was late."""
 
     def look(self, now_ns: int, good: bool) -> bool:
         """Record a step, and return whether a good line ends a silence that this computer caused.
@@ -121,7 +118,7 @@ class Lateness:
         passed_ns = 0 if before_ns is None else now_ns - before_ns
         self.step_s = passed_ns / NS_PER_S if passed_ns >= self._least_ns else 0.0
         late_s = max(self.late_s, self.step_s)
-        self.late_s, self.ended_s = (0.0, late_s) if good else (late_s, 0.0)
+        self.late_s = 0.0 if good else late_s
         return good and (late_s > 0.0 or self._simulated)
 
     def words(self, link: LinkState) -> str:

@@ -6,8 +6,7 @@ these sources that exists: the encoder counts in the line, whole counts that are
 speeds in the line, or these speeds times the time. It uses no time and no count twice, and leaves
 none out. In a gap that no line covers, `Rolling` assumes the speed before the gap for the first
 half of the gap, and the speed after the gap for the second half. If the daemon commanded rest
-during the first half, the speed before the gap is assumed only until that command, which a daemon
-that did not run has sent later. The motion
+during the first half, the speed before the gap is assumed only until that command. The motion
 during implausible lines, and in the gaps before them, is computed with the next plausible line.
 
 A damaged line after a gap would falsify the motion of the whole gap. `Confirmation` therefore holds
@@ -82,15 +81,8 @@ class Rolling:
 
         `quiet` is the time without feedback after which the daemon commands rest, s.
         """
-        self._quiet, self._late = quiet, 0.0
+        self._quiet = quiet
         self.forget()
-
-    def stall(self, seconds: float) -> None:
-        """Record that the daemon did not run for this time, s, before the next line.
-
-        So the daemon may have commanded rest later by this time.
-        """
-        self._late = max(self._late, seconds)
 
     def forget(self) -> None:
         """Forget the implausible lines since the last plausible one."""
@@ -126,7 +118,6 @@ class Rolling:
         `before` contains the wheel speeds of the last plausible line, rad/s.
         """
         speeds, dt, bridged = line.speeds.as_tuple(), line.dt, line.bridged + self._bridged
-        quiet, self._late = self._quiet + self._late, 0.0
         if not (self._skipped or bridged or line.gap or line.turned is not None):
             # Nearly every line takes this shortcut. The code below would give the same result.
             seen = times(speeds, dt)
@@ -150,7 +141,7 @@ class Rolling:
             if line.counted is not None:
                 pieces = _some(line.counted, times(speeds, lost))
             if bridged:
-                on = min(bridged / 2, quiet)
+                on = min(bridged / 2, self._quiet)
                 between = plus(times(before.as_tuple(), on), times(speeds, bridged - on))
                 seen, pieces = plus(between, said), _some(between, *pieces)
         return Rolled(pieces, turned, seen, seconds, bridged, unknown, 0.0 if unknown else known)

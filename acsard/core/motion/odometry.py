@@ -170,10 +170,6 @@ class Odometry:
         """
         self._rolling.skip(feedback)
 
-    def stall(self, seconds: float) -> None:
-        """Record that the daemon did not run for this time, s, in the silence before a line."""
-        self._rolling.stall(seconds)
-
     def confirmed(self, feedback: Feedback) -> tuple[list[Feedback], int]:
         """Return a pair: the lines for `fold`, the oldest first, and the number of dropped lines.
 

@@ -68,14 +68,6 @@ def test_a_silence_continues_the_speed_before_it_until_rest_is_commanded() -> No
     assert total(short) == pytest.approx(0.2), "until rest is commanded"
 
 
-def test_a_stall_of_the_daemon_delays_the_command_to_rest_in_the_next_line_only() -> None:
-    rolling = Rolling(quiet=0.1)
-    rolling.stall(0.2)
-    for seconds in (0.3, 0.1):
-        stood = rolling.take(Feedback(AT, WheelSpeeds(), 0.8, bridged=0.7), FOUR)
-        assert total(stood) == pytest.approx(4.0 * seconds)
-
-
 def test_counts_take_precedence_over_the_speed() -> None:
     counted = (0.05, 0.05, 0.05, 0.05)
     rolled = Rolling().take(Feedback(AT, FOUR, 0.01, counted=counted), TWO)
