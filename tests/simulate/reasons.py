@@ -23,7 +23,7 @@ KINDS = (
     ("proof", re.compile(r"\b(\w+) is new: ")),
     ("late", re.compile(r"\bcommands of (\w+) arrive .* too late\b")),
     ("priority", re.compile(r"\b(\w+) has (?:priority|the same priority)\b")),
-    ("stalled", re.compile(r"\bthe daemon (?:stood still|stalled): .* command of (\w+)")),
+    ("stalled", re.compile(r"\bthe daemon stalled: .* command of (\w+)")),
     ("command", re.compile(r"^(?:waiting for )?a command()\b")),
     ("", re.compile(r"^()$")),
 )
@@ -254,7 +254,9 @@ class Reasons:
             armed = heard.armed_ns > since_ns and certain
             if witness.neutral_first and not (armed and heard.own):
                 found.add("neutral")
-        if now_ns - self._stalled_ns < timeout_ns + NS:
+        if now_ns - self._stalled_ns < timeout_ns + MARGIN_NS and any(
+            heard.arrived_ns <= self._stalled_ns for heard in self._heard.get(source, {}).values()
+        ):
             # A stall prolongs the place of a sender that has not sent since.
             found.add("stalled")
         mine = witness.priority[source]
