@@ -1120,6 +1120,24 @@ def test_behind_a_suspend_only_a_sender_that_was_proved_before_may_be_called_lat
     assert ("late" in reasons.allowed("app", end_ns)) is late
 
 
+@pytest.mark.parametrize(("stalled_s", "after_s", "excused"), [
+    (3.1, 0.2, True), (2.9, 0.2, False), (3.1, 5.0, False),
+])  # fmt: skip
+def test_only_a_sender_that_was_silent_since_a_stall_may_wait_because_of_it(
+    stalled_s: float, after_s: float, excused: bool
+) -> None:
+    witness = witnessed()
+    witness.timeout["app"] = NS
+    run: Any = SimpleNamespace(witness=witness)
+    reasons, at_ns = Reasons(run), 3 * NS
+    one = Message(at_ns, at_ns, 0.1, 0.0, at_ns, 1, "")
+    found = sample(SIGNED, one, PLAIN["config"], 0)
+    witness.command(SIGNED, one, found, at_ns)
+    reasons.command(SIGNED, one, found)
+    reasons._stalled_ns = int(stalled_s * NS)
+    assert ("stalled" in reasons.allowed("app", int((stalled_s + after_s) * NS))) is excused
+
+
 def test_a_shared_identity_may_wait_for_a_zero_behind_messages_that_were_dropped() -> None:
     witness = witnessed()
     run: Any = SimpleNamespace(witness=witness)
