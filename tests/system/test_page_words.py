@@ -394,7 +394,7 @@ def test_a_stop_during_a_fault_says_that_it_stays_latched_after_the_fault(
     try:
         shows(browser, "mode", "FAULT")
         browser.tap("stop")
-        shows(browser, "complaint", "Release fault leads to STOPPED")
+        shows(browser, "complaint", "STOP is latched, too")
     finally:
         board.reply = usual
     shows(browser, "hint", "Press Release fault first")
