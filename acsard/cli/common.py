@@ -59,9 +59,10 @@ def require_asking(args: argparse.Namespace) -> None:
 
 
 def count(text: str) -> int:
-    """Return the whole number in `text`, which must be at least 1. This is an argparse type."""
-    if not text.isascii() or not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not a whole number of at least 1")
+    """Return the whole number in `text`, from 1 to 999999999. This is an argparse type."""
+    if not text.isascii() or not text.isdecimal() or len(text) > 9 or int(text) < 1:
+        words = f"{text[:40]} is not a whole number from 1 to 999999999"
+        raise argparse.ArgumentTypeError(words)
     return int(text)
 
 

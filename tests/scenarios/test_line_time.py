@@ -104,6 +104,76 @@ def test_the_pose_of_a_pushed_robot_is_right_although_stop_lines_leave_late(link
     assert at[-1] > 1.5
 
 
+class Gap:
+    """A checked link on which a gap in the feedback begins while the robot drives at a speed."""
+
+    def __init__(self, speed: float) -> None:
+        self.world, self.speed = World(Config(sim=FINE, mcu=McuConfig(link_check="auto"))), speed
+        self.estimates: list[Estimate] = []
+        self.world.watch = lambda outputs: self.estimates.extend(outputs.estimates)
+        self.world.run(1.5)
+        self.world.drive(speed, seconds=2.0)
+        self.before, self.variance = self.off, self.estimates[-1].covariance.xx
+
+    @property
+    def off(self) -> float:
+        """The error of the pose along its path, m."""
+        return self.world.state.x - self.world.mcu.vehicle.pose.x
+
+    def end(self) -> tuple[float, float]:
+        """End the gap at rest; return the error that it caused, m, and its deviation, m."""
+        self.world.hold(0.0, seconds=1.5)
+        grown = self.estimates[-1].covariance.xx - self.variance
+        return self.off - self.before, math.sqrt(grown)
+
+
+@pytest.mark.parametrize("waiting", [0.0, 0.2])
+@pytest.mark.parametrize("stall", [0.2, 0.3, 0.5])
+@pytest.mark.parametrize("kept", [0.0, 0.05])
+def test_a_stall_in_a_gap_does_not_end_the_motion_in_the_pose_before_rest_is_commanded(
+    kept: float, stall: float, waiting: float
+) -> None:
+    """The robot moves on while this computer sends nothing, until the zeros or the watchdog.
+
+    `waiting` is a stall before the gap: the reply to the line before it waits in the buffer.
+    """
+    gap = Gap(0.5)
+    if waiting:
+        gap.world.stall(waiting)
+    with gap.world.mcu.lost_replies(1):
+        gap.world.hold(0.5, seconds=kept)
+        gap.world.stall(stall)
+        gap.world.run(0.6 - kept - stall)
+    off, deviation = gap.end()
+    assert abs(off) < 0.1
+    assert abs(off) < 3 * deviation
+
+
+def test_a_stall_behind_the_command_to_rest_changes_nothing_in_the_pose() -> None:
+    found = []
+    for stall in (0.0, 0.3):
+        gap = Gap(0.5)
+        with gap.world.mcu.mute():
+            gap.world.hold(0.5, seconds=0.3)
+            gap.world.stall(stall)
+            gap.world.run(0.5 - stall)
+        found.append(gap.end()[0])
+    assert found[0] == pytest.approx(found[1], abs=0.002)
+
+
+@pytest.mark.parametrize("speed", [0.3, 0.6, 0.9])
+@pytest.mark.parametrize("seconds", [0.2, 0.35, 0.4, 0.5, 0.8])
+def test_a_board_that_misses_the_command_to_rest_is_in_the_covariance(
+    seconds: float, speed: float
+) -> None:
+    """It ignores all lines, so only its watchdog stops the robot: up to 0.2 s later."""
+    gap = Gap(speed)
+    with gap.world.mcu.lost_commands(1):
+        gap.world.hold(speed, seconds=seconds)
+    off, deviation = gap.end()
+    assert abs(off) < 3 * deviation
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("after", "every"), [(0.8, 3), (2.0, 2)])
 def test_a_board_that_answered_late_before_loses_no_distance_with_its_replies(

@@ -732,7 +732,7 @@ FAULTS = (
         "        if rolled.unknown > 1e9:\n            self._stand",
         Edit(
             ODOMETRY,
-            "self._uncertainty.doubt(*self._gaps.bridge(bridged, before, twist))",
+            "self._uncertainty.doubt(*self._gaps.bridge(bridged, before, twist, doubtful))",
             "self._gaps.interrupt(twist)",
         ),
     ),

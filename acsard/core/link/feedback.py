@@ -22,6 +22,7 @@ from acsard.core.config.wire_time import PLAIN_BYTES, wire_ns
 from acsard.core.link.checked_line import Reading
 from acsard.core.link.codec import Codec, Motors
 from acsard.core.link.encoders import Encoders, Turned
+from acsard.core.link.link_state import WATCHDOG_NS
 from acsard.core.link.sample_time import BRIDGED_S, FreeRunningTimes, Placed, PromptedTimes
 from acsard.core.values import NS_PER_S, Instant, WheelSpeeds
 
@@ -102,6 +103,10 @@ class Feedback(Struct, frozen=True, gc=False):
     """Quantization step of each wheel's reported speed, rad/s, `math.inf` if unknown."""
     count: float = 0.0
     """Angle of one encoder count, rad, 0 if the counts per turn are not configured."""
+    driven: float = 0.0
+    """Time from the previous line until the motors were commanded to rest, or until the watchdog
+    of the MCU stopped them for want of lines, s. It is negative if the command came before the
+    previous line, and 0 in the first line."""
 
 
 class ReplyStyle:
@@ -190,6 +195,9 @@ class Timeline:
         self._last: Instant | None = None
         self._heard_ns = self._end_ns = 0
         self._forgotten = True
+        self._rest_ns = 0
+        """Monotonic time, ns, of the first command to rest after the last command that moves a
+        wheel, or of the watchdog's stop if that is earlier."""
         self._last_placed = Placed("reads", 0)
         """The time of the last good line, according to the clock that was used for it."""
         self._spoilt = False
@@ -210,10 +218,14 @@ class Timeline:
         self._prompts.forget()
         self._forgotten = True
 
-    def left(self, at_ns: int) -> None:
-        """Record that a command was written at `at_ns` on the monotonic clock."""
+    def left(self, at_ns: int, moves: bool = True) -> None:
+        """Record that a command was written at `at_ns` on the monotonic clock.
+
+        `moves` is true if the command gives a speed to a wheel.
+        """
         self._prompts.left(at_ns)
         self._style.left()
+        self._rest_ns = at_ns + WATCHDOG_NS if moves else min(self._rest_ns, at_ns)
 
     def read(self, at: Instant, size: int, lines: int, following: int) -> None:
         """Process a read of the port that completes at least one line.
@@ -295,9 +307,12 @@ class Timeline:
             self._last_placed = self._placed_by_reads() if placed.clock == "reads" else placed
             dt = bridged = since = 0.0
         self._forgotten = False
+        driven = 0.0 if self._last is None else (self._rest_ns - self._last.mono_ns) / NS_PER_S
         at = self._sampled(came_ns, self._last_placed, length)
         since = 0.0 if silent else since
-        return Feedback(at, speeds, dt, gap, wheels, bridged, asked_ns, since, came_ns)
+        return Feedback(
+            at, speeds, dt, gap, wheels, bridged, asked_ns, since, came_ns, driven=driven
+        )
 
     def _placed(self, asked_ns: int | None, came_ns: int) -> Placed:
         """Return the time of the next line by the best available clock.

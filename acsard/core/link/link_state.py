@@ -52,6 +52,9 @@ WORDS: dict[State, str] = {
 WATCHDOG_S = 0.3
 """If the board receives no valid line from the daemon for this time, s, it stops the motors."""
 
+WATCHDOG_NS = int(WATCHDOG_S * NS_PER_S)
+"""`WATCHDOG_S` in ns."""
+
 GOOD_LINES = 3
 """The link comes up only after this number of good lines in a row. Fewer prove little, because a
 board may print anything after a reset."""

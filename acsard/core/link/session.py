@@ -22,7 +22,7 @@ from acsard.core.link.codec import Codec, FrameError
 from acsard.core.link.feedback import Feedback, Timeline
 from acsard.core.link.lines import LineReader
 from acsard.core.link.link_diagnosis import Lateness, SilenceDiagnosis
-from acsard.core.link.link_state import WATCHDOG_S, Link
+from acsard.core.link.link_state import WATCHDOG_NS, Link
 from acsard.core.link.link_state import State as LinkState
 from acsard.core.link.negotiation import BLIND_PERIOD_NS, MENDS, Negotiation, Throttle
 from acsard.core.link.quantization import CountRecovery
@@ -38,10 +38,6 @@ NAMES: dict[LinkState, EventName] = {
 LONG_GAP_NS = 1 * NS_PER_S
 """If for at least this time, ns, no line was received or no line was written, the MCU may have been
 reset meanwhile. After such a gap, every sender must send a zero before it can drive."""
-
-BLOCKED_NS = int(WATCHDOG_S * NS_PER_S)
-"""Time without a written line after which the output is reported as blocked, ns. By then the
-watchdog of the MCU has stopped the motors."""
 
 FORGET_NS = 3 * NS_PER_S
 """When the port was opened, another board may answer. After the link has been up for this time
@@ -77,6 +73,8 @@ class McuSession:
         highest value that the setting `mcu.reply_period` may have, s.
         """
         self.codec = Codec(mcu.wheels, mcu.trailing_comma)
+        self._rest = self.codec.stop.rstrip(b",\r\n")
+        """The first bytes of every line, plain or checked, with speed zero for all wheels."""
         self._lines = LineReader()
         self._needs_check = mcu.link_check == "require"
         self.statuses: list[tuple[int, BoardStatus]] = []
@@ -129,7 +127,7 @@ class McuSession:
         self._held_up = False
         """True if the port did not write the last line that was made."""
         self.blocked = False
-        """True if the port is open, but its driver has not accepted a line for `BLOCKED_NS`."""
+        """True if the port is open, but its driver has not accepted a line for `WATCHDOG_NS`."""
 
     @property
     def link(self) -> LinkState:
@@ -249,7 +247,7 @@ class McuSession:
         if went:
             line, left_ns = made[0], made[1] + late_ns
             self.negotiation.left(line)
-            self._timeline.left(left_ns)
+            self._timeline.left(left_ns, moves=not line.startswith(self._rest))
             self.restarted = self.blocked and left_ns - self._left_ns >= LONG_GAP_NS
             self._left_ns = left_ns
         elif blind and port_open:
@@ -287,7 +285,7 @@ class McuSession:
         link, check = self._link, self.negotiation
         if not self._held_up:
             self.blocked = False
-        elif now_ns - self._left_ns > BLOCKED_NS and not self.lateness.step_s:
+        elif now_ns - self._left_ns > WATCHDOG_NS and not self.lateness.step_s:
             # In a late step, the last written line is old because this computer did not run.
             self.blocked = True
         if self.blocked:

@@ -5,8 +5,8 @@ implausible line is a line that `sanity.py` or `Confirmation` rejects.) `Rolling
 these sources that exists: the encoder counts in the line, whole counts that are recovered from the
 speeds in the line, or these speeds times the time. It uses no time and no count twice, and leaves
 none out. In a gap that no line covers, `Rolling` assumes the speed before the gap for the first
-half of the gap, and the speed after the gap for the second half. If the daemon commanded rest
-during the first half, the speed before the gap is assumed only until that command. The motion
+half of the gap, and the speed after the gap for the second half. If the motors were commanded to
+rest during the first half, the speed before the gap is assumed only until that command. The motion
 during implausible lines, and in the gaps before them, is computed with the next plausible line.
 
 A damaged line after a gap would falsify the motion of the whole gap. `Confirmation` therefore holds
@@ -24,6 +24,7 @@ from msgspec import Struct
 from acsard.core.config.settings import FeedbackConfig
 from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
+from acsard.core.link.link_state import WATCHDOG_S
 from acsard.core.motion.error_model import SMOOTHED
 from acsard.core.motion.sanity import SLACK
 from acsard.core.values import REST, Twist, WheelSpeeds
@@ -71,6 +72,9 @@ class Rolled(Struct, frozen=True, gc=False):
     """Time in addition to `seconds` in which the motion of the robot is unknown, s."""
     known: float
     """Duration of `pieces` and `turned` together, s; 0 if a part of the motion is unknown."""
+    doubtful: float = 0.0
+    """Part of `bridged`, s: the time from the assumed stop of the wheels to the stop by the MCU's
+    watchdog. The wheels moved in this part if the MCU did not receive the command to rest."""
 
 
 class Rolling:
@@ -79,18 +83,19 @@ class Rolling:
     def __init__(self, quiet: float = math.inf) -> None:
         """Start without implausible lines.
 
-        `quiet` is the time without feedback after which the daemon commands rest, s.
+        `quiet` is the time without feedback after which a running daemon commands rest, s.
         """
         self._quiet = quiet
         self.forget()
 
     def forget(self) -> None:
         """Forget the implausible lines since the last plausible one."""
-        self._lost = self._gap = self._bridged = self._counted = 0.0
+        self._lost = self._gap = self._bridged = self._counted = self._driven = 0.0
         """Durations, s. `_lost` is the time that implausible lines without counts cover, and
         `_counted` the time that implausible lines with counts cover. `_bridged` and `_gap` are the
         gaps before the lines without counts: `_bridged` is the total of those that can be filled,
-        and `_gap` is the total of those that cannot."""
+        and `_gap` is the total of those that cannot. `_driven` is the part of `_bridged` before the
+        command to rest."""
         self._turned, self._skipped = NOWHERE, 0
 
     @property
@@ -107,10 +112,15 @@ class Rolling:
         if line.turned is None:
             self._lost += line.dt - line.bridged
             self._gap += line.gap
+            self._driven = self._driven_in(line)
             self._bridged += line.bridged
         else:
             self._counted += line.dt
             self._turned = plus(self._turned, line.turned)
+
+    def _driven_in(self, line: Feedback) -> float:
+        """Return the part of the gaps before `line` until rest was commanded to the motors, s."""
+        return self._bridged + line.driven if line.bridged else self._driven
 
     def take(self, line: Feedback, before: WheelSpeeds) -> Rolled:
         """Return the angles that the wheels rolled from the last plausible line to this one.
@@ -128,6 +138,7 @@ class Rolling:
         guessed = self._lost <= MAX_LOST_S or self._skipped <= MAX_LOST
         lost, unknown = (self._lost, 0.0) if guessed else (0.0, self._lost)
         turned, filled, unknown = self._turned, self._bridged, unknown + self._gap
+        driven, doubtful = self._driven_in(line), 0.0
         known = lost + filled + self._counted + dt
         if self._skipped:
             self.forget()
@@ -141,10 +152,14 @@ class Rolling:
             if line.counted is not None:
                 pieces = _some(line.counted, times(speeds, lost))
             if bridged:
-                on = min(bridged / 2, self._quiet)
+                # If rest was commanded before `quiet`, the wheels still need time to slow down.
+                stops = max(self._quiet, driven)
+                doubtful = max(0.0, min(bridged, WATCHDOG_S) - stops)
+                on = min(bridged / 2, stops)
                 between = plus(times(before.as_tuple(), on), times(speeds, bridged - on))
                 seen, pieces = plus(between, said), _some(between, *pieces)
-        return Rolled(pieces, turned, seen, seconds, bridged, unknown, 0.0 if unknown else known)
+        known = 0.0 if unknown else known
+        return Rolled(pieces, turned, seen, seconds, bridged, unknown, known, doubtful)
 
 
 def _some(*pieces: Motors) -> tuple[Motors, ...]:
@@ -297,18 +312,23 @@ class Gaps:
             self._turning += (turned * turned * scale - self._turning) / self._spans
         self._first, self._seconds, self._distance, self._turn = twist, 0.0, 0.0, 0.0
 
-    def bridge(self, seconds: float, before: Twist, after: Twist) -> tuple[float, float]:
+    def bridge(
+        self, seconds: float, before: Twist, after: Twist, doubtful: float = 0.0
+    ) -> tuple[float, float]:
         """Return a pair: the variances of distance (m2) and turn (rad2) that a filled gap adds.
 
         The gap lasts `seconds` s. If it directly follows another gap, both count as one longer gap,
         and the result is the increase of the variances since the earlier gap. `before` and `after`
-        are the twists before and after this gap.
+        are the twists before and after this gap. During `doubtful` s of the gap, the robot had
+        either of these twists, both with the probability 1/2.
         """
         bridged, given = self._bridged + seconds, self._given
         along, yaw = self.unseen(bridged, before, after)
         self.interrupt(after)
         self._bridged, self._given = bridged, (max(along, given[0]), max(yaw, given[1]))
-        return max(0.0, along - given[0]), max(0.0, yaw - given[1])
+        late = doubtful / 2 * (before.linear - after.linear)
+        late_turn = doubtful / 2 * (before.angular - after.angular)
+        return max(0.0, along - given[0]) + late**2, max(0.0, yaw - given[1]) + late_turn**2
 
     def unseen(self, seconds: float, before: Twist, after: Twist) -> tuple[float, float]:
         """Return the variances of the distance (m2) and the turn (rad2) in a gap of `seconds` s.

@@ -209,7 +209,7 @@ class Odometry:
         if rolled.unknown > 0.0:
             self._stand(rolled.unknown, before, twist)
         turned = self._move(self._settled(rolled, at_rest), turn, speeds, slips)
-        self._go_on(rolled.bridged, feedback, before, twist)
+        self._go_on(rolled, feedback, before, twist)
         variances = self._twist_variances(twist, feedback, at_rest, turn, slips)
         if turn is not None and dt > 0.0:
             twist = Twist(linear, turn.rate)
@@ -306,16 +306,16 @@ class Odometry:
         self._steps.append(Step(pose, pieces, turn, speeds, turned, on_trial, self._track.share))
         return turned
 
-    def _go_on(self, bridged: float, feedback: Feedback, before: Twist, twist: Twist) -> None:
+    def _go_on(self, rolled: Rolled, feedback: Feedback, before: Twist, twist: Twist) -> None:
         """Add the uncertainty of a filled gap; without a gap, measure how the twist changes.
 
-        `bridged` is the duration of the filled gap, s; 0 without one. `before` and `twist` are the
-        twists of the line before and of this line. A gap that was not filled restarts the
-        measurement.
+        `before` and `twist` are the twists of the line before and of this line. A gap that was not
+        filled restarts the measurement.
         """
+        bridged, doubtful = rolled.bridged, rolled.doubtful
         if bridged > 0.0:
             self.bridged += bridged
-            self._uncertainty.doubt(*self._gaps.bridge(bridged, before, twist))
+            self._uncertainty.doubt(*self._gaps.bridge(bridged, before, twist, doubtful))
         elif feedback.gap:
             self._gaps.interrupt(twist)
         else:

@@ -59,7 +59,7 @@ WheelFault = Literal["dead", "reversed", "stuck"]
 
 WORDS: dict[WheelFault, str] = {
     "dead": "reports no motion while the other wheel on its side turns",
-    "reversed": "turns opposite to the other wheel on its side, by its encoder",
+    "reversed": "reports a direction opposite to that of the other wheel on its side",
     "stuck": "reports a speed that never changes",
 }
 

@@ -660,6 +660,70 @@ def test_the_bad_lines_of_an_update_make_one_event_for_each_reason(reads: int) -
     assert bench.session.rejects == {"malformed": 201 * reads, "too_long": reads}
 
 
+# the command to rest
+
+
+def driven_ms(bench: Bench, *lines: tuple[WheelSpeeds, float]) -> float:
+    """Write these lines, each followed by this silence in ms, and then receive a good line.
+
+    Return the time in ms from the sample before the first line to the command to rest.
+    """
+    for speeds, ms in lines:
+        bench.line(speeds)
+        bench.wait(ms)
+    (feedback,) = bench.wait(0, GOOD)
+    return 1000 * feedback.driven
+
+
+WIRE_MS = wire_ns(len(GOOD), 115200) / MS
+
+
+@pytest.mark.parametrize(
+    "mcu",
+    [
+        McuConfig(),
+        McuConfig(trailing_comma=True),
+        McuConfig(wheels=WheelMap("-d", "+c", "-b", "+a")),
+    ],
+)
+def test_a_line_tells_when_rest_was_commanded_after_the_last_motion(mcu: McuConfig) -> None:
+    moves, rests = (SLOW, 10.0), (STILL, 10.0)
+    bench = Bench(mcu).up()
+    assert driven_ms(bench, moves, moves, rests, rests) == pytest.approx(20 + WIRE_MS)
+    assert driven_ms(bench, rests, rests) == pytest.approx(-20 + WIRE_MS), "before that line"
+    assert driven_ms(bench, moves, rests, moves, rests) == pytest.approx(30 + WIRE_MS)
+
+
+def test_behind_a_stall_the_watchdog_has_stopped_the_motors_before_the_zeros() -> None:
+    bench = Bench(rate_hz=20.0).up()
+    assert driven_ms(bench, (SLOW, 10), (SLOW, 190), (STILL, 10)) == pytest.approx(200 + WIRE_MS)
+    late = driven_ms(bench, (SLOW, 10), (SLOW, 500), (STILL, 10), (STILL, 10))
+    assert late == pytest.approx(310 + WIRE_MS)
+
+
+def test_zeros_that_did_not_leave_command_no_rest() -> None:
+    bench = Bench().up()
+    bench.line(SLOW)
+    bench.wait(10)
+    for left in (False, True):
+        bench.line(STILL)
+        update(bench, left=left, read=b"")
+    (feedback,) = bench.wait(0, GOOD)
+    assert 1000 * feedback.driven == pytest.approx(20 + WIRE_MS)
+
+
+def test_a_checked_line_of_zeros_commands_rest() -> None:
+    bench = Bench(McuConfig(link_check="auto")).checked()
+    line = bench.line(SLOW)
+    assert line is not None
+    bench.wait(10)
+    zeros = bench.line(STILL)
+    (feedback,) = bench.wait(10, bench.answer(zeros))
+    assert 1000 * feedback.driven == pytest.approx(
+        10 + wire_ns(len(bench.answer(zeros)), 115200) / MS
+    )
+
+
 # a blocked output
 
 

@@ -68,6 +68,43 @@ def test_a_silence_continues_the_speed_before_it_until_rest_is_commanded() -> No
     assert total(short) == pytest.approx(0.2), "until rest is commanded"
 
 
+@pytest.mark.parametrize(
+    ("driven", "on", "doubtful"),
+    [(-0.5, 0.1, 0.2), (0.05, 0.1, 0.2), (0.2, 0.2, 0.1), (0.3, 0.3, 0.0), (0.6, 0.35, 0.0)],
+)
+def test_a_late_command_to_rest_is_used_and_an_early_one_leaves_time_to_slow_down(
+    driven: float, on: float, doubtful: float
+) -> None:
+    """`on` is the time at the speed before the gap; it is at most half of the gap."""
+    line = Feedback(AT, STILL, 0.8, bridged=0.7, driven=driven)
+    stood = Rolling(quiet=0.1).take(line, FOUR)
+    assert total(stood) == pytest.approx(4.0 * on)
+    assert stood.doubtful == pytest.approx(doubtful)
+
+
+def test_in_a_short_gap_no_command_to_rest_is_doubtful() -> None:
+    line = Feedback(AT, TWO, 0.1, bridged=0.09, driven=0.05)
+    assert Rolling(quiet=0.1).take(line, FOUR).doubtful == 0.0
+
+
+@pytest.mark.parametrize(("late", "on"), [(0.15, 0.25), (-0.05, 0.1)])
+def test_the_command_to_rest_may_come_in_the_gap_behind_an_implausible_line(
+    late: float, on: float
+) -> None:
+    """`late` is the time from the implausible line to the command; the gap before it has 0.1 s."""
+    rolling = Rolling(quiet=0.1)
+    rolling.skip(Feedback(AT, FOUR, 0.11, bridged=0.1, driven=0.4))
+    stood = rolling.take(Feedback(AT, STILL, 0.7, bridged=0.6, driven=late), FOUR)
+    assert total(stood) == pytest.approx(4.0 * on)
+
+
+def test_the_command_to_rest_in_a_gap_before_an_implausible_line_is_used() -> None:
+    rolling = Rolling(quiet=0.1)
+    rolling.skip(Feedback(AT, FOUR, 0.61, bridged=0.6, driven=0.2))
+    stood = rolling.take(Feedback(AT, STILL, 0.01, driven=-0.4), FOUR)
+    assert total(stood) == pytest.approx(4.0 * 0.2)
+
+
 def test_counts_take_precedence_over_the_speed() -> None:
     counted = (0.05, 0.05, 0.05, 0.05)
     rolled = Rolling().take(Feedback(AT, FOUR, 0.01, counted=counted), TWO)
@@ -334,3 +371,12 @@ def test_a_line_between_two_gaps_makes_their_errors_independent() -> None:
     gaps.follow(CRUISE, 0.01)
     assert gaps.bridge(0.3, CRUISE, CRUISE) == first
     assert gaps.bridge(0.3, CRUISE, CRUISE)[0] > 20 * first[0]
+
+
+def test_a_command_to_rest_that_may_be_lost_makes_the_motion_uncertain() -> None:
+    """The robot moved on, or it stood, for 0.2 s: each is 0.1 s away from the mean."""
+    before, after = Twist(0.5, 1.0), Twist(0.1, -1.0)
+    sure = Gaps().bridge(0.5, before, after)
+    unsure = Gaps().bridge(0.5, before, after, doubtful=0.2)
+    assert (unsure[0] - sure[0], unsure[1] - sure[1]) == near((0.1 * 0.4) ** 2, (0.1 * 2.0) ** 2)
+    assert Gaps().bridge(0.5, REST, REST, doubtful=0.2) == (0.0, 0.0)
