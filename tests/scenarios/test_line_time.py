@@ -127,20 +127,22 @@ class Gap:
         return self.off - self.before, math.sqrt(grown)
 
 
+@pytest.mark.parametrize("mute", [False, True], ids=["lost replies", "mute"])
 @pytest.mark.parametrize("waiting", [0.0, 0.2])
 @pytest.mark.parametrize("stall", [0.2, 0.3, 0.5])
 @pytest.mark.parametrize("kept", [0.0, 0.05])
 def test_a_stall_in_a_gap_does_not_end_the_motion_in_the_pose_before_rest_is_commanded(
-    kept: float, stall: float, waiting: float
+    kept: float, stall: float, waiting: float, mute: bool
 ) -> None:
     """The robot moves on while this computer sends nothing, until the zeros or the watchdog.
 
-    `waiting` is a stall before the gap: the reply to the line before it waits in the buffer.
+    A mute board takes no samples, so that its first speeds are the means over the gap. `waiting` is
+    a stall before the gap: the reply to the line before it waits in the buffer.
     """
     gap = Gap(0.5)
     if waiting:
         gap.world.stall(waiting)
-    with gap.world.mcu.lost_replies(1):
+    with gap.world.mcu.mute() if mute else gap.world.mcu.lost_replies(1):
         gap.world.hold(0.5, seconds=kept)
         gap.world.stall(stall)
         gap.world.run(0.6 - kept - stall)

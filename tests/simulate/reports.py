@@ -28,6 +28,9 @@ ECHO_LINES, ECHO_CHANGE = 40, 6.0
 """Lines with another speed, and rad/s of change in all, by which an echo is known as one: twice as
 many as the pages say, and three times the change."""
 
+ECHO_BACK = 10
+"""Lines behind the first bend, after which its own line surely came back and was read."""
+
 ECHO_CORNER = 0.025
 """rad/s by which two changes of speed must differ, because a straight ramp shows no echo."""
 
@@ -145,7 +148,9 @@ class _Changes:
 
     def restart(self) -> None:
         """Note that the daemon, or the opening of its port, begins anew."""
-        self._lines, self._change, self._corner = 0, 0.0, False
+        self._lines, self._change = 0, 0.0
+        self._since_corner = 0
+        """Number of lines since the first bend of the speeds, which may still be on the wire."""
         self._last: tuple[float, ...] = ()
         self._slope: list[float] = []
 
@@ -158,10 +163,11 @@ class _Changes:
             return False
         slope = self._slope = [new - old for new, old in zip(wheels, last, strict=True)]
         bends = [abs(new - old) for new, old in zip(slope, before or slope, strict=True)]
-        self._corner |= max(bends) > ECHO_CORNER
+        self._since_corner += self._since_corner > 0 or max(bends) > ECHO_CORNER
         self._change += max(map(abs, slope))
         self._lines += any(wheels) and any(slope)
-        return self._lines > ECHO_LINES and self._change > ECHO_CHANGE and self._corner
+        enough = self._lines > ECHO_LINES and self._change > ECHO_CHANGE
+        return enough and self._since_corner > ECHO_BACK
 
     @property
     def text(self) -> str:

@@ -1034,6 +1034,16 @@ def test_a_new_daemon_learns_anew_that_it_hears_itself(restarts: bool) -> None:
             echo.line(n * NS, (0.2 * max(0, n - 5),) * 4)
 
 
+@pytest.mark.parametrize(("lines", "finding"), [(56, False), (70, True)])
+def test_the_line_that_shows_an_echo_must_come_back_first(lines: int, finding: bool) -> None:
+    """A steady ramp shows no echo; its end is line 50, which is on the wire for some lines."""
+    echo = Echo()
+    echo.begin()
+    with pytest.raises(BrokenError, match="an echo is no board") if finding else nullcontext():
+        for n in range(1, lines):
+            echo.line(n * NS, (0.2 * min(n, 50),) * 4)
+
+
 def test_a_steady_ramp_need_not_show_an_echo() -> None:
     echo = Echo()
     echo.begin()

@@ -6,8 +6,8 @@ these sources that exists: the encoder counts in the line, whole counts that are
 speeds in the line, or these speeds times the time. It uses no time and no count twice, and leaves
 none out. In a gap that no line covers, `Rolling` assumes the speed before the gap for the first
 half of the gap, and the speed after the gap for the second half. If the motors were commanded to
-rest during the first half, the speed before the gap is assumed only until that command. The motion
-during implausible lines, and in the gaps before them, is computed with the next plausible line.
+rest in the gap, the speed before the gap is assumed only until that command. The motion during
+implausible lines, and in the gaps before them, is computed with the next plausible line.
 
 A damaged line after a gap would falsify the motion of the whole gap. `Confirmation` therefore holds
 a line with a doubtful speed until other lines confirm this speed or refute it.
@@ -73,8 +73,8 @@ class Rolled(Struct, frozen=True, gc=False):
     known: float
     """Duration of `pieces` and `turned` together, s; 0 if a part of the motion is unknown."""
     doubtful: float = 0.0
-    """Part of `bridged`, s: the time from the assumed stop of the wheels to the stop by the MCU's
-    watchdog. The wheels moved in this part if the MCU did not receive the command to rest."""
+    """Time in the gap from the command to rest until the MCU's watchdog stops the motors, s. The
+    wheels moved on in this time if the MCU did not receive the command."""
 
 
 class Rolling:
@@ -152,11 +152,14 @@ class Rolling:
             if line.counted is not None:
                 pieces = _some(line.counted, times(speeds, lost))
             if bridged:
-                # If rest was commanded before `quiet`, the wheels still need time to slow down.
+                first, second = before.as_tuple(), speeds
                 stops = max(self._quiet, driven)
                 doubtful = max(0.0, min(bridged, WATCHDOG_S) - stops)
-                on = min(bridged / 2, stops)
-                between = plus(times(before.as_tuple(), on), times(speeds, bridged - on))
+                if self._quiet < driven < bridged:
+                    between = _until_rest(first, driven, second, bridged)
+                else:
+                    on = min(bridged / 2, stops)
+                    between = plus(times(first, on), times(second, bridged - on))
                 seen, pieces = plus(between, said), _some(between, *pieces)
         known = 0.0 if unknown else known
         return Rolled(pieces, turned, seen, seconds, bridged, unknown, known, doubtful)
@@ -164,6 +167,23 @@ class Rolling:
 
 def _some(*pieces: Motors) -> tuple[Motors, ...]:
     return tuple([piece for piece in pieces if piece != NOWHERE])
+
+
+def _until_rest(before: Motors, driven: float, after: Motors, bridged: float) -> Motors:
+    """Return the angles of the wheels in a gap in which rest was commanded after `driven` s, rad.
+
+    `before` and `after` are the speeds around the gap, rad/s, and `bridged` is its duration, s. A
+    board that computes its speeds since its last reply reports the means over the gap. These means
+    are large enough for the motion until the command to rest. If a speed is smaller, it is the
+    speed at the end of the gap.
+    """
+    angles = []
+    for old, new in zip(before, after, strict=True):
+        until, whole = old * driven, new * bridged
+        is_mean = abs(whole) >= abs(until) and whole * until >= 0.0
+        angles.append(whole if is_mean else until + new * (bridged - driven))
+    front_right, front_left, rear_left, rear_right = angles
+    return front_right, front_left, rear_left, rear_right
 
 
 def plus(a: Motors, b: Motors) -> Motors:
@@ -319,16 +339,20 @@ class Gaps:
 
         The gap lasts `seconds` s. If it directly follows another gap, both count as one longer gap,
         and the result is the increase of the variances since the earlier gap. `before` and `after`
-        are the twists before and after this gap. During `doubtful` s of the gap, the robot had
-        either of these twists, both with the probability 1/2.
+        are the twists before and after this gap. During `doubtful` s of the gap, the robot is
+        assumed to have had the twist `after`, but it had the twist `before` with the probability
+        1/2.
         """
         bridged, given = self._bridged + seconds, self._given
         along, yaw = self.unseen(bridged, before, after)
         self.interrupt(after)
         self._bridged, self._given = bridged, (max(along, given[0]), max(yaw, given[1]))
-        late = doubtful / 2 * (before.linear - after.linear)
-        late_turn = doubtful / 2 * (before.angular - after.angular)
-        return max(0.0, along - given[0]) + late**2, max(0.0, yaw - given[1]) + late_turn**2
+        late = doubtful * (before.linear - after.linear)
+        late_turn = doubtful * (before.angular - after.angular)
+        return (
+            max(0.0, along - given[0]) + late**2 / 2,
+            max(0.0, yaw - given[1]) + late_turn**2 / 2,
+        )
 
     def unseen(self, seconds: float, before: Twist, after: Twist) -> tuple[float, float]:
         """Return the variances of the distance (m2) and the turn (rad2) in a gap of `seconds` s.

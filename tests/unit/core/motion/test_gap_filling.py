@@ -70,16 +70,26 @@ def test_a_silence_continues_the_speed_before_it_until_rest_is_commanded() -> No
 
 @pytest.mark.parametrize(
     ("driven", "on", "doubtful"),
-    [(-0.5, 0.1, 0.2), (0.05, 0.1, 0.2), (0.2, 0.2, 0.1), (0.3, 0.3, 0.0), (0.6, 0.35, 0.0)],
+    [(-0.5, 0.1, 0.2), (0.05, 0.1, 0.2), (0.2, 0.2, 0.1), (0.6, 0.6, 0.0), (0.8, 0.35, 0.0)],
 )
 def test_a_late_command_to_rest_is_used_and_an_early_one_leaves_time_to_slow_down(
     driven: float, on: float, doubtful: float
 ) -> None:
-    """`on` is the time at the speed before the gap; it is at most half of the gap."""
+    """`on` is the time at the speed before the gap. Without rest in the gap, it is half of it."""
     line = Feedback(AT, STILL, 0.8, bridged=0.7, driven=driven)
     stood = Rolling(quiet=0.1).take(line, FOUR)
     assert total(stood) == pytest.approx(4.0 * on)
     assert stood.doubtful == pytest.approx(doubtful)
+
+
+@pytest.mark.parametrize(("after", "angle"), [(1.5, 1.05), (1.0, 1.3), (-0.5, 0.55), (4.0, 2.8)])
+def test_speeds_that_are_large_enough_are_means_over_the_gap(after: float, angle: float) -> None:
+    """Until rest was commanded, the wheels rolled 0.8 rad at 4 rad/s; 1.14 rad/s are this mean."""
+    line = Feedback(AT, WheelSpeeds(after, after, after, after), 0.7, bridged=0.7, driven=0.2)
+    assert total(Rolling(quiet=0.1).take(line, FOUR)) == pytest.approx(angle)
+    mirrored = Feedback(AT, WheelSpeeds(*(-after,) * 4), 0.7, bridged=0.7, driven=0.2)
+    back = Rolling(quiet=0.1).take(mirrored, WheelSpeeds(-4.0, -4.0, -4.0, -4.0))
+    assert total(back) == pytest.approx(-angle)
 
 
 def test_in_a_short_gap_no_command_to_rest_is_doubtful() -> None:
@@ -374,9 +384,11 @@ def test_a_line_between_two_gaps_makes_their_errors_independent() -> None:
 
 
 def test_a_command_to_rest_that_may_be_lost_makes_the_motion_uncertain() -> None:
-    """The robot moved on, or it stood, for 0.2 s: each is 0.1 s away from the mean."""
+    """The robot is assumed to have stood for 0.2 s, but it moved on with the probability 1/2."""
     before, after = Twist(0.5, 1.0), Twist(0.1, -1.0)
     sure = Gaps().bridge(0.5, before, after)
     unsure = Gaps().bridge(0.5, before, after, doubtful=0.2)
-    assert (unsure[0] - sure[0], unsure[1] - sure[1]) == near((0.1 * 0.4) ** 2, (0.1 * 2.0) ** 2)
+    assert (unsure[0] - sure[0], unsure[1] - sure[1]) == near(
+        (0.2 * 0.4) ** 2 / 2, (0.2 * 2.0) ** 2 / 2
+    )
     assert Gaps().bridge(0.5, REST, REST, doubtful=0.2) == (0.0, 0.0)
