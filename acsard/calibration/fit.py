@@ -123,10 +123,10 @@ def of_rows(
 
 
 def condition(normal: Floats) -> float:
-    """Return the condition number of `normal`, scaled so that its diagonal is 1.
+    """Return the condition number of the matrix `normal` after scaling its diagonal to 1.
 
-    Because of the scaling, the units of the parameters do not matter. The number is infinite if a
-    parameter has no influence (0 on the diagonal).
+    Because of the scaling, the units of the parameters do not matter. The condition number is
+    infinite if a parameter does not influence the predictions (0 on the diagonal).
     """
     size = np.sqrt(np.diag(normal))
     if not np.all(size > 0.0):
@@ -191,8 +191,8 @@ class Fit(Struct, frozen=True):
     score: Floats
     """Right-hand sides of the normal equations, shape (blocks, COUNT)."""
     known: Floats
-    """Left-hand side of the normal equations of constraints and prior information, shape
-    (COUNT, COUNT)."""
+    """Matrix that the constraints and the prior information add to the left-hand side of the normal
+    equations, shape (COUNT, COUNT)."""
     active: tuple[P, ...]
     """Indices of the parameters that were fitted."""
     converged: bool
@@ -210,10 +210,16 @@ class Fit(Struct, frozen=True):
         return found
 
     def marginal(self) -> Floats:
-        """Return the left-hand side of the normal equations of left radius, right radius and track.
+        """Return the matrix on the left-hand side of the normal equations of the wheel parameters.
 
-        All other parameters are eliminated. If no positions show the size of the wheels, only two
-        unknowns remain: the difference of the radii, and the inverse track.
+        The other fitted parameters are eliminated by a Schur complement. The matrix includes the
+        constraints and the prior information. There are two cases:
+
+        - If the fit used positions, the shape is (3, 3). The unknowns are the left radius, the
+          right radius and the inverse track.
+        - If the fit used no positions, the evidence does not show the mean radius of the wheels.
+          The shape is (2, 2). The unknowns are the right radius minus the left radius, and the
+          inverse track.
         """
         total = self.normal.sum(axis=0) + self.known
         rest = [index for index in self.active if index > P.INVERSE_TRACK]
@@ -307,11 +313,13 @@ def fit(
 
 
 def _sum(evidence: Sequence[Evidence]) -> tuple[Floats, Floats]:
-    """Return the normal equations of all sensors: a pair of their left-hand and right-hand sides.
+    """Return the normal equations of all sensors, as a pair of arrays.
 
-    Both are weighted sums over the sensors. The weight of a sensor follows from the differences
-    between the right-hand sides of its blocks. Unlike the residuals, these differences become
-    larger if the residuals are correlated.
+    The first array has the left-hand side for each block, shape (blocks, COUNT, COUNT). The second
+    array has the right-hand side for each block, shape (blocks, COUNT). Both arrays are weighted
+    sums over the sensors. The weight of a sensor follows from the differences between the
+    right-hand sides of its blocks. Unlike the residuals, these differences become larger if the
+    residuals are correlated.
     """
     normal, score = np.zeros_like(evidence[0].normal), np.zeros_like(evidence[0].score)
     for part in evidence:
@@ -337,9 +345,15 @@ def _weight(part: Evidence) -> float:
 def _known(
     parameters: Floats, held: Sequence[Held], usual: Mapping[P, float]
 ) -> tuple[Floats, Floats]:
-    """Return the normal equations of constraints and priors: a pair of left and right-hand side.
+    """Return the normal equations of the constraints and of the prior information, as a pair.
 
-    `held` contains the constraints. `usual` contains the prior standard deviations.
+    The first array is the left-hand side, shape (COUNT, COUNT). The second array is the right-hand
+    side, shape (COUNT,).
+
+    Args:
+        parameters: the present parameters of the fit.
+        held: the constraints.
+        usual: the prior standard deviation of each parameter that has one.
     """
     normal, score = np.zeros((COUNT, COUNT)), np.zeros(COUNT)
     for index, deviation in usual.items():

@@ -47,13 +47,18 @@ A value contains the first bytes of such a file, and words for the error message
 
 
 def calibrated(log: Path, config: Config, tape: Tape | None, choice: Choice) -> Calibration:
-    """Return the calibration from a recorded drive: a file, or the directory of a bag.
+    """Compute the calibration from a recording of the robot while it drove, and return it.
 
-    `choice` names the topics and the axis to use if the drive is a bag. `tape` is a distance that
-    was measured by tape.
+    Args:
+        log: path of the recording: a CSV file, a black-box recording of acsard, an MCAP file of a
+            ROS 2 bag, or the directory of a ROS 2 bag.
+        config: the configuration of the robot.
+        tape: a distance that a person measured by tape, or None.
+        choice: the topics and the axis of the IMU to use. Only a ROS 2 bag permits such a choice.
 
     Raises:
-        LogError: the content of the log is unreadable, incomplete or wrong.
+        LogError: the content of the log is unreadable, incomplete or wrong, or `choice` is not the
+            default although the log is not a ROS 2 bag.
         MendableError: the file cannot be opened, or is too large.
         RefusedError: the log is valid, but it gives no useful calibration.
     """
@@ -130,7 +135,10 @@ def _bag(files: list[Path], config: Config, choice: Choice) -> Table:
 
 
 def _messages(file: Path, notes: list[str]) -> Iterator[RosMessage]:
-    """Yield the messages in file order. If the file is cut off or damaged, stop and add a note."""
+    """Yield the messages of a bag file in file order.
+
+    If the file is cut off or damaged, the generator appends a note to `notes` and ends.
+    """
     with file.open("rb") as stream:
         try:
             for schema, channel, one in _reader(stream).iter_messages(log_time_order=False):

@@ -83,7 +83,7 @@ LEAST_S = 0.001
 """`Board.drive` sends no further line if less than this part of its duration is left, s."""
 
 BEAT_NS = int(motion.PERIOD_S * NS_PER_S)
-"""Interval at which `Board.listen` measures the lateness of this computer, ns."""
+"""Interval at which `Board.listen` measures how late this computer runs the check, ns."""
 
 FAREWELL = 5
 """Number of times that zeros are sent at the end of the check."""
@@ -107,8 +107,8 @@ class Board:
         self.longest_reply_s = longest_reply
         """Largest permitted value of mcu.reply_period, s."""
         self.armed = False
-        """Whether the check has seen all motors stand. Once this is true, a motor that runs away
-        ends the check."""
+        """Whether the check has seen all motors stand still. Once this is true, a motor that runs
+        away ends the check."""
         self.between: Callable[[], object] = _nothing
         """Callback that may raise an exception to end the check. `send` calls it before each line
         that turns a motor. `listen` calls it at its beginning, and then after each wait of up to
@@ -143,8 +143,8 @@ class Board:
         self.sent_lines = 0
         self.sent_s = 0.0
         self.lateness = Lateness()
-        """The delays of this computer. If the board is simulated on this computer, they include the
-        delays of the simulation."""
+        """The times by which this computer ran the check too late. If the board is simulated on
+        this computer, the delays of the simulation are included."""
         self.fled = False
         """Whether a motor runs away, or keeps turning although zeros are sent. Then the check sends
         nothing more, so that the board's watchdog can stop the motor."""
@@ -185,7 +185,7 @@ class Board:
             self.wire.close()
 
     def _farewell(self) -> None:
-        """Send zeros several times, but send no more once a motor runs away.
+        """Send zeros several times, but stop sending once a motor runs away.
 
         If an encoder is reversed, the firmware's speed control may make the motor run away even
         when zeros are sent. Each further line would keep the watchdog from stopping the motor.
@@ -421,7 +421,7 @@ class Board:
         return motion.moving(last, motion.STANDING)
 
     def rest(self) -> None:
-        """Send zeros until all motors stand. Raises `StoppedError` if a motor keeps turning.
+        """Send zeros until all motors stand still. Raises `StoppedError` if a motor keeps turning.
 
         Some firmware stops motor d only at lines with a final comma, or only at lines without one.
         If motor d stops only at lines with the other ending than `comma` says, `comma` is changed,
@@ -442,10 +442,15 @@ class Board:
         raise StoppedError(outcomes.find("stop: turns", motors=motors, seconds=seconds))
 
     def settles(self, comma: bool) -> bool:
-        """Send zeros until every motor stands. Return False if this takes too long, else True.
+        """Send zeros until every motor stands still, and return whether all of them came to rest.
 
-        The motors stand if the last two replies show no movement. The limit is `MOTOR_S`, or
-        `PATIENCE_S` while a motor slows down. `comma` says whether the lines end with a comma.
+        The motors count as standing still if the last two replies since the call report no motion,
+        and if no earlier reply suggests that a motor with a coarse encoder still turns
+        (`motion.turning`). The method returns False if the motors do not stand still after
+        `MOTOR_S` s. While a motor slows down, this time limit is `PATIENCE_S` s instead.
+
+        Args:
+            comma: whether the lines of zeros end with a comma.
         """
         began_s = self.now_s
         while True:

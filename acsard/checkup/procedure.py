@@ -64,15 +64,16 @@ Tell = Callable[[Finding], None]
 Step = Callable[[], Finding | None]
 
 LATE_AGAIN, LATE_MOST = 2, 8
-"""If this computer was late during a step, the step is repeated, up to `LATE_AGAIN` times. A check
-has at most `LATE_MOST` such repetitions in all. Without this second limit, a check could take four
+"""The check runs late if this computer is too busy to run the tool in time. If the finding of a
+step is therefore doubtful, the check repeats the step, up to `LATE_AGAIN` times. A check has at
+most `LATE_MOST` such repetitions in total. Without this second limit, a check could take four
 minutes."""
 
 STALL_S, ZEROS_STALL_S = 0.5, 5.0
-"""Longest stalls of this program that do not end the check, s. `ZEROS_STALL_S` applies until all
-motors have been seen to stand, because the check sends only zeros until then. Later `STALL_S`
-applies. A longer stall ends the check, because the operator may have left the robot. A shorter
-stall may only cause a step to be repeated (see `LATE_AGAIN`)."""
+"""Longest stalls of this program that do not end the check, s. `ZEROS_STALL_S` applies until the
+check has seen all motors stand still, because the check sends only zeros until then. Later
+`STALL_S` applies. A longer stall ends the check, because the operator may have left the robot. A
+shorter stall may only cause a step to be repeated (see `LATE_AGAIN`)."""
 
 AGAIN, MOST = 1, 5
 """If the board restarts during a step, the step is repeated, up to `AGAIN` times. One more restart
@@ -174,7 +175,11 @@ class _Watched:
 
 
 class _Steps:
-    """Runs the steps. It repeats a step if the board restarted or this computer was late."""
+    """Runs the steps of the check.
+
+    A step is repeated if the board restarts during the step, or if the finding of the step is
+    doubtful because the check ran late.
+    """
 
     def __init__(
         self,
@@ -213,7 +218,12 @@ class _Steps:
         self._board.armed = True
 
     def _turn(self, motor: int) -> Finding:
-        """Test one motor. Unless this computer was late, ask the operator which wheel turned."""
+        """Test one motor, ask the operator which wheel it turned, and return the finding.
+
+        The question is left out if the check ran too late in every attempt at the test. The
+        measured motion of the motor is then doubtful, and the finding says that the check could not
+        judge the motor.
+        """
         board, operator, channels = self._board, self._operator, self._channels
         operator.doing(f"{motor_name(board.mcu, motor)} turns: briefly, then forward and back")
 
@@ -229,11 +239,20 @@ class _Steps:
         return encoder_finding(board.mcu, channels[motor])
 
     def _measure(self, doing: str, step: Step) -> None:
-        """Run a step and report its finding. Repeat the step if this computer was late."""
+        """Run a step and report its finding.
+
+        The step is repeated if the board restarts, or if the finding is doubtful because the check
+        ran late.
+        """
         self._take(doing, partial(self._in_time, step))
 
     def _in_time(self, step: Step) -> Finding | None:
-        """Run a step, repeat it if this computer was late, and return its finding."""
+        """Run a step, and return its finding.
+
+        The step is repeated if the finding is doubtful because the check ran late during the step
+        (`lateness.spoilt`). If the last permitted attempt is doubtful too, the returned finding
+        says that the step was not judged. Raises `StoppedError` if the step ends the check.
+        """
         board, known, late_s = self._board, self._board.known, 0.0
         for _ in range(1 + min(LATE_AGAIN, self._late_left)):
             if late_s:
@@ -266,7 +285,11 @@ class _Steps:
         return found
 
     def _take(self, doing: str, step: Step) -> None:
-        """Run a step and report its finding. Repeat the step if the board restarts."""
+        """Run a step and report its finding. Repeat the step if the board restarts.
+
+        `doing` is the text about this step that the operator sees; "" shows no text. Raises
+        `StoppedError` if the board restarts too often.
+        """
         board, again = self._board, 0
         known = board.known
         while True:
@@ -310,7 +333,11 @@ class _Steps:
             board.wakes(BOOT_S)
 
     def _come_back(self) -> None:
-        """Send zeros until a restarted board answers and its motors stand."""
+        """Send zeros until a restarted board answers.
+
+        Once the check has seen all motors stand still (`Board.armed`), also send zeros until they
+        stand still again.
+        """
         board = self._board
         board.forget()
         self._operator.doing(

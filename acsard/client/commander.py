@@ -87,14 +87,17 @@ class Wish(Struct, frozen=True):
 
 
 class Commander:
-    """Decides which commands of one sender are sent, and when. Only the newest command can wait.
+    """Decides when to send the commands of one sender, and which of them to drop.
+
+    At most one command waits to be sent. A newer command replaces the waiting command.
 
     Args:
         leads: whether to send a zero before the first command after each silence. Set this for a
             sender that sends no zeros of its own.
-        gathers: whether to drop a burst of commands that arrives after a silence, because a
-            congested link or a stalled process must have delayed it. Set this for a sender without
-            stamps, because the daemon cannot measure the delay of such a sender.
+        gathers: whether the first command after a silence waits for `GATHER_NS`. If several
+            commands arrive in this time, a congested link or a stalled process has delayed them. In
+            this case, none of them is sent, except the last one if it is a zero. Set this for a
+            sender without stamps, because the daemon cannot measure the delay of its commands.
     """
 
     def __init__(self, *, leads: bool = False, gathers: bool = False) -> None:
@@ -122,9 +125,8 @@ class Commander:
     def take(self, wish: Wish, now_ns: int) -> int | None:
         """Store a command that has arrived. It replaces a command that still waits to be sent.
 
-        `now_ns` is the monotonic time, as in the other methods. Returns the time since the previous
-        command, ns, if it is longer than `SILENCE_NS`. Returns None otherwise, and for the first
-        command.
+        `now_ns` is the monotonic time, ns. Returns the time since the previous command arrived, ns,
+        if this time is longer than `SILENCE_NS`. Returns None otherwise, and for the first command.
         """
         silence = None if self._heard_ns is None else now_ns - self._heard_ns
         begins = silence is None or silence > SILENCE_NS
@@ -187,9 +189,10 @@ class Commander:
         return self._zero(now_ns)
 
     def _zero(self, now_ns: int) -> Wish:
-        """Return a zero with the present time on the sender's clock as its stamp.
+        """Return a zero whose stamp is the present time on the sender's clock.
 
-        The daemon would take a stamp of another clock for a jump of the sender's clock.
+        With a stamp from another clock, the daemon would assume that the sender's clock has jumped.
+        If the sender sends no stamps, the zero does not get a stamp either.
         """
         stamp_ns = self._last.stamp_ns
         if stamp_ns is not None:

@@ -35,7 +35,8 @@ SETTLED_S = 0.2
 after an action, the daemon sent it after the action."""
 
 STANDS = 0.01, 0.02
-"""Linear speed, m/s, and turn rate, rad/s. The robot counts as standing if it is below both."""
+"""Linear speed, m/s, and turn rate, rad/s. The robot counts as standing still if it moves more
+slowly than the first and turns more slowly than the second."""
 
 SLOWER, SLOWS_S = 0.97, 1.0
 """The robot counts as slowing down if, within `SLOWS_S` s, its speed falls below `SLOWER` times the
@@ -63,16 +64,22 @@ class Driven(Followed, Protocol):
 def drive(
     robot: Driven, linear: float, angular: float, seconds: float
 ) -> Generator[float, None, None]:
-    """Drive for `seconds`, then send zeros until the robot stands.
+    """Drive for `seconds`, then send zeros until the robot stands still.
 
-    The generator yields the time, s, for which the caller must wait before it resumes the
-    generator. `linear` is in m/s and `angular` in rad/s (left is +).
+    Before the drive, the generator sends zeros until the daemon accepts the commands. It yields the
+    time, s, for which the caller must wait before it resumes the generator.
+
+    Args:
+        robot: the client that sends the commands.
+        linear: linear speed, m/s.
+        angular: turn rate, rad/s, positive to the left.
+        seconds: duration of the drive, s.
 
     Raises:
-        NotDrivenError: The robot does not follow the commands; the text is the daemon's reason. Or
-            this program sent no command for more than `GRACE_S` s, before it sent the zeros at the
-            end.
-        NoAnswerError: The daemon is silent.
+        NotDrivenError: The robot does not follow the commands; the text is the daemon's reason. It
+            is also raised if this program pauses for more than `GRACE_S` s between two commands,
+            unless it already sends the zeros at the end.
+        NoAnswerError: The daemon is silent, or the connection to it was closed.
         UsageError: An argument is not a finite number, or `seconds` is not above 0.
     """
     _require(linear=linear, angular=angular, seconds=seconds)
@@ -123,9 +130,14 @@ def _opening(checks: _Drive) -> Iterator[float]:
 
 
 def _stopping(checks: _Drive) -> Iterator[float]:
-    """Send zeros until the robot stands, and yield each pause between two zeros in seconds.
+    """Send zero commands until the robot stands still.
 
-    End also when the robot no longer slows down, because then something else moves it.
+    After each command, the generator yields the time, s, for which the caller must wait before it
+    resumes the generator. The generator also ends if the robot has not become slower for `SLOWS_S`
+    s. Then something else moves the robot, or the board sends no feedback.
+
+    Raises `NotDrivenError` if the daemon will keep refusing the commands, and `NoAnswerError` if
+    the daemon is silent.
     """
     begun = since = clock.steady_s()
     watch, slowest = checks.watch, math.inf
@@ -213,8 +225,8 @@ class _Drive:
     def require(self, grace: float) -> None:
         """Process the received states, and raise `NotDrivenError` if the robot does not follow.
 
-        It is raised if the robot has not followed the commands for `grace` s, or if the state shows
-        that the daemon will keep refusing the commands.
+        The method raises this error if the robot has not followed the commands for `grace` s, or if
+        the state shows that the daemon will keep refusing the commands.
         """
         self.look()
         if not self.objection:

@@ -103,9 +103,10 @@ class Guard:
         self._note_limits()
 
     def check(self, outputs: Outputs) -> tuple[bytes | None, str]:
-        """Return a pair: the line to send, and why the guard replaced it with the stop line.
+        """Return a pair: the line to send, and the reason why the guard replaced the robot's line.
 
-        The line is None if `outputs` has no line. The reason is "" if the guard did not replace it.
+        The guard replaces a forbidden line with the stop line. The reason is "" if the guard did
+        not replace the line. If `outputs` does not contain a line, the pair is (None, "").
         """
         if outputs.mode == "driving":
             if self._commanded(outputs):
@@ -168,10 +169,16 @@ class Guard:
         return abs(outputs.now.mono_ns - arrived) <= timeout
 
     def _sealed(self, line: bytes) -> bool:
-        """Return whether a line ends correctly for a link with checksums.
+        """Return whether a line has a correct end for a link on which each line has a checksum.
 
-        From column 31 on, such a line consists of these parts: a comma (only for a board with
-        trailing commas), `#`, two hexadecimal digits, an optional `S` or `H`, a correct checksum.
+        After the four speeds (the first 31 characters), the line must consist of these parts, in
+        this order:
+
+        - a comma, if the board needs a comma at the end of the speeds
+        - `#`, and the sequence number of the line as two hexadecimal digits
+        - at most one request letter: `S` or `H`
+        - `*`, and the CRC-16/XMODEM of all characters before `*` as four hexadecimal digits
+        - a carriage return and a line feed
         """
         body, check = line[:-7], line[-7:]
         comma, mark = self._stop[31:-2], body[31:]

@@ -243,8 +243,8 @@ class Estimate(Struct, frozen=True, gc=False):
     angle is not wrapped: each full turn forward adds 2 pi."""
     speeds: WheelSpeeds
     asked_ns: int | None = None
-    """Monotonic time at which the daemon wrote the line that the feedback answers, ns. None if the
-    daemon does not know which line that is."""
+    """Monotonic time at which the daemon wrote the command line that the feedback line answers, ns.
+    None if the daemon does not know which command line that is."""
     heard_ns: int = 0
     """Monotonic time, ns, at which the daemon had received the complete feedback line."""
 
@@ -430,16 +430,19 @@ class Latch(Struct, frozen=True):
     kept: bool = False
     """True if the latch was set before the daemon's last start."""
     earlier: tuple[Latch, ...] = ()
-    """The earlier causes of the same stop, the newest first. Each of them was a latch until a later
-    cause replaced it. In these latches, `earlier` is empty."""
+    """The latches with the earlier causes of the same stop, the newest first. A latch moves to this
+    tuple when a later cause replaces it. The field `earlier` of these latches is empty."""
 
     @property
     def causes(self) -> tuple[Latch, ...]:
-        """This latch and the earlier causes of the same stop, the newest first."""
+        """This latch, and the latches with the earlier causes of the same stop, newest first."""
         return (self, *self.earlier)
 
     def each(self, change: Callable[[Latch], Latch]) -> Latch:
-        """Return a copy of this latch, with `change` applied to it and to each earlier cause."""
+        """Apply `change` to this latch and to each latch in `earlier`; return the changed latch.
+
+        The function `change` gets one latch and returns its replacement.
+        """
         return replace(change(self), earlier=tuple([change(cause) for cause in self.earlier]))
 
 

@@ -48,9 +48,10 @@ EXIT_RAMP_S = 0.6
 
 
 class Departure:
-    """State of the daemon's shutdown.
+    """State of the daemon's shutdown, and a context manager that handles the signals.
 
-    The first signal begins a ramp to zero speed, and a second signal cuts the ramp short.
+    The first signal begins a ramp to zero speed, and a second signal cuts the ramp short. If the
+    daemon's start is not complete, a signal cancels the start.
     """
 
     def __init__(self, log: Log, wake: Callable[[], None], manager: Systemd) -> None:
@@ -67,11 +68,15 @@ class Departure:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> bool:
-        """Suppress the `CancelledError` of a start that a signal ended. That is not an error."""
+        """Suppress a `CancelledError` if a signal has begun the shutdown.
+
+        A signal that arrives during the start of the daemon cancels the start. The resulting
+        `CancelledError` is a normal end of the daemon and not an error.
+        """
         return kind is asyncio.CancelledError and self.begun_ns is not None
 
     def started(self) -> None:
-        """Record that the start is complete. Before this call, a signal cancels the start."""
+        """Record that the daemon's start is complete, so that a signal no longer cancels it."""
         self._starting = None
 
     def _signal(self, number: signal.Signals) -> None:

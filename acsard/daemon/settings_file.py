@@ -69,7 +69,7 @@ class _Checked(Struct, frozen=True):
 
 
 class _Pending(Struct):
-    """A `set` request with `keep` that has no reply yet."""
+    """A `set` request with the field `keep` that waits for its reply."""
 
     request: Request
     due_ns: int
@@ -97,7 +97,7 @@ class SettingsFile:
         """
         self.differ = ""
         """The settings in force that differ from the file, in words, or the reason why the file
-        cannot be used. It is "" if nothing differs."""
+        cannot be used. The text is "" if no setting differs."""
         self._file, self._parse = file, parse
         self._in_force = self._written = started
         self._signature: Signature | None = None
@@ -157,11 +157,14 @@ class SettingsFile:
             self._box.put("look")
 
     def obeyed(self, answer: Answer) -> bool:
-        """Process the robot's answer to a request, and return whether the answer must wait.
+        """Process the robot's answer to a client's request; return whether the answer must wait.
 
-        If the robot has used the settings of a `set` with `keep`, return True. The thread then
-        writes the file, and `results` returns the answer. For any other answer, return False: the
-        caller must send it to the client now.
+        The answer must wait if the client sent a `set` request with the field `keep`, and the robot
+        now uses the new settings. In this case, the method returns True, and the caller must not
+        send the answer. The thread of this object first writes the settings to the configuration
+        file, and `results` later returns the answer that the caller must send to the client.
+
+        For any other answer, the method returns False, and the caller must send the answer now.
         """
         pending = self._pending.get(answer.id)
         if pending is None or pending.edit is None:
@@ -214,9 +217,11 @@ class SettingsFile:
 
     @property
     def limits(self) -> LimitsConfig:
-        """The limits at the daemon's start, with the values that it has since written to the file.
+        """The limits in the configuration file, as far as the daemon has read or written them.
 
-        Those values replace the values at the start.
+        They are the limits at the start of the daemon. If the daemon has written a limit to the
+        file since its start, that limit has the last written value. Changes of the file by other
+        programs are not included.
         """
         return self._limits
 

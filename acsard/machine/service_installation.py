@@ -123,8 +123,8 @@ def _closed(path: Path) -> Path | None:
 
 
 OURS = ("bin", "acsard", "acsard.service.d", "acsard-gateway.service.d", "acsard-web.service.d")
-"""Names of acsard's own directories. The removal of the service also removes those of them that are
-then empty."""
+"""Names of acsard's own directories. If one of them is empty after the removal of the service, the
+removal deletes it too."""
 
 
 class File(Struct, frozen=True):
@@ -345,7 +345,7 @@ def admitting(directory: Path) -> Write | Keep | None:
     The step writes a drop-in file for the gateway's unit. Without this file, the gateway may use
     only loopback and cannot read root's files. If the drop-in exists, only its paths change, and
     the networks in it stay, because a person may have narrowed them. Return None if the service is
-    not installed, or if this user is not root.
+    not installed, or if this program does not run as root.
     """
     if os.geteuid() != 0 or not (UNITS / GATEWAY).exists():
         return None
@@ -385,12 +385,15 @@ def installing(
 ) -> list[Step]:
     """Return the steps that install the service.
 
+    An existing file with `File.kept` stays as it is.
+
     Args:
         wanted: the files of the installation.
-        found: their present contents.
-        wrong: those paths whose mode or owner is wrong. These files are written again.
-        force: whether to replace a file with another content. If it is false and there is such a
-            file, raise `MendableError`.
+        found: the present content of each file, by path; None for a file that does not exist.
+        wrong: the paths of the existing files whose mode or owner is wrong. The steps write these
+            files again.
+        force: whether to overwrite existing files whose content differs from the installation. If
+            `force` is false and such a file exists, the function raises `MendableError`.
     """
     steps: list[Step] = []
     changed: list[str] = []
@@ -433,14 +436,18 @@ def uninstalling(
     purge: bool = False,
     stateful: Iterable[str] = (),
 ) -> list[Step]:
-    """Return the steps that remove the service. A step for a file that stays contains the reason.
+    """Return the steps that remove the service.
+
+    For each file that stays, the result contains a `Keep` step with the reason.
 
     Args:
         wanted: the files of the installation.
-        found: their present contents.
+        found: the present content of each file, by path; None for a file that does not exist.
         others: other paths in the service's directories. Only `purge` removes them.
-        force: whether to remove changed files too, except those with `File.kept`.
-        purge: whether to remove everything.
+        force: whether to remove even files whose content was changed, except those with
+            `File.kept`.
+        purge: whether to remove everything, including changed files, files with `File.kept`, the
+            paths in `others` and the state directories.
         stateful: the units that have a state directory. Only `purge` removes these directories. If
             such a unit is missing, a purge first installs it again, because only systemd can remove
             the directory.

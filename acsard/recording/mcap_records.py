@@ -144,7 +144,11 @@ class GrowingChunk:
         return self._taken()
 
     def end(self) -> tuple[bytes, bytes]:
-        """End the chunk. Return a pair: its last bytes, and the header for its beginning."""
+        """End the chunk, and return a pair of byte strings.
+
+        The first one contains the last bytes of the chunk. The second one is the true header, which
+        replaces the header at the beginning of the chunk.
+        """
         self._out.append(self._compressor.flush())
         last = self._taken()
         return last, _head(self.first_ns, self._last_ns, self.size, self._crc, self._length)
@@ -157,7 +161,10 @@ class GrowingChunk:
 
 
 class ReadChunk(NamedTuple):
-    """The readable part of a chunk. `complete` is true if it includes the chunk's last block."""
+    """The readable part of a chunk.
+
+    `complete` is true if the readable part includes the last block of the chunk.
+    """
 
     begin: int
     """Offset of the chunk's header in the file."""
@@ -170,10 +177,11 @@ class ReadChunk(NamedTuple):
     """Work of reading the chunk: its number of unpacked bytes, plus `_BLOCK_EFFORT` per block."""
 
     def head(self, data: bytes) -> bytes:
-        """Return a header with the lengths and the checksum of the readable part of the chunk.
+        """Return a new chunk header that describes only the readable part of the chunk.
 
-        `data` is the whole file. If `complete` is false, the caller must also write `LAST_BLOCK` at
-        the offset `self.end`. The length in the header includes this block.
+        If `complete` is false, the caller must also write `LAST_BLOCK` at the offset `self.end`.
+        Two fields of the header then include the bytes of this block: the length of the record, and
+        the size of the compressed data. `data` is the content of the whole file.
         """
         times = [message.wall_ns for message in self.messages]
         blocks = _blocks(data[: self.end], self.begin + _HEAD.size)

@@ -132,17 +132,24 @@ class Step(Struct, frozen=True):
 
 
 class UnfinishedError(AcsardError):
-    """The bytes do not encode the step in which the daemon failed."""
+    """The record of the step in which the daemon failed cannot be decoded.
+
+    The daemon failed before it finished this control step. The record therefore contains the inputs
+    of the step, but no outputs (`Unfinished`).
+    """
 
 
 class Unfinished(Struct, frozen=True):
-    """Inputs of the step in which the daemon failed. This step has no outputs."""
+    """Inputs of the control step in which the daemon failed.
+
+    The daemon did not finish this step, so the record contains only the inputs of the step.
+    """
 
     number: int
     inputs: Inputs
 
     def encode(self) -> bytes:
-        """Encode the step with field names, because a later version may add fields."""
+        """Encode the inputs with field names, because a later version may add fields."""
         return msgspec.msgpack.encode(self)
 
 
@@ -150,7 +157,7 @@ _unfinished = msgspec.msgpack.Decoder(Unfinished)
 
 
 def unfinished(data: bytes) -> Unfinished:
-    """Decode the step in which the daemon failed.
+    """Decode the record of the control step in which the daemon failed.
 
     Raises `UnfinishedError` if the bytes are damaged.
     """

@@ -57,13 +57,14 @@ refuses.
 
 
 class StateError(AcsardError):
-    """The bytes do not encode a robot, or this version cannot rebuild it from them."""
+    """The saved state of a robot is damaged, or this version of acsard cannot use it."""
 
 
 class State(NamedTuple):
-    """A robot and the memory of its guard.
+    """The state between two control steps: a robot, and the memory of the guard of its lines.
 
-    Together with the further inputs, they determine all further outputs.
+    If two runs of the control steps begin with equal states and receive equal inputs, they produce
+    equal outputs.
     """
 
     robot: Robot
@@ -71,7 +72,10 @@ class State(NamedTuple):
 
 
 class Checkpoint(Struct, frozen=True, array_like=True):
-    """A robot between two steps, as the channel `state` of a recording holds it."""
+    """The saved state of a robot between two control steps.
+
+    It is the content of one message on the channel `state` of a recording.
+    """
 
     number: Annotated[int, Meta(ge=0)]
     """Number of the step that follows the saved state."""

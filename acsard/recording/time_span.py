@@ -107,10 +107,17 @@ def _time_of_day(words: str, text: str) -> TimeOfDay:
 
 
 def _date(words: str, text: str, now_s: float) -> tuple[int, int, int]:
-    """Return the triple (year, month, day) that `words` mean, for example "yesterday".
+    """Return the triple (year, month, day) for a date that a person typed.
 
-    For "yesterday" the day may be 0. `text` is all that the person typed, for the error message.
-    `now_s` is the present time, s since 1970. Raises `TimeError` if `words` are not a date.
+    On the first day of a month, the result for "yesterday" has the present month and the day 0.
+    `_moment` takes the day 0 for the last day of the previous month.
+
+    Args:
+        words: the date: "today", "yesterday" or a date like "2026-11-21".
+        text: the whole text that the person typed, for the error message.
+        now_s: the present time, s since 1970.
+
+    Raises `TimeError` if `words` are not a date.
     """
     if words in _DAYS_AGO:
         today = time.localtime(now_s)
@@ -129,7 +136,8 @@ def _date(words: str, text: str, now_s: float) -> tuple[int, int, int]:
 def _moment(date: tuple[int, int, int], when: TimeOfDay = MIDNIGHT, days: int = 0) -> float:
     """Return a local time in s since 1970: the time of day `when`, `days` days after `date`.
 
-    The day of the month in `date` may be out of range, for example 0.
+    The day of the month in `date` may be out of range. For example, the day 0 is the last day of
+    the previous month.
     """
     year, month, day = date
     whole = (year, month, day + days, when.hours, when.minutes, 0, 0, 0, -1)

@@ -76,9 +76,14 @@ class LineTimes(Struct, frozen=True):
 def line_times(t: Floats, sent: Floats) -> LineTimes:
     """Estimate the delay of each feedback line, and the number of lines that were lost before it.
 
-    `t` contains the stamps of at least 3 feedback lines, s, and `sent` the times of the daemon's
-    lines, s. The function makes two estimates: one for a board that sends at a fixed period, one
-    for a board that answers each line of the daemon. It returns the estimate with smaller delays.
+    The function makes two estimates. The first estimate assumes that the board sends its lines at a
+    fixed period. The second estimate assumes that the board answers each line of the daemon. The
+    function returns the estimate with the smaller delays. If the second estimate is not possible,
+    the function returns the first one.
+
+    Args:
+        t: the stamp of each feedback line, s. At least 3 lines are needed.
+        sent: the time at which the daemon sent each of its lines to the board, s.
     """
     even = _even(t)
     asked = _asked(t, sent)
@@ -88,7 +93,10 @@ def line_times(t: Floats, sent: Floats) -> LineTimes:
 
 
 def _even(t: Floats) -> LineTimes:
-    """Estimate the delays of lines with the stamps `t`, s, if the board sends at a fixed period."""
+    """Estimate the delays of the feedback lines of a board that sends them at a fixed period.
+
+    `t` contains the stamps of the feedback lines, s.
+    """
     steps = np.diff(t)
     usual, mean = float(np.median(steps)), float(np.mean(steps))
     alike = np.abs(steps - usual) < ALIKE_TIMES * usual
@@ -105,9 +113,14 @@ def _even(t: Floats) -> LineTimes:
 
 
 def _asked(t: Floats, sent: Floats) -> LineTimes | None:
-    """Estimate the delays of lines with the stamps `t`, s, if the board answers the daemon's lines.
+    """Estimate the delays of the feedback lines of a board that answers each line of the daemon.
 
-    The result is None if the daemon's lines `sent`, s, are too few or do not cover the stamps.
+    Return None if the daemon sent too few lines, or if its lines do not cover the whole time of the
+    feedback lines.
+
+    Args:
+        t: the stamp of each feedback line, s.
+        sent: the time at which the daemon sent each of its lines to the board, s.
     """
     if len(sent) < 3 or sent[0] > t[0] or len(sent) < len(t) / 2:
         return None
@@ -220,9 +233,13 @@ class Motion(Struct, frozen=True):
 def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool) -> Motion:
     """Compute the motion between at least 3 feedback lines, and the errors of this motion.
 
-    `sent` contains the times of the daemon's lines, s. `whole` is true if this program received
-    every line that the daemon received. If `whole` is false, a missing line may have been lost
-    between the daemon and this program, so it does not count as an error of the odometry.
+    Args:
+        lines: the feedback lines in order.
+        sent: the time at which the daemon sent each of its lines to the board, s.
+        kinematics: the geometry of the robot.
+        whole: whether this program received every feedback line that the daemon received. If it is
+            false, a missing line may have been lost between the daemon and this program, so a
+            missing line does not count as an error of the odometry.
     """
     t = np.array([line.at for line in lines])
     found = line_times(t, sent)
@@ -249,14 +266,17 @@ def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool)
 def _noise(t: Floats, speeds: Floats, turns: Floats, variances: Floats) -> Floats | None:
     """Return the variance, rad2, that the gyro's noise adds to the heading between two lines.
 
-    `t` contains the times of the lines, s, `speeds` the speeds of the wheels, `turns` the turn from
-    each line to the next, rad, and `variances` the variance of the heading at each line, rad2.
-
     The gyro's scale error also adds to the variance of the heading: S^2 A^2, where S is the
     relative standard deviation of the scale, and A is the turn since the pose was last set. A
     further turn dA adds 2 S^2 A dA. A is unknown at the first line, so a least-squares fit
-    estimates A and the noise together. The result is None if the fit cannot separate the two. It is
-    0 for lines at which the wheels stand still.
+    estimates A and the noise together. Return None if the fit cannot separate the two. The result
+    is 0 for lines at which the wheels stand still.
+
+    Args:
+        t: the time of each feedback line, s.
+        speeds: the speeds of the four wheels in each feedback line.
+        turns: the turn from each feedback line to the next, rad.
+        variances: the variance of the heading at each feedback line, rad2.
     """
     # Leave out the lines in which the variance falls, because the pose was set there.
     dt, moves = np.diff(t), speeds[1:].any(axis=1) & (variances[1:] > variances[:-1] / 2)
@@ -294,9 +314,13 @@ def _gaps(
 ) -> tuple[Floats, Floats, int, float]:
     """Return four values: `filled`, `unfilled`, `missing` and `unseen` of `Motion`.
 
-    `twists` are computed from the wheel speeds in the lines. `rolled` is the motion from each line
-    to the next, computed from the wheel positions. `found` tells which lines were lost. If `whole`
-    is false, these lines are ignored.
+    Args:
+        t: the time of each feedback line, s.
+        twists: the motion at each feedback line, computed from the wheel speeds in the line.
+        rolled: the motion from each feedback line to the next, computed from the wheel positions.
+        found: the result of `line_times`, which says where feedback lines were lost.
+        whole: whether this program received every feedback line that the daemon received. If it is
+            false, lost lines count only in gaps that the odometry did not fill.
     """
     filled, unfilled = np.zeros((len(rolled), 2)), np.zeros((len(rolled), 4))
     lost, unseen = 0, 0.0

@@ -201,15 +201,18 @@ class Setup(Struct, frozen=True):
 
     @property
     def from_edge(self) -> float:
-        """Distance of the robot's middle from the edge behind it before the straight drive, m.
+        """Distance from the robot's middle to the edge of the free floor behind the robot, m.
 
-        The edge is that of the free floor.
+        A person places the robot at this distance from the edge before the straight drive begins.
         """
         return self.reach + EDGE
 
     @property
     def to_middle(self) -> float:
-        """Distance from the end of the straight drive back to the middle of the floor, m."""
+        """Distance from the end of the straight drive to the middle of the free floor, m.
+
+        The robot drives back by this distance, so that it can turn in the middle of the floor.
+        """
         return self.from_edge + self.length - ROOM / 2
 
     def ahead(self, metres: float) -> Move:
@@ -244,8 +247,8 @@ class Setup(Struct, frozen=True):
     def command(self, rate: float) -> float:
         """Return the turn rate to command, rad/s, for a true turn rate of `rate`, rad/s.
 
-        It is right for a robot without skidding. If it would exceed the limits, it is reduced to
-        them.
+        The command gives this turn rate to a robot that does not skid. If the command would exceed
+        the robot's limits, the result is the largest command within these limits.
         """
         per_command = self.rate_per_command
         most = min(2 * self.wheel / self.drive.wheel_separation, self.turning * per_command)
@@ -275,8 +278,8 @@ Its arguments are the robot's setup, and the ratio of effective track to wheel s
 TRACKS = [1.0 + 0.05 * step for step in range(round((WIDEST - 1.0) / 0.05) + 1)]
 """Ratios of effective track to wheel separation for which the driving time is checked.
 
-All are checked, because the largest ratio does not always need the longest time. With a smaller
-ratio, a leg may have one more full turn.
+All these ratios are checked, because the largest ratio does not always need the longest time. With
+a smaller ratio, a leg may have one more full turn.
 """
 
 
@@ -293,7 +296,8 @@ class Method(Struct, frozen=True):
     def longest_s(self, setup: Setup) -> float:
         """Return the total driving time of all legs, s.
 
-        It is the longest of the times for the ratios in `TRACKS`.
+        The time depends on the ratio of effective track to wheel separation. The result is the
+        longest of the times for the ratios in `TRACKS`.
         """
         return max(sum(leg.seconds for leg in self.legs(setup, track)) for track in TRACKS)
 

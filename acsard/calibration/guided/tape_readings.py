@@ -50,8 +50,8 @@ UNKNOWN = 1.0
 PRIOR_FREE = 4.0
 """Weight of the assumed noise of the readings, in degrees of freedom.
 
-The fit averages the assumed noise with the noise that the scatter of the readings shows. The weight
-of the latter is the number of surplus readings.
+The fit averages the assumed noise with the noise that the scatter of the readings shows. The noise
+from the scatter has the number of surplus readings as its weight.
 """
 
 MOST_STEPS = 50
@@ -109,7 +109,8 @@ class TapeFit(Struct, frozen=True):
     residuals: Floats
     """Measured minus predicted value of each reading."""
     held_out: Floats
-    """Residual of each reading in a fit to all other readings; NaN if that fit fails."""
+    """Residual of each reading with the parameters that fit all other readings. The residual is NaN
+    if the fit to the other readings fails."""
 
 
 def joined(rides: Sequence[Run]) -> WheelSteps:
@@ -201,9 +202,21 @@ def _compared(
 
 
 def _solved(readings: Sequence[Reading], base: Base, start: Floats) -> tuple[Floats, Floats]:
-    """Return a pair: the parameters that fit the readings best, and the matrix J^T W J of this fit.
+    """Fit the parameters to the readings by weighted least squares, and return a pair.
 
-    Raises `RefusedError` if the readings do not determine the parameters.
+    The first item is the array of the fitted parameters, shape (COUNT,). The second item is the
+    matrix on the left-hand side of the normal equations of the last step, shape (COUNT, COUNT). It
+    is J^T W J plus the prior information about the track growth and the mean radius. J contains the
+    derivatives of the predicted readings with respect to the parameters, and W contains the weights
+    of the readings.
+
+    Args:
+        readings: the measurements by tape.
+        base: the configured geometry.
+        start: the parameters from which the fit starts.
+
+    Raises `RefusedError` if the readings do not determine the parameters, or if the fit does not
+    converge because the readings contradict each other.
     """
     parameters, configured = start.copy(), base.start()
     for _ in range(MOST_STEPS):
@@ -237,7 +250,17 @@ def _solved(readings: Sequence[Reading], base: Base, start: Floats) -> tuple[Flo
 def _held_out_residual(
     number: int, readings: Sequence[Reading], base: Base, start: Floats
 ) -> float:
-    """Return the residual of the reading `number` in a fit to all others; NaN if that fit fails."""
+    """Return the residual of one reading with the parameters that fit all other readings.
+
+    The residual is the measured value of the reading minus the value that the fit to the other
+    readings predicts. The result is NaN if this fit fails.
+
+    Args:
+        number: the index in `readings` of the reading whose residual is returned.
+        readings: all measurements by tape.
+        base: the configured geometry.
+        start: the parameters from which the fit starts.
+    """
     try:
         parameters, _ = _solved([*readings[:number], *readings[number + 1 :]], base, start)
     except RefusedError:
@@ -247,9 +270,9 @@ def _held_out_residual(
 
 
 READ_M = 0.002
-"""Standard deviation of a distance by tape, m.
+"""Standard deviation of a distance that a person measures by tape, m.
 
-It is also that of the place of a robot that a person puts on a line.
+The place of a robot that a person puts on a line has the same standard deviation.
 """
 
 CREDIBLE = 0.85, 3.0
@@ -284,8 +307,8 @@ def reading(measure: Measure, leg: str, rides: Mapping[str, Run], answers: Answe
 def track_ratio(reading: Reading, drive: DriveConfig) -> float:
     """Return the approximate ratio of effective track to wheel separation.
 
-    `reading` is that of one full turn. The next legs are planned with this ratio. Raises
-    `GuideError` if the ratio is not credible.
+    The next legs are planned with this ratio. `reading` is the measurement of one full turn of the
+    robot. Raises `GuideError` if the ratio is not credible.
     """
     # Use the measured radius and separation without the configured multipliers.
     base = Base(drive.wheel_radius, drive.wheel_separation, 1.0, 1.0, 1.0)
@@ -372,8 +395,8 @@ def calibrated(
 def _improvement(readings: Sequence[Reading], base: Base, fit: TapeFit, rate: Rates) -> Improvement:
     """Return the odometry errors with the configured and with the new parameters.
 
-    Each reading shows one error. To measure the error with the new parameters, they are fitted to
-    all other readings. If that fit fails, the parameters that fit all readings are used.
+    Each reading shows one error. To measure the error with the new parameters, the parameters are
+    fitted to all other readings. If this fit fails, the parameters that fit all readings are used.
     """
     sums = {name: np.zeros(3) for name in ("turn", "straight", "place")}
     present = fit.parameters.copy()

@@ -19,8 +19,10 @@ from acsard.core.link.negotiation import MENDS, Negotiation
 from acsard.core.values import NS_PER_S, Event
 
 SHARE = 0.5
-"""The link is stale after a silence of `Link.quiet_ns`. If the time between two control steps
-reaches this share of `Link.quiet_ns`, the cause of the silence is this computer, not the board."""
+"""The link is stale if no feedback line was read for `Link.quiet_ns`. The daemon reads the lines of
+the board only in its control steps. If the time between two control steps reaches this share of
+`Link.quiet_ns`, the second step is late. Then this computer has caused the silence by not running
+the daemon, and the board is not to blame."""
 
 BUSY = (
     "the Linux command `top` shows which other program uses the processor; acsard has priority if "
@@ -82,7 +84,7 @@ LOST = 0.02
 
 
 def is_ours(words: str) -> bool:
-    """Return whether `words` names this computer as the cause of a silence.
+    """Return whether the text `words` blames this computer or the built-in simulator for a silence.
 
     `words` is the text of an event of the link, or the `reason` in `state`.
     """
@@ -92,11 +94,13 @@ def is_ours(words: str) -> bool:
 class Lateness:
     """Detector of control steps that come too late.
 
-    If a step is late, this computer caused the silence before it, and the board did not.
+    The daemon reads the lines of the board only in its control steps. If a control step comes late,
+    no line could be read for a while. This computer has then caused the silence on the serial line
+    by not running the daemon in time. The board is not to blame.
     """
 
     def __init__(self, simulated: bool, quiet_ns: int) -> None:
-        """Create the initial state, in which no step has been seen.
+        """Create the detector before the first control step.
 
         `simulated` is true if the built-in simulator takes the place of the board. `quiet_ns` is
         the duration of silence after which the link is stale, ns.
@@ -104,15 +108,21 @@ class Lateness:
         self._simulated, self._least_ns = simulated, SHARE * quiet_ns
         self._looked_ns: int | None = None
         self.late_s = 0.0
-        """Longest time between two steps since the last good line, s, or 0 if no step was late."""
+        """Longest time between two control steps since the last good line, s; 0 if no control step
+        was late."""
         self.step_s = 0.0
-        """Time between the last two steps, s, if the last step was late. Otherwise 0."""
+        """Time between the last two control steps, s, if the last one was late; otherwise 0."""
 
     def look(self, now_ns: int, good: bool) -> bool:
-        """Record a step, and return whether a good line ends a silence that this computer caused.
+        """Record a control step. Return whether it ends a silence that this computer caused.
 
-        `good` says whether the step received a good line. The simulator runs on this computer. With
-        the simulator, the result is therefore True for every good line.
+        Only a good line from the board ends a silence. The built-in simulator runs on this
+        computer, so this computer counts as the cause of each of its silences. With the simulator,
+        the result is therefore True for every step that receives a good line.
+
+        Args:
+            now_ns: the monotonic time of the control step, ns.
+            good: whether the control step received a good line.
         """
         before_ns, self._looked_ns = self._looked_ns, now_ns
         passed_ns = 0 if before_ns is None else now_ns - before_ns
@@ -122,9 +132,10 @@ class Lateness:
         return good and (late_s > 0.0 or self._simulated)
 
     def words(self, link: LinkState) -> str:
-        """Return a sentence about the state of the link.
+        """Return a sentence that describes the state `link` for the operator.
 
-        If this computer caused a silence, the sentence is about this computer instead.
+        If the link is stale because a control step was late, the sentence blames this computer. If
+        the link to the built-in simulator is stale, the sentence blames the simulator.
         """
         if link == "stale" and self.late_s:
             return (

@@ -413,7 +413,8 @@ prove that a reply was lost. After a host stall, two commands are written close 
 reply to the first one is late even if no reply was lost."""
 
 JITTER_NS = 350_000
-"""If the mean deviation of the reply delay is at most this, ns, USB and the scheduler cause it."""
+"""If the mean deviation of the reply delay is at most this, ns, USB and the scheduler explain the
+deviation."""
 
 THOUGHT_NS = 800_000
 """If the mean deviation of the reply delay exceeds this, ns, the board itself varies the delay. USB
@@ -437,12 +438,13 @@ SEVERAL = 0.15
 Host stalls alone cause fewer such reads."""
 
 THINKS = 0.6
-"""If the reply delay varies in more than this share of the reads, the board itself varies it. An
-adapter whose packets fill line by line also varies it, but only for a quarter of a second."""
+"""If the reply delay varies in more than this share of the reads, the board itself varies the
+delay. An adapter whose packets fill line by line also varies the delay, but only for a quarter of a
+second."""
 
 BATCH_NS = 2_000_000
-"""If the mean deviation of the reply delay exceeds this, ns, an adapter causes it and not the
-board."""
+"""If the mean deviation of the reply delay exceeds this, ns, an adapter causes the deviation. The
+board does not."""
 
 
 class PromptedTimes:
@@ -495,9 +497,9 @@ class PromptedTimes:
         """Time at which the last answered command was written, ns. If the board itself delayed the
         reply more or less than usual, the time is shifted by about the difference."""
         self._passed = self._line = 0
-        """Both are times at which a command was written, ns. `_line` is that of the last answered
-        command. `_passed` is that of the last command that waits for no reply any more, because it
-        was answered, skipped or given up."""
+        """Both are times at which the daemon wrote a command, ns. `_line` belongs to the last
+        answered command. `_passed` belongs to the last command whose reply is not awaited any more,
+        because the command was answered, skipped or given up."""
         self._lost = False
         """Whether the last read with a single reply showed that an earlier reply was lost."""
         self._given: list[int] = []
@@ -603,7 +605,10 @@ class PromptedTimes:
             self._passed = self._left.popleft()
 
     def _begin(self) -> None:
-        """Assign the first reply to the newest command it can answer, and set the usual delay."""
+        """Assign the first reply to the newest command that this reply can answer.
+
+        The delay of this reply becomes the usual delay.
+        """
         left = self._left
         while len(left) > 1 and left[1] + self._soonest <= self._at:
             self._passed = left.popleft()
@@ -670,10 +675,11 @@ class PromptedTimes:
         self._delay = self._base
 
     def _given_up_too_early(self, delay: float) -> bool:
-        """Give up the commands whose replies were lost. Return whether one was given up too early.
+        """Give up the commands whose replies were lost.
 
-        In that case, the present reply answers the command that was given up last. The present
-        reply must be the only one in its read. `delay` is the usual delay, ns.
+        Return True if an earlier read gave up one command too early. In that case, the present
+        reply answers the command that was given up last. The present reply must be the only reply
+        in its read of the port. `delay` is the usual delay, ns.
         """
         left, at, wide = self._left, self._at, 4 * self._spread
         lost, self._lost = self._lost, False
@@ -707,11 +713,25 @@ class PromptedTimes:
         return at - left[0] - delay <= -max((left[0] - self._passed) / 2, wide)
 
     def _shift(self, line: int) -> int:
-        """Return by how much the delay of a reply that was read alone exceeds the usual delay, ns.
+        """Return an estimate of the extra time that the board took for the present reply, ns.
 
-        Also update the usual delay. Return 0 if the delay varies no more than USB and the scheduler
-        cause, or if an adapter or a host stall causes the variation. `line` is the time at which
-        the answered line was written, ns.
+        The result is negative if the board answered sooner than usual. It is computed from the
+        difference between the delay of this reply and the usual delay. The result is smaller than
+        this difference, because USB and the scheduler cause a part of the difference. The present
+        reply must be the only reply in its read of the port. The result is 0 in these cases:
+
+        - An adapter batches the replies, or the usual delay is not known yet.
+        - The difference is more than four times the usual deviation, so that a host stall has
+          probably delayed the reply.
+        - The delay usually varies so little that USB and the scheduler explain the variation.
+        - The delay usually varies so much that an adapter must cause the variation.
+
+        The method also updates the usual delay, the least delay and the mean deviation. It does not
+        update them in the first case, or if the difference in the second case exceeds even the
+        usual delay.
+
+        Args:
+            line: the time at which the daemon wrote the command that this reply answers, ns.
         """
         delay, spread = self._delay, self._spread
         if delay is None or self._batched:

@@ -258,16 +258,22 @@ TOPICS: tuple[Topic, ...] = (
 FOLLOWED: tuple[Topic, ...] = tuple(
     topic for topic in TOPICS if topic.subscribe and topic.query and "<" not in topic.key
 )
-"""The rows of all keys that clients may both subscribe to and query. These are the keys on which
-the daemon publishes, and the key of the gyro."""
+"""The rows of `TOPICS` for the keys that clients may both subscribe to and query. These are the
+keys on which the daemon publishes messages, and the key of the gyro. The row of the JSON copies
+(`json/<key>`) is left out."""
 
 PUBLISHED: tuple[Topic, ...] = tuple(topic for topic in FOLLOWED if topic.direction == "out")
-"""The rows of all keys on which the daemon publishes. A query for such a key returns the present
-message."""
+"""The rows of `TOPICS` for the keys on which the daemon publishes messages. A query for such a key
+returns the present message. The row of the JSON copies (`json/<key>`) is left out."""
 
 
 def offered(config: Config) -> tuple[Topic, ...]:
-    """Return the rows of the table for the keys that exist with this configuration."""
+    """Return the rows of `TOPICS` whose keys exist on the bus with the configuration `config`.
+
+    `TOPICS` has a row for each Zenoh key. Some keys exist only with the built-in simulator, with
+    `[odometry] gyro = true`, or with a file in `[ros] urdf`. The result leaves out the rows whose
+    condition `config` does not fulfill.
+    """
     simulated, gyro, urdf = config.mcu.simulated, config.odometry.gyro, bool(config.ros.urdf)
     return tuple(
         topic
@@ -279,10 +285,10 @@ def offered(config: Config) -> tuple[Topic, ...]:
 
 
 def published(config: Config) -> tuple[Topic, ...]:
-    """Return the rows of the keys on which a daemon with this configuration publishes.
+    """Return the rows of `TOPICS` for the keys on which a daemon with this configuration publishes.
 
-    With the built-in simulator and `odometry.gyro = true`, they include the key of the gyro,
-    because the daemon itself then publishes the samples of the simulated gyro.
+    If the configuration selects the built-in simulator and has `odometry.gyro = true`, the result
+    includes the row of the gyro. The daemon then publishes the samples of the simulated gyro.
     """
     own = config.mcu.simulated
     return tuple(t for t in offered(config) if t in PUBLISHED or (own and t.key == IMU))
@@ -332,12 +338,12 @@ def key_hint(key: str) -> str:
 
 
 def by_key(key: str) -> Topic | None:
-    """Return the row whose key is exactly `key`, such as `cmd/<source>`, or None."""
+    """Return the row of `TOPICS` whose key is exactly `key`, such as `cmd/<source>`, or None."""
     return next((topic for topic in TOPICS if topic.key == key), None)
 
 
 def row_of(key: str) -> Topic | None:
-    """Return the row that a key below the robot's id matches, or None.
+    """Return the row of `TOPICS` that a key below the robot's id matches, or None.
 
     For example, `cmd/app` matches the row of `cmd/<source>`.
     """

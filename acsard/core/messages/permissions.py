@@ -44,10 +44,10 @@ def keys_for(role: Role, use: Use, rows: Iterable[Topic]) -> list[str]:
 
 
 def _exact(row: Topic, use: Use) -> Iterator[tuple[str, Role]]:
-    """Yield a pair for each key that a row stands for: the key, and a role.
+    """Yield a pair for each key that `row` describes: the key, and a role.
 
-    The role is the lowest one with the permission `use`. Nothing is yielded if no client has this
-    permission.
+    The role is the lowest role with the permission `use` for this key. The function yields no pair
+    if no client has this permission.
     """
     least = {"publish": row.publish, "subscribe": row.subscribe, "query": row.query}[use]
     if least == "<role>":
@@ -62,11 +62,16 @@ def _exact(row: Topic, use: Use) -> Iterator[tuple[str, Role]]:
 
 
 def least_role(key: str) -> Role:
-    """Return the lowest role that may use a key. `key` is the part after the robot's id.
+    """Return the lowest role that has the main permission for a Zenoh key.
 
-    If clients may put on the key, the result is the lowest role that may do so. Otherwise it is the
-    lowest role that may query the key, or else subscribe to it. For an unknown key, the result is
-    "viewer", which does not mean that a viewer may use such a key.
+    The main permission is the first of these that the table of keys gives to any client: to put on
+    the key, to query the key, to subscribe to the key. For example, the result for `imu` is
+    "maintainer", because only a maintainer may put on this key, although a viewer may query it.
+
+    Args:
+        key: the part of the key after the robot's id, such as `state`. A `json/` in front of it is
+            ignored. If the table does not contain the key, the function returns the placeholder
+            "viewer". This does not mean that a viewer may use the key.
     """
     row = row_of(key.removeprefix(JSON_TREE))
     if row is None:

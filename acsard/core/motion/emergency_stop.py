@@ -44,14 +44,14 @@ SILENT_S = 0.5
 """Time without a report after which an input counts as pressed, s: five status lines at 10 Hz."""
 
 LATE_NS = 150_000_000
-"""If more than this time passes between two steps of the control loop, ns, this computer counts as
-late. The longest control period that can be configured is 100 ms."""
+"""If more than this time passes between two control steps, ns, the second step counts as late. The
+longest control period that can be configured is 100 ms."""
 
 EXCUSE_NS = 100_000_000
-"""Extra time after this computer was late, ns, before the board counts as silent. In this time, the
-daemon reads the lines and commands that arrived while the computer was late. The daemon grants the
-extra time only once between two reports, so a computer that is always late does not delay the stop
-forever."""
+"""Extra time after a late control step, ns, before the board counts as silent. In this time, the
+daemon reads the lines and commands that arrived while no control step ran. The daemon grants the
+extra time only once between two reports of the board, so that a control loop that is always late
+does not delay the stop forever."""
 
 PRESSED = "emergency stop pressed at the robot"
 SILENT = (
@@ -83,17 +83,18 @@ class BoardInput(ABC):
         self.state: EstopState = ""
         """The state of the inputs; "" if the board has never reported them."""
         self.pressed: tuple[bool, ...] | None = None
-        """Whether each input counts as pressed, None if the board has never reported them."""
+        """Whether each input counts as pressed; None if the board has never reported the inputs."""
         self._awaited = True
         """True from the opening of the port until the board reports the inputs."""
         self.pressed_now = ""
-        """Why an input began to count as pressed in the last `look`, in words; "" if none did."""
+        """Why an input began to count as pressed in the last call of `look`, in words; "" if no
+        input began to count as pressed in that call."""
         self._reported_ns = self._looked_ns = 0
         self._excused = False
 
     @property
     def why(self) -> str:
-        """Why an input counts as pressed, in words; "" while none does."""
+        """Why an input counts as pressed, in words; "" while no input counts as pressed."""
         if self.state == "silent":
             return self.silent
         return self.words() if self.state == "pressed" else ""
@@ -158,7 +159,7 @@ class BoardInput(ABC):
         """
 
     def advice(self) -> str:
-        """Return what the operator must do after a press, for the log."""
+        """Return the instruction that the log gives to the operator when an input is pressed."""
         return f"{self.mend}, then call srv/clear"
 
     def _take(self, sign: Sign, pressed: tuple[bool, ...]) -> list[Event]:

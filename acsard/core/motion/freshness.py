@@ -198,7 +198,7 @@ class _Clock:
         self._stamp_ns = 0
         self._delay = 0
         self._number = -1
-        """Sequence number of the last command, -1 without one."""
+        """Sequence number of the last command, or -1 if that command was not numbered."""
         self._least = 0
         """Minimum of the trusted delays, ns. It rises with time by the largest possible drift."""
         self._early = 0
@@ -223,7 +223,8 @@ class _Clock:
         self._budget, self._budget_at_ns = FORGIVE_NS, at_ns
         self._proof: _Proof | None = None
         self._accepted: tuple[int, int] | None = None
-        """Stamp and sequence number (-1 without one) of the last accepted command."""
+        """The stamp, ns, and the sequence number of the last accepted command; None before the
+        first accepted command. The sequence number is -1 if that command was not numbered."""
 
     @property
     def was_known(self) -> bool:
@@ -258,20 +259,29 @@ class _Clock:
         return verdict
 
     def _superseded(self, mark: tuple[int, int]) -> bool:
-        """Return whether a newer command than this one was already accepted.
+        """Return whether this command, or a newer command of the same clock, was already accepted.
 
-        `mark` is the pair of this command's stamp, ns, and its sequence number, -1 without one.
+        A repetition of an accepted command is recognized only if the command is numbered.
+
+        Args:
+            mark: a pair that describes this command: its stamp, ns, and its sequence number. The
+                sequence number is -1 if the command is not numbered.
         """
         last = self._accepted
         return last is not None and (mark < last or (mark == last and mark[1] >= 0))
 
     def _repeats(self, stamp_ns: int, number: int, silence: int) -> bool:
-        """Return whether the network repeated this command, or delivered a later one before it.
+        """Return whether the network repeated this command, or delivered a later command before it.
 
-        Such a command changes nothing. `number` is its sequence number, -1 without one, and
-        `silence` is the time since the command before it, ns. A low number may also show that the
-        program has restarted and counts from the beginning. That is assumed if the stamp is later
-        than all stamps before, or after a pause.
+        The caller ignores such a command. A low sequence number may also mean that the sender has
+        restarted and counts from the beginning. The method assumes a restart, and returns False, if
+        the sender has paused, or if the stamp is later than the stamps of the previous command and
+        of the last accepted command.
+
+        Args:
+            stamp_ns: the stamp of this command, ns.
+            number: the sequence number of this command, or -1 if the command is not numbered.
+            silence: the time since the previous command arrived, ns.
         """
         if not 0 <= number <= self._number or silence > self.gap_ns:
             return False
@@ -279,10 +289,14 @@ class _Clock:
         return stamp_ns <= self._stamp_ns or (accepted is not None and stamp_ns <= accepted[0])
 
     def _later_than_lowest(self, delay: int, silence: int) -> int:
-        """Return by how much this delay of a steady clock exceeds its lowest delay so far, ns.
+        """Return the difference between a delay and the lowest delay of this steady clock, ns.
 
-        `silence` is the time since the previous command, ns. The lowest delay rises by the drift
-        that is possible in this time.
+        The result is 0 if `delay` is the new lowest delay. The lowest delay rises by the drift that
+        is possible in the time `silence`.
+
+        Args:
+            delay: the delay of the present command, ns.
+            silence: the time since the previous command arrived, ns.
         """
         floor = delay if self._floor is None else self._floor + silence // DRIFT
         self._floor = min(floor, delay)
@@ -291,16 +305,18 @@ class _Clock:
     def _look_for_adjustment(self, stamp_ns: int, silence: int, number: int) -> None:
         """Record a pause of the sender, or an adjustment of its clock.
 
-        `silence` is the time since the previous command, ns. `number` is the sequence number, -1
-        without one.
-
         A stamp that goes back or stands still shows an adjustment. The next command must confirm
         the adjustment: the stamp of that command must also go back or stand still, or must not be
         later than the stamp before the adjustment.
 
         If the sequence numbers show that commands were lost, the network may have caused the
         silence, so no pause is recorded. The size of an adjustment is then the time by which the
-        stamp is earlier than that of the last accepted command.
+        stamp is earlier than the stamp of the last accepted command.
+
+        Args:
+            stamp_ns: the stamp of the present command, ns.
+            silence: the time since the previous command arrived, ns.
+            number: the sequence number of the present command, or -1 if it is not numbered.
         """
         lost = number - self._number - 1 if number >= 0 and self._number >= 0 else 0
         if lost < 0:  # the sender has restarted its numbers
@@ -365,11 +381,12 @@ class _Clock:
         return "stale"
 
     def _forgive(self, proof: _Proof, at_ns: int) -> bool:
-        """Trust the delay that `proof` found constant, if that is allowed; return whether it is.
+        """Trust the delay that `proof` found constant, if the rules below allow that.
 
-        A fall of the delay is always allowed. A rise is allowed if the sender has paused, if the
-        budget covers the rise, or if a visible adjustment of the clock accounts for it. A visible
-        adjustment and the budget may each account for a part of the rise.
+        Return whether the rules allow it. A fall of the delay is always allowed. A rise is allowed
+        if the sender has paused, if the budget covers the rise, or if a visible adjustment of the
+        clock accounts for the rise. A visible adjustment and the budget may each account for a part
+        of the rise.
         """
         self._accrue(at_ns, FORGET_NS)
         hidden = proof.least - self._least

@@ -53,7 +53,10 @@ GROWTH = 5
 
 
 class Rolled(Struct, frozen=True, gc=False):
-    """Angles that the wheels rolled since the last plausible line, rad, in `WHEELS` order."""
+    """The angles that the wheels rolled since the last plausible feedback line from the board.
+
+    All angles are in rad and in `WHEELS` order.
+    """
 
     pieces: tuple[Motors, ...]
     """Angles that are computed from the speeds, rad. Each item is one arc of the path, and has at
@@ -67,21 +70,27 @@ class Rolled(Struct, frozen=True, gc=False):
     seconds: float
     """Duration of the motion `seen`, s."""
     bridged: float
-    """Part of `seconds`, s, that no line covers, so that the speeds in this part were assumed."""
+    """Part of `seconds`, s, that no feedback line covers. The speeds in this part were assumed."""
     unknown: float
     """Time in addition to `seconds` in which the motion of the robot is unknown, s."""
     known: float
-    """Duration of `pieces` and `turned` together, s; 0 if a part of the motion is unknown."""
+    """Total duration of the motion in `pieces` and `turned`, s; 0 if a part of the motion is
+    unknown."""
     doubtful: float = 0.0
     """Time in the gap from the command to rest until the MCU's watchdog stops the motors, s. The
     wheels moved on in this time if the MCU did not receive the command."""
 
 
 class Rolling:
-    """Computes the angles that the wheels rolled from one plausible line to the next."""
+    """Computes the angles that the wheels rolled from one plausible feedback line to the next.
+
+    A feedback line is a line from the board with the speeds of the wheels. It is plausible unless
+    `sanity.py` or `Confirmation` rejects it. The motion during rejected lines is computed with the
+    next plausible line.
+    """
 
     def __init__(self, quiet: float = math.inf) -> None:
-        """Start without implausible lines.
+        """Start with no implausible feedback lines to take into account.
 
         `quiet` is the time without feedback after which a running daemon commands rest, s.
         """
@@ -89,25 +98,33 @@ class Rolling:
         self.forget()
 
     def forget(self) -> None:
-        """Forget the implausible lines since the last plausible one."""
+        """Forget the implausible feedback lines that came after the last plausible one."""
         self._lost = self._gap = self._bridged = self._counted = self._driven = 0.0
-        """Durations, s. `_lost` is the time that implausible lines without counts cover, and
-        `_counted` the time that implausible lines with counts cover. `_bridged` and `_gap` are the
-        gaps before the lines without counts: `_bridged` is the total of those that can be filled,
-        and `_gap` is the total of those that cannot. `_driven` is the part of `_bridged` before the
-        command to rest."""
+        """Durations, s.
+
+        - `_lost`: the time that implausible feedback lines without encoder counts cover.
+        - `_counted`: the time that implausible feedback lines with encoder counts cover.
+        - `_bridged`: the total of the gaps before the lines without counts that can be filled.
+        - `_gap`: the total of the gaps before the lines without counts that cannot be filled.
+        - `_driven`: the part of `_bridged` before the motors were commanded to rest.
+        """
         self._turned, self._skipped = NOWHERE, 0
 
     @property
     def skipped(self) -> float:
-        """Total time of the implausible lines without counts since the last plausible line, s.
+        """Total time of the implausible feedback lines without encoder counts, s.
 
-        It includes the gaps before these lines.
+        Only the lines after the last plausible line count. The gaps before these lines are
+        included.
         """
         return self._lost + self._gap + self._bridged
 
     def skip(self, line: Feedback) -> None:
-        """Record the counts of an implausible line, or its duration if it has no counts."""
+        """Record an implausible feedback line.
+
+        If the line has encoder counts, they are added to the motion. Otherwise, the time that the
+        line covers is recorded.
+        """
         self._skipped += 1
         if line.turned is None:
             self._lost += line.dt - line.bridged
@@ -119,13 +136,15 @@ class Rolling:
             self._turned = plus(self._turned, line.turned)
 
     def _driven_in(self, line: Feedback) -> float:
-        """Return the part of the gaps before `line` until rest was commanded to the motors, s."""
+        """Return the time in the gaps before `line` until the motors were commanded to rest, s."""
         return self._bridged + line.driven if line.bridged else self._driven
 
     def take(self, line: Feedback, before: WheelSpeeds) -> Rolled:
-        """Return the angles that the wheels rolled from the last plausible line to this one.
+        """Return the angles that the wheels rolled since the last plausible feedback line.
 
-        `before` contains the wheel speeds of the last plausible line, rad/s.
+        Args:
+            line: the present feedback line, which is plausible.
+            before: the wheel speeds in the last plausible feedback line, rad/s.
         """
         speeds, dt, bridged = line.speeds.as_tuple(), line.dt, line.bridged + self._bridged
         if not (self._skipped or bridged or line.gap or line.turned is not None):
@@ -197,7 +216,7 @@ def times(a: Motors, factor: float) -> Motors:
 
 
 class Confirmation:
-    """Holds back a line that reports a doubtful speed and covers more time than usual.
+    """Holds back a feedback line that reports a doubtful speed and covers more time than usual.
 
     After a gap, one damaged line would falsify the motion of the whole gap. Damage can be detected,
     because it changes one wheel alone, while motion changes the speeds of both wheels of a side
@@ -221,14 +240,14 @@ class Confirmation:
     def __init__(self, feedback: FeedbackConfig) -> None:
         self._acceleration = feedback.wheel_acceleration
         self._period = 0.0
-        """Usual time between two lines, s; 0 before the first line."""
+        """Usual time between two feedback lines, s; 0 before the first line."""
         self.forget()
 
     def forget(self) -> None:
-        """Forget the lines that are held."""
+        """Forget the feedback lines that are held back."""
         self._held: list[Feedback] = []
         self._seconds = 0.0
-        """Time that the held lines and the gaps before them cover, s."""
+        """Time that the held feedback lines and the gaps before these lines cover, s."""
 
     def look(
         self,
@@ -237,13 +256,15 @@ class Confirmation:
         before: WheelSpeeds,
         believed: Callable[[Motors], Motors],
     ) -> tuple[list[Feedback], list[Feedback]]:
-        """Return a pair: the lines to use now, the oldest first, and the lines to drop.
+        """Return a pair: the feedback lines to use now, and the feedback lines to drop.
+
+        The lines to use are in the order of time.
 
         Args:
-            line: The next plausible line.
-            skipped: The time that the implausible lines directly before `line` cover, s, including
-                the gaps before them.
-            before: The wheel speeds of the last line that was used, rad/s.
+            line: The next plausible feedback line.
+            skipped: The time that the implausible lines directly before `line` cover, s. The gaps
+                before these lines are included.
+            before: The wheel speeds in the last line that was used, rad/s.
             believed: The function that replaces the speeds of wheels that are known to be faulty.
         """
         period, held, seconds = self._period, self._held, line.dt + line.gap + skipped
@@ -273,9 +294,12 @@ class Confirmation:
 def _alone(a: Motors, b: Motors, steps: Motors) -> float:
     """Return the largest speed change of one wheel that the other wheel of its side did not make.
 
-    `a` are the speeds after the change, and `b` those before it, rad/s. `steps` are the
-    quantization steps of the speeds, rad/s, infinite if unknown. A change by one known step does
-    not count.
+    A change by one known quantization step does not count. The result is in rad/s.
+
+    Args:
+        a: the wheel speeds after the change, rad/s.
+        b: the wheel speeds before the change, rad/s.
+        steps: the quantization step of each wheel's speed, rad/s; infinite if it is unknown.
     """
     changes, largest = tuple(map(sub, a, b)), 0.0
     # The wheels i and 3 - i in `WHEELS` order are those of one side.
@@ -298,7 +322,7 @@ class Gaps:
     acceleration limits are not used, because robots seldom accelerate that much.
 
     The deviation is limited to the motion at the higher of the two speeds before and after the gap.
-    Therefore a robot that stood before and after a gap is assumed not to have moved in the gap.
+    Therefore a robot that stood still before and after a gap is assumed not to have moved in it.
     """
 
     def __init__(self) -> None:
@@ -313,7 +337,10 @@ class Gaps:
         self._bridged, self._given = 0.0, (0.0, 0.0)
 
     def follow(self, twist: Twist, dt: float) -> None:
-        """Measure the acceleration with a new line, which reports `twist` for the last `dt` s."""
+        """Measure the acceleration with a new feedback line.
+
+        The line reports that the robot moved with `twist` in the last `dt` s.
+        """
         linear, angular = twist.linear, twist.angular
         self._bridged, self._given = 0.0, (0.0, 0.0)
         self._seconds += dt

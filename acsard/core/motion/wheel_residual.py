@@ -79,11 +79,17 @@ class Residual:
         self._off = self._way = self._net = 0.0
 
     def add(self, front: float, rear: float, keep: float, dt: float, count: float) -> bool:
-        """Add a feedback line of `dt` s, and return whether the wheels agree.
+        """Add the motion of a feedback line from the board, and return whether both wheels agree.
 
-        `front` and `rear` are the angles that the wheels rolled in the line, and `count` is the
-        angle of an encoder count, rad. `keep` is the factor by which this line reduces the weight
-        of all angles so far.
+        The method also learns the fraction by which the wheels differ, while `learns` is true.
+
+        Args:
+            front: the angle that the front wheel rolled since the previous feedback line, rad.
+            rear: the angle that the rear wheel rolled since the previous feedback line, rad.
+            keep: the factor, from 0 to 1, with which the sums of the angles are multiplied after
+                this line was added, so that older angles have less weight (`MEMORY_S`).
+            dt: the time in which the wheels rolled these angles, s.
+            count: the angle of one encoder count, rad.
         """
         mean = (front + rear) / 2
         size = abs(mean) if front * rear >= 0.0 else (abs(front) + abs(rear)) / 2
@@ -113,7 +119,10 @@ class Residual:
 
     @property
     def rolling(self) -> bool:
-        """Whether the wheels rolled fast enough to show a difference (`SLOWEST` on average)."""
+        """Whether the wheels recently rolled faster than `SLOWEST` on average.
+
+        Slower wheels do not show reliably whether they differ.
+        """
         return self._way > SLOWEST * MEMORY_S
 
     def _learn(self, more: float) -> None:

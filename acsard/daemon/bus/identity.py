@@ -34,7 +34,7 @@ class Identity(Struct, frozen=True):
     """The identity of a client at a robot: its role, its certificate and its name."""
 
     role: Role | Literal[""]
-    """The role of the client; "" if no key answered."""
+    """The role of the client; "" if the robot answered none of the queries for the role."""
     certificate: str
     """The common name of the client's certificate; "" if the client has no certificate."""
     sender: str
@@ -43,10 +43,14 @@ class Identity(Struct, frozen=True):
     endpoint: str = ""
 
     def lacks(self, key: str) -> str:
-        """Return why this client may not use the robot's key `key`, in words; "" if it may.
+        """Return the reason, in words, why this client may not use a Zenoh key of the robot.
 
-        Also returns "" if no key answered and the client has no certificate, because the role is
-        then unknown.
+        The result is "" if the client may use the key. If the robot answered no query for the
+        client's role, the role is unknown. Then the result is the text of `silence`, which is "" if
+        the client connects without a certificate.
+
+        Args:
+            key: the part of the Zenoh key after the robot's id, such as `state`.
         """
         least = least_role(key)
         if not self.role:
@@ -57,11 +61,11 @@ class Identity(Struct, frozen=True):
 
     @property
     def silence(self) -> str:
-        """The likeliest reasons why no key answered, in words.
+        """The likeliest reasons why the robot answered no query for the client's role, in words.
 
         The text names several reasons, because a client cannot tell whether the robot is absent,
-        hangs, or does not list the client's certificate. The text is "" if a key answered, or if
-        the client has no certificate.
+        hangs, or does not list the client's certificate. The text is "" if the robot answered a
+        query, or if the client connects without a certificate.
         """
         return "" if self.role or not self.certificate else self._nobody()
 
@@ -82,7 +86,10 @@ class Identity(Struct, frozen=True):
         )
 
     def words(self) -> str:
-        """Return the role and the certificate in a sentence."""
+        """Return a sentence about the client's role and certificate.
+
+        If the role is unknown, the text says why the robot may not have answered.
+        """
         if not self.role:
             return self._nobody()
         owner = (

@@ -245,10 +245,13 @@ def _tls(directory: str) -> dict[str, object]:
 
 
 def _command_limits(config: Config) -> dict[str, object]:
-    """Return the rate limits of commands, speed limits and gyro samples, on native and ROS keys.
+    """Return the Zenoh setting that limits the rate of the messages that clients put on input keys.
 
-    All certificates of a configured source share one limit. All sources that are not configured
-    share another one. Zenoh counts the samples of each connection separately.
+    Clients put three kinds of messages on these keys: velocity commands, gyro samples, and messages
+    that lower the robot's highest speed (`SPEED_LIMIT`). The limit covers native and ROS keys.
+
+    Zenoh counts the messages of each connection separately. On each command key of a configured
+    source, all certificates share one limit. All sources that are not configured share another one.
     """
     names = [*(source.name for source in config.commands.sources), "*"]
     below = [*source_keys(names), *source_keys(names, "*"), IMU, SPEED_LIMIT]
