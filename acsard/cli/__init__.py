@@ -60,7 +60,7 @@ VERBS = {
 subcommand is also the name of its module in this package."""
 
 _EPILOG = """\
-exit codes: 0 done, 1 failure, 2 wrong usage, 65 part of the recording is damaged, 66 no such
+exit codes: 0 done, 1 failure, 2 wrong usage, 65 part of the recording was left out, 66 no such
 port, 69 daemon unreachable, 75 port, bus address or robot id in use, 77 no permission, 78 bad
 configuration
 

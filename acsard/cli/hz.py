@@ -15,6 +15,13 @@ import zenoh
 from acsard.cli.common import count
 from acsard.cli.connection import add_bus, connected, require_followed, silence_explained
 
+SPAN_S = 10.0
+"""Time that each line covers, s."""
+
+MAX_TIMES = 1_000_000
+"""Maximum number of arrival times in memory (32 MB). Python receives fewer messages in `SPAN_S`, so
+the limit counts only while the output is blocked."""
+
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("topic", help="for example odom")
@@ -25,7 +32,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     require_followed(args.topic)
-    times: deque[float] = deque(maxlen=10_000)
+    times: deque[float] = deque(maxlen=MAX_TIMES)
     left = args.n
     with connected(args) as robot, silence_explained(robot, args.topic) as heard:
 
@@ -38,7 +45,7 @@ def main(args: argparse.Namespace) -> int:
             while left is None or left > 0:
                 time.sleep(1.0)
                 now = time.monotonic()
-                while times and now - times[0] > 10.0:
+                while times and now - times[0] > SPAN_S:
                     times.popleft()
                 figures = rate(list(times))
                 text = msgspec.json.encode(figures).decode() if args.json else _line(figures)

@@ -99,18 +99,30 @@ class _Puts:
 
     def __init__(self) -> None:
         # The lock is reentrant: a signal handler may also send while the same thread holds it.
-        self._lock, self._next_s = threading.RLock(), 0.0
+        self._lock, self._next_s, self._last_s = threading.RLock(), 0.0, 0.0
         self.moving: dict[Client, float] = {}
         """Maps each client whose last command was not zero to the monotonic time of that command,
         s."""
 
-    def wait(self) -> None:
+    @contextmanager
+    def turn(self) -> Iterator[None]:
+        """Wait until the next command may be sent. The caller sends it in the `with` block.
+
+        No other thread sends a command in the meantime.
+        """
+        # Each thread reserves a time and waits for it without the lock. Otherwise a thread that
+        # sends without end would take the lock again and again before the others.
         with self._lock:
             at_s = max(self._next_s, time.monotonic())
             self._next_s = at_s + SPACING_S
         time.sleep(max(0.0, at_s - time.monotonic()))
-        # A busy machine may wake this thread late. The next command must still keep the pause.
-        self._next_s = max(self._next_s, time.monotonic() + SPACING_S)
+        with self._lock:
+            # A busy machine may wake another thread late, or a signal handler may just have sent.
+            while (left_s := self._last_s + SPACING_S - time.monotonic()) > 0:
+                time.sleep(left_s)
+            yield
+            self._last_s = time.monotonic()
+            self._next_s = max(self._next_s, self._last_s + SPACING_S)
 
 
 class Client:
@@ -184,11 +196,12 @@ class Client:
         daemon requires a zero before it follows a sender. A program that forwards commands passes
         `stamp_ns`, the time of the command on the clock of the original sender, ns.
         """
-        if self._opened:
-            self._put(linear, angular, stamp_ns)
-        else:
-            self._opened = True
-            self._put(0.0, 0.0, stamp_ns)
+        with self._puts.turn():
+            if self._opened:
+                self._put(linear, angular, stamp_ns)
+            else:
+                self._opened = True
+                self._put(0.0, 0.0, stamp_ns)
 
     def end(self) -> None:
         """Close the connection, as `connect` does at the end of its block.
@@ -198,7 +211,8 @@ class Client:
         """
         begun_s = clock.steady_s()
         # When the longest timeout has passed, a zero would only stop the next sender that drives.
-        moving = [one for one, at_s in self._puts.moving.items() if begun_s - at_s < LONGEST_S]
+        known = list(self._puts.moving.items())
+        moving = [one for one, at_s in known if begun_s - at_s < LONGEST_S]
         try:
             for pause_s in (AGAIN_S, 0.0) if moving else ():
                 for client in moving:
@@ -341,8 +355,8 @@ class Client:
 
         `source` is the command source; "" means the source of this client.
         """
-        self._puts.wait()
-        self._publish(twist, signature, source or self.source)
+        with self._puts.turn():
+            self._publish(twist, signature, source or self.source)
 
     def _publish(
         self, twist: schema.Twist | schema.TwistStamped, signature: Signature, source: str
@@ -357,7 +371,6 @@ class Client:
         )
 
     def _put(self, linear: float, angular: float, stamp_ns: int | None) -> None:
-        self._puts.wait()
         steady = stamp_ns is None
         if stamp_ns is None:
             stamp_ns = clock.steady_ns() + self._wall_offset_ns

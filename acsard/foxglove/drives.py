@@ -31,6 +31,15 @@ SLOW_NS, SLOW_TIMES = 5 * NS_PER_S // 2, 3
 `SLOW_TIMES` consecutive messages is longer than `commander.SILENCE_NS` (0.3 s) and at most
 `SLOW_NS` (2.5 s)."""
 
+MAX_CHANNELS = 64
+"""Maximum number of channels of one viewer that are registered at the same time."""
+
+TOO_MANY_CHANNELS = (
+    f"a viewer may publish on {MAX_CHANNELS} topics at most, so the messages of this panel are "
+    "lost: remove panels that publish, then close the viewer and open it again"
+)
+"""Notice about a message on a channel that was not registered."""
+
 _receiver = Receiver(JointsConfig(), Kinematics(DriveConfig()))
 """Decoder of velocity commands (twists). It has the default joints and wheels, because a twist does
 not depend on them."""
@@ -108,7 +117,7 @@ class Drives:
         """Register the channel with the id `channel` of the viewer with the id `client`.
 
         If messages on the channel cannot drive the robot, `came` reports the reason when one
-        arrives.
+        arrives. A channel beyond `MAX_CHANNELS` is not registered, which `came` reports too.
         """
         found, problem = "", ""
         if topic != self.topic:
@@ -122,7 +131,7 @@ class Drives:
             viewer = self._viewers.get(client)
             if viewer is None:
                 viewer = self._viewers[client] = Viewer(self._robot_of(client))
-            if len(viewer.channels) < 64:
+            if len(viewer.channels) < MAX_CHANNELS:
                 viewer.channels[channel] = found, problem
 
     def came(self, client: int, channel: int, data: bytes) -> None:
@@ -132,10 +141,11 @@ class Drives:
         message.
         """
         viewer = self._viewers.get(client)
-        encoding, problem = viewer.channels.get(channel, ("", "")) if viewer else ("", "")
-        if viewer is None or not encoding:
-            if problem:
-                self._notices.say("warning", "drive", problem)
+        if viewer is None:
+            return
+        encoding, problem = viewer.channels.get(channel, ("", TOO_MANY_CHANNELS))
+        if not encoding:
+            self._notices.say("warning", "drive", problem)
             return
         if self.forbidden:
             self._notices.say("error", "drive", self.forbidden)

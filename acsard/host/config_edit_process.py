@@ -19,6 +19,7 @@ from msgspec import Struct
 from acsard.core.config.parsing import ConfigError
 from acsard.core.config.toml_editing import edited
 from acsard.host.child import environment
+from acsard.host.errors import MendableError
 from acsard.host.extras import install
 
 EDIT_S = 2.0
@@ -40,13 +41,15 @@ class Result(Struct, frozen=True):
 
     text: str = ""
     error: str = ""
+    mendable: bool = False
+    """Whether `error` contains its remedy."""
 
 
 def edited_apart(text: str, keys: Mapping[str, object]) -> str:
     """Return the configuration `text` with new values, computed in a separate process.
 
-    `keys` maps dotted keys, such as "mcu.port", to their new values. Raises `ValueError` if the
-    text cannot be changed, and `OSError` if the process cannot be started.
+    `keys` maps dotted keys, such as "mcu.port", to their new values. Raises `MendableError` or
+    `ValueError` if the text cannot be changed, and `OSError` if the process cannot be started.
     """
     task = msgspec.json.encode(Task(text, dict(keys)))
     # With -P Python ignores the working directory, so it runs the installed package.
@@ -60,14 +63,14 @@ def edited_apart(text: str, keys: Mapping[str, object]) -> str:
             f"the robot's computer was too busy to make the change within {EDIT_S:g} s: type the "
             "command again"
         )
-        raise ValueError(text) from None
+        raise MendableError(text) from None
     try:
         result = msgspec.json.decode(done.stdout, type=Result)
     except msgspec.DecodeError:
         told = done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
         raise ValueError(f"the process that changes the file failed: {told}") from None
     if result.error:
-        raise ValueError(result.error)
+        raise (MendableError if result.mendable else ValueError)(result.error)
     return result.text
 
 
@@ -83,10 +86,11 @@ def main() -> None:
     except ImportError:
         result = Result(
             error="the robot needs the library tomlkit; run this command on the robot: "
-            f"{install('write')}"
+            f"{install('write')}",
+            mendable=True,
         )
     except (ValueError, ConfigError) as error:
-        result = Result(error=str(error))
+        result = Result(error=str(error), mendable=isinstance(error, ConfigError))
     sys.stdout.buffer.write(msgspec.json.encode(result))
 
 

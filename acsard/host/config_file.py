@@ -13,6 +13,7 @@ from msgspec import Struct
 from acsard.core.config.parsing import ConfigError, parse
 from acsard.core.config.settings import Config
 from acsard.core.config.toml_editing import edited
+from acsard.core.values import AcsardError
 from acsard.host.atomic_file import replace, sync
 from acsard.host.config_edit_process import edited_apart
 from acsard.host.errors import Exit, ExitError, MendableError
@@ -111,13 +112,13 @@ def keepable(file: Path | None, keys: Keys) -> Edit:
         place = file.resolve(strict=True)
         _require_writable(place)
         if is_tracked(place):
-            raise ValueError(
+            raise MendableError(
                 "git tracks it, and a changed file hinders the next `git pull`; start the daemon "
                 "with a copy of it (--config)"
             )
         before = place.read_bytes()
         return Edit(file, keys, before, edited_apart(before.decode(), keys))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, MendableError) as error:
         raise _left(file, error) from None
 
 
@@ -246,4 +247,6 @@ def _changed(
 
 
 def _left(file: Path, error: Exception) -> MendableError:
-    return MendableError(f"{file} was not changed: {error}; write the lines by hand")
+    # The text of an `AcsardError` contains its own remedy.
+    mend = "" if isinstance(error, AcsardError) else "; write the lines by hand"
+    return MendableError(f"{file} was not changed: {error}{mend}")

@@ -31,7 +31,7 @@ WORDS: dict[int, str] = {
     Exit.OK: "done",
     Exit.FAILURE: "failure",
     Exit.USAGE: "wrong usage",
-    Exit.INCOMPLETE: "part of the recording is damaged",
+    Exit.INCOMPLETE: "part of the recording was left out",
     Exit.NO_PORT: "no such port",
     Exit.UNREACHABLE: "daemon unreachable",
     Exit.IN_USE: "port, bus address or robot id in use",

@@ -42,7 +42,7 @@ from acsard.daemon.bus.address import Address
 from acsard.daemon.bus.zenoh_sessions import no_endpoint, reachable
 from acsard.daemon.late_causes import cause_in
 from acsard.host import clock
-from acsard.host.errors import NoAnswerError
+from acsard.host.errors import MendableError, NoAnswerError
 from acsard.host.processes import name_of
 from acsard.machine.finding import LEVELS, Finding, Level
 
@@ -374,6 +374,11 @@ ANOTHER = (
     "otherwise check whether another program listens at that address"
 )
 
+OTHER_VERSION = "if the daemon has another version of acsard, run this tool from the same version"
+
+GUARD = "the daemon's guard"
+"""Words in the reason of a fault that the guard has found, which is a defect of acsard."""
+
 SIGN = (
     "or let the clients sign their commands (deploy/clients/README.md): signed commands do not "
     "need a common clock"
@@ -438,10 +443,11 @@ def found(config: Config, address: Address) -> Running | Finding:
         return asked(config, address)
     except NoAnswerError as error:
         return Finding("daemon", "failure", str(error), ANOTHER)
+    except MendableError as error:
+        # The text of such an error contains the advice.
+        return Finding("daemon", "failure", str(error))
     except AcsardError as error:
-        return Finding(
-            "daemon", "failure", str(error), "check whether another program listens at that address"
-        )
+        return Finding("daemon", "failure", str(error), OTHER_VERSION)
 
 
 def daemon(running: Running) -> Iterator[Finding]:
@@ -452,6 +458,11 @@ def daemon(running: Running) -> Iterator[Finding]:
         "correct the cause that this reason names, then release the fault with `acsard call "
         f"clear`; {check(running)}"
     )
+    if GUARD in state.reason:
+        mend = (
+            "this is a defect of acsard: report it with the newest recording (`acsard recording` "
+            "lists the recordings), then release the fault with `acsard call clear`"
+        )
     mend = mend if level == "failure" else ""
     yield Finding("daemon", level, f"{state.mode}: {state.reason}", mend)
     yield from link(running)
@@ -575,8 +586,7 @@ def gyro(does: str, counters: Mapping[str, int]) -> Iterator[Finding]:
     if does != "off":
         mend = next(
             (text for name, text in GYRO_MENDS.items() if name == does),
-            "this tool does not know this status of the gyro: if the daemon has another version of "
-            "acsard, run this tool from the same version",
+            f"this tool does not know this status of the gyro: {OTHER_VERSION}",
         )
         yield Finding("gyro", "warning" if mend else "ok", words, mend)
     refused = {n.removeprefix("imu_"): c for n, c in counters.items() if n.startswith("imu_") and c}

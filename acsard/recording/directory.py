@@ -355,12 +355,12 @@ class Ring:
             oldest_s = now.wall_ns / NS_PER_S - self._days * S_PER_DAY
         freed = self._run.freed if refused else None
         names = to_delete(ended, Bounds(self._bytes, oldest_s), disk, freed)
-        if refused:
-            self._run.freed += sum(file.size for file in ended if file.name in names)
-        for name in names:
+        for file in ended:
             # The file may belong to another user. Recording goes on in any case.
             with suppress(OSError):
-                (self._directory / name).unlink()
+                if file.name in names:
+                    (self._directory / file.name).unlink()
+                    self._run.freed += file.size if refused else 0
         self.file_bytes = share(self._bytes, sum(file.size for file in ended), disk)
 
     def _ended(self) -> list[Ended]:

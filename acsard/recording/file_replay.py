@@ -140,6 +140,8 @@ class _Source:
         self._state: State | None = None
         """Robot state that was last decoded from the file; None while the replay uses a new
         robot."""
+        self._place = "at the start of"
+        """Place of the robot state `_state` in the recording, in words."""
         self._left = MAX_BYTES
         """Number of bytes of robot states that may still be decoded after gaps."""
         for path in recording.paths:
@@ -163,7 +165,7 @@ class _Source:
             if self._state is None:
                 raise
             reason = (
-                "this version of acsard cannot read the robot state at the start of the recording: "
+                f"this version of acsard cannot read the robot state {self._place} the recording: "
                 f"{short(error)}"
             )
             raise _foreign(self._recording, reason) from error
@@ -193,6 +195,7 @@ class _Source:
             adopt(state.robot, Robot(present), Robot(tried(present) if tried else present))
         except (StateError, ConfigError, *INCOMPLETE_STATE_ERRORS):
             return None
+        self._place = f"before step {number} of"
         return state
 
 

@@ -10,6 +10,7 @@ from collections.abc import Collection, Hashable
 from typing import Generic, TypeVar
 
 from acsard.host.rate_limits import Places, Rate
+from acsard.web.callers import network_of
 
 SOCKETS, SOCKETS_HERE = 256, 96
 """Maximum numbers of TCP connections from other machines, and from the robot itself. A browser
@@ -41,9 +42,9 @@ OVERRUNS = 600
 """Number of messages beyond the rate limit `MESSAGES` after which a WebSocket is closed."""
 
 CONNECTIONS, CONNECTIONS_OF_ONE, CONNECTIONS_OF_TOKEN, CONNECTIONS_ALIKE = 100, 20, 30, 6
-"""Maximum numbers of WebSockets from other machines: in total, per address, per token, and per
-token at one address. Because of the last limit, one program cannot lock out other tokens at its
-address."""
+"""Maximum numbers of WebSockets from other machines: in total, per network, per token, and per
+token in one network. Because of the last limit, one program cannot lock out other tokens in its
+network."""
 
 CONNECTIONS_HERE = 20
 """Maximum number of WebSockets from the robot itself. These places are only for clients on the
@@ -220,7 +221,7 @@ class Seats:
         self._here = Places(CONNECTIONS_HERE, CONNECTIONS_HERE)
         self._alike = Places(CONNECTIONS, CONNECTIONS_ALIKE)
         self._tokens = Places(CONNECTIONS, CONNECTIONS_OF_TOKEN)
-        self._addresses = Places(CONNECTIONS, CONNECTIONS_OF_ONE)
+        self._networks = Places(CONNECTIONS, CONNECTIONS_OF_ONE)
 
     def missing(self, address: str, token: str) -> str:
         """Return "" if there is room for a WebSocket, else the reason and the remedy."""
@@ -250,19 +251,20 @@ class Seats:
         if not token:
             here = f"{CONNECTIONS_HERE} pages are open on the robot itself: close some"
             return [(self._here, address, here)]
+        network = network_of(address)
         alike = (
-            f"{CONNECTIONS_ALIKE} pages with this token are open at {address} already: close "
+            f"{CONNECTIONS_ALIKE} pages with this token are open at {network} already: close "
             "some, or ask for a token of your own"
         )
         spread = f"{CONNECTIONS_OF_TOKEN} pages with this token are open already: close some"
         full = (
-            f"{CONNECTIONS} pages are open in total, or {CONNECTIONS_OF_ONE} from this address: "
+            f"{CONNECTIONS} pages are open in total, or {CONNECTIONS_OF_ONE} from {network}: "
             "close some of them"
         )
         return [
-            (self._alike, f"{address} {token}", alike),
+            (self._alike, f"{network} {token}", alike),
             (self._tokens, token, spread),
-            (self._addresses, address, full),
+            (self._networks, network, full),
         ]
 
 

@@ -32,6 +32,7 @@ def _tls(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ours.issue(place / "robot", "robot", ALL_NAMES, 1)
     ours.issue(place / "robot ended", "robot", ALL_NAMES, -1)
     ours.issue(place / "robot elsewhere", "robot", ["robot.example"], 1)
+    ours.issue(place / "robot barred", "robot", [*ALL_NAMES, "elsewhere.example"], 1)
     Authority.make(place / "other ca", "other", 10).issue(place / "stranger", "client", [], 1)
     mixed = place / "mixed"  # it knows the robot's authority but shows another's certificate
     shutil.copytree(place / "stranger", mixed)
@@ -103,6 +104,7 @@ def test_the_certificate_directory_is_checked_before_the_network(tmp_path: Path)
         ),
         ("robot later", "is not valid yet, according to this machine's clock"),
         ("robot elsewhere", "tls renew --address 127.0.0.1"),
+        ("robot barred", "may not sign for the names in the certificate of 127.0.0.1"),
     ],
 )
 def test_the_error_says_what_is_wrong_with_the_robot_s_certificate(

@@ -231,8 +231,17 @@ AWAY = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN)
 
 EXPIRED, NOT_YET, WRONG_NAME, WRONG_ADDRESS = 10, 9, 62, 64
 """OpenSSL's error codes (X509_V_ERR_...) for a certificate that has expired, is not valid yet, or
-is not for the host name or the IP address. For any other code, `trouble` reports that another
-authority signed the certificate."""
+is not for the host name or the IP address."""
+
+UNSIGNED, BARRED, WRONG_PURPOSE = (2, 7, 18, 19, 20, 21), (47, 48), 26
+"""Further error codes of OpenSSL: another authority signed the certificate, the authority may not
+sign for the names in it, or it is not for a server. For any other code, `trouble` reports the text
+of OpenSSL."""
+
+RENEW = (
+    "run `acsard tls renew` on the machine that has ca-key.pem (with `--name NAME` for a robot of "
+    "a fleet); this command prints the next step"
+)
 
 
 def trouble(endpoint: str, directory: str) -> str:
@@ -297,13 +306,12 @@ def _server_rejected(error: ssl.SSLCertVerificationError, host: str, directory: 
     `directory` contains the client's certificate and the certificate of its authority.
     """
     now = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime())
+    reason = error.verify_message
     match error.verify_code:
         case code if code == EXPIRED:
             return (
                 f"the certificate of {host} has expired, according to this machine's clock "
-                f"({now}); if the clock is right, run `acsard tls renew` on the machine that has "
-                "ca-key.pem (with `--name NAME` for a robot of a fleet); this command prints the "
-                "next step"
+                f"({now}); if the clock is right, {RENEW}"
             )
         case code if code == NOT_YET:
             return (
@@ -317,11 +325,22 @@ def _server_rejected(error: ssl.SSLCertVerificationError, host: str, directory: 
                 f"that the certificate contains, or run `acsard tls renew --address {host}` on the "
                 "robot; the command says what to do next"
             )
-    return (
-        f"the authority in {directory}/{CA} did not sign the certificate of {host} "
-        f"({error.verify_message}); use a certificate directory that `acsard tls add` made for "
-        "this robot"
-    )
+        case code if code in UNSIGNED:
+            return (
+                f"the authority in {directory}/{CA} did not sign the certificate of {host} "
+                f"({reason}); use a certificate directory that `acsard tls add` made for this robot"
+            )
+        case code if code in BARRED:
+            return (
+                f"the authority in {directory}/{CA} may not sign for the names in the certificate "
+                f"of {host} ({reason}); to make one without these names, {RENEW}"
+            )
+        case code if code == WRONG_PURPOSE:
+            return (
+                f"the certificate of {host} is not for a TLS server ({reason}); to make one for "
+                f"servers and clients, {RENEW}"
+            )
+    return f"the certificate of {host} is not valid ({reason}); to make another one, {RENEW}"
 
 
 def _client_rejected(reason: str, host: str, directory: str) -> str:
@@ -337,10 +356,15 @@ def _client_rejected(reason: str, host: str, directory: str) -> str:
             "one with `acsard tls add` on the machine that has ca-key.pem, or set the clocks of "
             "this machine and of that host (`timedatectl`)"
         )
-    if "UNKNOWN_CA" in reason or "CERTIFICATE" in reason or "DECRYPT" in reason:
+    if "UNKNOWN_CA" in reason or "DECRYPT" in reason:
         return (
             f"{host} does not accept {certificate}: the robot's authority did not sign this "
             "certificate; get a certificate that `acsard tls add` made for this robot"
+        )
+    if "CERTIFICATE" in reason:
+        return (
+            f"{host} does not accept {certificate} ({reason}); get a certificate that `acsard tls "
+            "add` made for this robot"
         )
     return (
         f"{host} does not speak TLS on this port ({reason}); an endpoint without TLS begins with "

@@ -2,8 +2,16 @@
 
 from __future__ import annotations
 
+import json
+from argparse import Namespace
+from collections.abc import Callable
+from contextlib import nullcontext
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 
+from acsard.cli import hz
 from acsard.cli.hz import rate
 
 
@@ -43,3 +51,27 @@ def test_one_hole_shows_in_the_largest_gap_and_hardly_in_the_median() -> None:
 
 def test_messages_of_one_instant_have_no_rate() -> None:
     assert rate([1.0, 1.0]) == {"count": 2, "hz": 0.0}
+
+
+def test_a_line_covers_ten_seconds_of_a_fast_stream(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The clock is virtual, and 2000 messages arrive in each second."""
+    now, takes = [0.0], list[Callable[[Any], None]]()
+
+    def sleep(seconds: float) -> None:
+        for _ in range(round(2000 * seconds)):
+            now[0] += 1 / 2000
+            takes[0](None)
+
+    def listen(_: str, take: Callable[[Any], None]) -> SimpleNamespace:
+        takes.append(take)
+        return SimpleNamespace(undeclare=lambda: None)
+
+    monkeypatch.setattr(hz, "time", SimpleNamespace(monotonic=lambda: now[0], sleep=sleep))
+    monkeypatch.setattr(hz, "connected", lambda _: nullcontext(SimpleNamespace(listen=listen)))
+    monkeypatch.setattr(hz, "silence_explained", lambda *_: nullcontext(lambda: None))
+    assert hz.main(Namespace(topic="odom", n=12, json=True)) == 0
+    last = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert last["count"] == pytest.approx(20_000, abs=1)
+    assert last["hz"] == 2000.0

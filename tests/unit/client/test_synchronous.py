@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from typing import Any
 
@@ -88,6 +89,32 @@ def test_two_clients_of_one_connection_keep_the_spacing_between_commands(session
     for each in (one, other) * 5:
         each.send(0.0)
     assert time.monotonic() - begun > 8.9 * SPACING_S
+
+
+def test_the_commands_of_two_threads_leave_in_their_order_and_with_the_pause(
+    session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The bus delays the speed of one thread, while the other thread sends a zero."""
+    client, put, began = client_of(session), session.put, threading.Event()
+    puts_s: list[float] = []
+
+    def slow(key: str, payload: bytes, **rest: Any) -> None:
+        if not began.is_set():
+            began.set()
+            time.sleep(10 * SPACING_S)
+        put(key, payload, **rest)
+        puts_s.append(time.monotonic())
+
+    client.send(0.0)
+    monkeypatch.setattr(session, "put", slow)
+    thread = threading.Thread(target=client.send, args=(0.5,))
+    thread.start()
+    assert began.wait(5.0)
+    client.send(0.0)
+    thread.join()
+    assert [one.sequence for one in session.heard] == [1, 2, 3]
+    assert session.heard[-1].twist == REST
+    assert puts_s[1] - puts_s[0] >= SPACING_S
 
 
 @pytest.mark.timeout(10)

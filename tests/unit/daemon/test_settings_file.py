@@ -216,15 +216,16 @@ def tracked(file: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "settings", "words"),
+    ("spoil", "settings", "words", "by_hand"),
     [
-        (read_only, {}, "it is read-only for the daemon"),
-        (broken, {}, "was not changed: not TOML"),
-        (tracked, {}, "git tracks it"),
+        (read_only, {}, "it is read-only for the daemon", True),
+        (broken, {}, "was not changed: not TOML", False),
+        (tracked, {}, "git tracks it", False),
         (
             None,
             {"commands.sources.app.timeout": 0.3},
             "cannot write a timeout of [[commands.sources]] to a file",
+            True,
         ),
     ],
 )
@@ -234,6 +235,7 @@ def test_nothing_is_set_if_the_file_cannot_be_changed(
     spoil: Callable[[Path], None] | None,
     settings: dict[str, Plain],
     words: str,
+    by_hand: bool,
 ) -> None:
     if spoil is not None:
         spoil(file)
@@ -242,6 +244,7 @@ def test_nothing_is_set_if_the_file_cannot_be_changed(
     message = refusal(made)
     assert message.startswith("nothing is set: ")
     assert words in message
+    assert ("write the lines by hand" in message) is by_hand, "one remedy, which fits"
     assert file.read_text() == before
 
 

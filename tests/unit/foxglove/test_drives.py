@@ -194,6 +194,15 @@ def test_single_presses_are_not_reported_as_a_slow_panel() -> None:
     assert not told_slow(4.0 * NS_PER_S)
 
 
+def test_a_command_on_a_channel_beyond_the_limit_is_reported(viewers: Viewers) -> None:
+    for channel in range(100):
+        viewers.drives.advertised(1, channel, "/cmd_vel", "cdr", "geometry_msgs/msg/Twist")
+    viewers.drives.came(1, 63, encode(AHEAD, "cdr"))
+    assert not said(viewers.notices)
+    viewers.drives.came(1, 64, encode(AHEAD, "cdr"))
+    assert ["64 topics at most" in text for text in said(viewers.notices)] == [True]
+
+
 def told_slow(every_ns: float) -> bool:
     """Return whether a panel that publishes at this interval is told that it is slow."""
     robot: Any = None

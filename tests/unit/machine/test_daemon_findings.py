@@ -20,6 +20,7 @@ from acsard.core.config.settings import (
     RobotConfig,
     SafetyConfig,
 )
+from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.schema import (
     BatterySummary,
     DiagnosticStatus,
@@ -29,6 +30,9 @@ from acsard.core.messages.schema import (
     Time,
 )
 from acsard.core.values import GyroDoes
+from acsard.daemon.bus.address import Address
+from acsard.host.errors import CertificateError, NoAnswerError
+from acsard.machine import daemon_findings
 from acsard.machine.daemon_findings import (
     GYRO_MENDS,
     SHOWN,
@@ -48,6 +52,8 @@ from acsard.machine.daemon_findings import (
 )
 from acsard.machine.finding import Finding
 from tests.each import each
+
+LISTENS = "check whether another program listens at that address"
 
 INFO = Info("acsar", "1.2", 77, "/dev/pts/3", False, 100.0, [], [])
 STATE = RobotState(
@@ -259,6 +265,47 @@ def test_settings_that_differ_from_the_file_of_another_machine_are_a_warning(her
 def found(before: dict[str, int], after: dict[str, int], **state: str) -> list[Finding]:
     one, two = replace(STATE, counters=before), replace(STATE, counters=after, **state)
     return list(link(Running(INFO, CONFIG, one, two, 0)))
+
+
+@pytest.mark.parametrize(
+    ("error", "mend"),
+    [
+        (NoAnswerError("no answer"), LISTENS),
+        (CertificateError("there is no directory certs: run `acsard tls init`"), ""),
+        (DecodeError("not_decodable", "a field is missing"), "from the same version"),
+    ],
+)
+def test_a_failed_query_of_the_daemon_has_advice_that_fits_its_error(
+    error: Exception, mend: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(daemon_findings, "answers", lambda _: True)
+    monkeypatch.setattr(daemon_findings, "asked", fail)
+    finding = daemon_findings.found(FILE, Address("tcp/127.0.0.1:7448", "acsar", ""))
+    assert isinstance(finding, Finding)
+    assert (finding.level, finding.text) == ("failure", str(error))
+    assert finding.mend.endswith(mend) if mend else not finding.mend
+
+
+@pytest.mark.parametrize(
+    ("reason", "mend", "unfit"),
+    [
+        ("the board reports impossible speeds: 900 rad/s", "acsard mcu check", "defect of acsard"),
+        (
+            "the daemon's guard replaced a line for the board with zeros: too fast",
+            "defect of acsard",
+            "acsard mcu check",
+        ),
+    ],
+)
+def test_the_advice_about_a_fault_fits_its_cause(reason: str, mend: str, unfit: str) -> None:
+    state = replace(STATE, mode="fault", reason=reason)
+    first = next(daemon(Running(INFO, CONFIG, state, state, 0)))
+    assert mend in first.mend
+    assert unfit not in first.mend
+    assert "acsard call clear" in first.mend
 
 
 def test_a_sound_link_gives_one_ok_finding() -> None:

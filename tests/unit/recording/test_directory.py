@@ -24,7 +24,7 @@ from acsard.recording.directory import (
 )
 from acsard.recording.end_record import read_end
 from acsard.recording.file import About, Recording, Writing
-from acsard.recording.retention import KEPT_FILES, STEADY_NS, Kind
+from acsard.recording.retention import KEPT_FILES, LEAST_BYTES, STEADY_NS, Kind
 
 DAY_NS = 86_400_000_000_000
 NOW_NS = 1_800_000_000_000_000_000
@@ -384,6 +384,21 @@ def test_an_incomplete_copy_is_deleted(tmp_path: Path) -> None:
     (left := tmp_path / f".000007-20270115T080000Z{PART}.new").write_bytes(b"half")
     Ring(RecordConfig(str(tmp_path)), run=Run())
     assert not left.exists()
+
+
+def test_a_recording_that_could_not_be_deleted_does_not_count_as_freed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path) -> None:
+        raise PermissionError(str(path))
+
+    one = ring(tmp_path)
+    record(one, 2 * LEAST_BYTES)
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", refuse)
+        one.trim(None, refused=True)
+    one.trim(None, refused=True)
+    assert not listed(tmp_path)
 
 
 def test_a_file_that_another_process_removes_meanwhile_does_no_harm(

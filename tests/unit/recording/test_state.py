@@ -141,6 +141,25 @@ def test_a_robot_with_a_wrong_part_is_refused_with_a_message(
         drawn(recording)
 
 
+def test_a_wrong_part_of_a_state_behind_a_gap_is_reported_with_its_place(
+    taped: Tape, tmp_path: Path
+) -> None:
+    robot, memory = thaw(taped.states[100])
+    SPOILERS["a list for a counter"](robot)
+    taped.write(tmp_path / "whole.mcap", Config())
+    about = Recording(tmp_path / "whole.mcap").about
+    writing = Writing(path := tmp_path / "spoilt.mcap", about)
+    writing.add("steps", about.wall_ns, encode(0, taped.taken[:50]))
+    writing.add("state", about.wall_ns, Checkpoint(100, freeze(robot, memory)).encode())
+    writing.add("steps", about.wall_ns, encode(100, taped.taken[100:]))
+    writing.finish()
+    words = r"cannot read the robot state before step 100 of the recording"
+    with pytest.raises(RecordingError, match=words):
+        replay_file(Recording(path))
+    with pytest.raises(RecordingError, match=words):
+        drawn(Recording(path))
+
+
 def replace_state(tape: Tape, state: bytes) -> Tape:
     """Return the same drive with another robot as its first state."""
     other = Tape()

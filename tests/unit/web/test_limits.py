@@ -71,8 +71,21 @@ def test_an_address_has_a_share_of_the_connections_over_all_its_tokens() -> None
     seats = Seats()
     told = [seats.enter("10.0.0.1", f"token{n}") for n in range(CONNECTIONS)]
     assert told.count("") == CONNECTIONS_OF_ONE
-    assert f"{CONNECTIONS_OF_ONE} from this address" in told[-1]
+    assert f"{CONNECTIONS_OF_ONE} from 10.0.0.1" in told[-1]
     assert not seats.enter("10.0.0.2", "token0")
+
+
+def test_all_addresses_of_an_ipv6_network_share_the_limits_of_one_address() -> None:
+    seats = Seats()
+    told = [seats.enter(f"2001:db8::{n + 1:x}", "broken") for n in range(CONNECTIONS_OF_ONE)]
+    assert told.count("") == CONNECTIONS_ALIKE
+    assert "are open at 2001:db8::/64 already" in told[-1]
+    told = [seats.enter(f"2001:db8::{n + 1:x}", f"token{n}") for n in range(CONNECTIONS)]
+    assert told.count("") == CONNECTIONS_OF_ONE - CONNECTIONS_ALIKE
+    assert f"{CONNECTIONS_OF_ONE} from 2001:db8::/64" in told[-1]
+    assert not seats.enter("2001:db8:0:1::1", "broken")
+    seats.leave("2001:db8::9", "broken")
+    assert not seats.enter("2001:db8::a", "broken")
 
 
 def test_local_browsers_have_reserved_connections() -> None:
@@ -111,8 +124,8 @@ def test_the_manual_states_the_limits_of_the_connections() -> None:
     told = " ".join(page.read_text(encoding="utf-8").split())
     assert (
         f"There are {CONNECTIONS} WebSockets for other machines: at most {CONNECTIONS_OF_ONE} of "
-        f"one address (with any tokens), {CONNECTIONS_OF_TOKEN} with one token (from all its "
-        f"addresses), and {CONNECTIONS_ALIKE} with one token from one address"
+        f"one network (with any tokens), {CONNECTIONS_OF_TOKEN} with one token (from all its "
+        f"networks), and {CONNECTIONS_ALIKE} with one token from one network"
     ) in told
     assert f"another {CONNECTIONS_HERE} WebSockets for the machine itself" in told
     assert f"room for {SOCKETS} TCP connections from other machines" in told

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import socket
+import ssl
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import pytest
 from cryptography.hazmat.primitives import serialization
 
 from acsard.core.values import NS_PER_S
+from acsard.daemon.bus import tls
 from acsard.daemon.bus.tls import AUTHORITY, common_name, ends, require_usable, trouble
 from acsard.host.errors import CertificateError, NotPermittedError
 from acsard.machine.authority import Authority
@@ -126,3 +128,30 @@ def test_the_options_of_an_endpoint_are_not_part_of_its_port(
         "and does a firewall drop connections?"
     )
     assert asked == [("robot.local", 7449)]
+
+
+@pytest.mark.parametrize(
+    ("code", "reason", "told"),
+    [
+        (20, "unable to get local issuer certificate", "dir/ca.pem did not sign the certificate"),
+        (47, "permitted subtree violation", "dir/ca.pem may not sign for the names in the"),
+        (26, "unsuitable certificate purpose", "the certificate of robot is not for a TLS server"),
+        (23, "certificate revoked", "the certificate of robot is not valid"),
+    ],
+)
+def test_a_rejected_server_certificate_has_the_reason_of_openssl(
+    code: int, reason: str, told: str
+) -> None:
+    error = ssl.SSLCertVerificationError(1, "certificate verify failed")
+    error.verify_code, error.verify_message = code, reason
+    found = tls._server_rejected(error, "robot", "dir")
+    assert found.startswith(("the authority in ", "the certificate of robot"))
+    assert told in found
+    assert f"({reason})" in found
+    assert ("did not sign" in found) is (code == 20)
+
+
+def test_a_rejected_client_certificate_has_the_alert_of_the_server() -> None:
+    found = tls._client_rejected("SSLV3_ALERT_CERTIFICATE_REVOKED", "robot", "dir")
+    assert "robot does not accept dir/certificate.pem (SSLV3_ALERT_CERTIFICATE_REVOKED)" in found
+    assert "did not sign" in tls._client_rejected("TLSV1_ALERT_UNKNOWN_CA", "robot", "dir")
