@@ -78,6 +78,8 @@ class Liveness:
         """Until then an event may ask each sender for a zero."""
         self._stall = -NS, -NS
         """Begin and end of the host's last stall. Zeros that came meanwhile may be lost."""
+        self._interrupted: dict[str, int] = {}
+        """Arrival of each sender's last zero that a stall may have taken, or its pause."""
         self._armed: dict[str, int] = {}
         """Arrival of the zero by which each lawful sender is certainly armed."""
         self._since: dict[str, int] = {}
@@ -159,7 +161,9 @@ class Liveness:
         if self._is_armed(name):
             return
         settled_ns = zero_ns + (self.run.witness.pause_ns if wish.shared else 0)
-        if zero_ns > ended_ns or settled_ns < begun_ns - self._tick_ns:
+        if zero_ns <= ended_ns and settled_ns >= begun_ns - self._tick_ns:
+            self._interrupted[name] = zero_ns
+        elif self._interrupted.get(name) != zero_ns:
             self._armed[name] = zero_ns
 
     def _keeps_rules(self, sender: dict[str, Any]) -> bool:

@@ -569,6 +569,16 @@ def test_a_zero_before_the_greeting_of_a_board_arms_nobody() -> None:
 
 
 @pytest.mark.slow
+def test_a_zero_whose_pause_was_interrupted_by_a_stall_arms_nobody_behind_the_next_stall() -> None:
+    """Seed 2702000061."""
+    stalls = [{"at": 2.6, "do": "stall", "for": 0.5}, {"at": 7.0, "do": "stall", "for": 0.2}]
+    plan = driven(events=stalls)
+    plan["senders"][0] |= {"from": 2.0, "phases": [[2.0, 0.0, 0.0], [3.49, 0.3, 0.0]]}
+    result = played(plan)
+    assert (result.finding, result.counts["lawful looks"]) == ("", 0)
+
+
+@pytest.mark.slow
 def test_a_plan_may_switch_the_robot_off_behind_its_end() -> None:
     """Seed 182028330."""
     call = {"verb": "deactivate", "late": 0.0, "lost": False, "twice": False, "via": "native"}
