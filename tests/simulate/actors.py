@@ -419,9 +419,11 @@ class Run:
                     self._bus_ns = after_ns + int(event["deaf"] * NS)
                 self.liveness.stalls(after_ns)
                 self.witness.stalls(self.true_ns, after_ns)
-                if self.true_ns > event["at"] * NS + NS // 1000:
+                behind_another = self.true_ns > event["at"] * NS + NS // 1000
+                if behind_another or self._link not in ("up", "stale"):
                     # One stall behind another: the daemon could read between, but take no step,
-                    # so it does not know when the lines came.
+                    # so it does not know when the lines came. Nor does it know that for the first
+                    # lines of a board, because their usual delay is not known yet.
                     self.pose.unknown_until(after_ns + NS // 5)
                 if event["do"] == "stall":
                     product.stall(lasts_ns / NS)
