@@ -584,6 +584,33 @@ def _late_lines(plan: Plan, dice: random.Random) -> None:
         at += lasts + dice.uniform(5.0, 9.0)
 
 
+def _wheel_limit(plan: Plan, dice: random.Random) -> None:
+    """Let one axis speed up at the limit of the wheels while the other one slows down gently."""
+    config = plan["config"]
+    limits, drive = config["limits"], config.get("drive", {})
+    radius = drive.get("wheel_radius", 0.05)
+    linear, angular = limits["linear_speed"], limits["angular_speed"]
+    fastest = max(linear, angular * drive.get("wheel_separation", 0.3) / 2) / radius
+    config.get("feedback", {}).pop("wheel_speed", None)
+    for name in ("linear_jerk", "angular_jerk"):
+        limits.pop(name, None)
+    limits |= {
+        "wheel_speed": round(min(99.0, fastest * dice.uniform(0.95, 1.1)), 2),
+        "linear_acceleration": round(dice.uniform(2.0, 4.0), 2),
+        "angular_acceleration": round(dice.uniform(8.0, 12.0), 2),
+        "linear_deceleration": round(linear / 5 + 0.001, 3),
+        "angular_deceleration": round(angular / 5 + 0.001, 3),
+    }
+    driver, at = _alone(plan, dice, []), 0.0
+    while at < plan["seconds"]:
+        driver["phases"].append([round(at, 3), 0.0, 0.0])
+        at += 1.0 + config["commands"].get("neutral_pause", 1.0)
+        for _ in range(6):
+            v, w = dice.choice((-linear, 0.0, linear)), dice.choice((-angular, 0.0, angular))
+            driver["phases"].append([round(at, 3), v, w])
+            at += dice.uniform(2.0, 6.0)
+
+
 MOMENTS: dict[str, tuple[float, Callable[[Plan], bool], Callable[[Plan, random.Random], None]]] = {
     "late step": (0.05, _any, _late_step),
     "half duplex": (0.12, _is_plain, _half_duplex),
@@ -602,6 +629,7 @@ MOMENTS: dict[str, tuple[float, Callable[[Plan], bool], Callable[[Plan, random.R
     "doubtful holder": (0.03, _any, _doubtful_holder),
     "coarse encoders": (0.05, _may_be_ideal, _coarse),
     "late lines": (0.05, _may_be_ideal, _late_lines),
+    "wheel limit": (0.04, _any, _wheel_limit),
 }
 """The share of the plans that have each moment, of those that can have it, whether a plan can have
 it, and what makes it."""

@@ -24,7 +24,7 @@ PLANS_OF_FAULT = {
     "neutral stall": "stall behind a zero", "neutral place": "doubtful holder",
     "neutral set": "doubtful holder", "driver release": "behind a press",
     "wheel press": "behind a press", "wheel counts": "coarse encoders",
-    "wheel waited": "late lines",
+    "wheel waited": "late lines", "limits saturated": "wheel limit",
     "freshness halves": "backlogs of newcomers", "freshness budget": "later and later",
 }  # fmt: skip
 """Kinds of plans by the name of a fault, or by the first word of its name."""
@@ -493,12 +493,10 @@ FAULTS = (
     ),
     fault(
         "limits saturated",
-        "a robot that turns harder at its limit gives up more speed than its curve asks for",
+        "a robot that turns harder at the limit of its wheels brakes harder than it may",
         LIMITS,
-        "        twist = self._kinematics.saturate(Twist(linear, angular), self._wheel_speed)\n",
-        "        twist = self._kinematics.saturate(Twist(linear, angular), self._wheel_speed)\n"
-        "        if twist.linear != linear:\n"
-        "            twist = Twist(0.9 * twist.linear, twist.angular)\n",
+        "if turns_faster and not faster:",
+        "if False:",
     ),
     fault(
         "kinematics curvature",

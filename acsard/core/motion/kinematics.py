@@ -16,6 +16,8 @@ The wheel speeds of a given twist are
 
 from __future__ import annotations
 
+import math
+
 from acsard.core.config.settings import DriveConfig
 from acsard.core.values import Twist, WheelSpeeds
 
@@ -83,3 +85,15 @@ class Kinematics:
             return twist
         scale = wheel_speed / fastest
         return Twist(twist.linear * scale, twist.angular * scale)
+
+    def room(self, kept: Twist, added: Twist, wheel_speed: float) -> float:
+        """Return the largest share of `added`, 0 to 1, that `kept` leaves room for.
+
+        With a larger share, a wheel would exceed `wheel_speed` rad/s.
+        """
+        first, second, share = self.wheel_speeds(kept), self.wheel_speeds(added), 1.0
+        sides = (first.front_right, second.front_right), (first.front_left, second.front_left)
+        for speed, more in sides:
+            if more:
+                share = min(share, (math.copysign(wheel_speed, more) - speed) / more)
+        return max(0.0, share)

@@ -90,11 +90,31 @@ class Limiter:
         angular, slope_w = _approach(
             now.twist.angular, goal.angular, now.angular_slope, dt, self._angular
         )
-        # Each axis changes at its own rate. In between, both axes together may need a faster wheel
-        # than at the start or at the goal.
-        twist = self._kinematics.saturate(Twist(linear, angular), self._wheel_speed)
+        twist = self._fitted(Twist(linear, angular))
         self.state = _State(twist, slope_v, slope_w)
         return twist
+
+    def _fitted(self, twist: Twist) -> Twist:
+        """Return the next twist, reduced so that no wheel exceeds its limit.
+
+        Each axis changes at its own rate. In between, both axes together may need a faster wheel
+        than at the start or at the goal. If one axis speeds up while the other one slows down, only
+        the former is reduced, because the latter would exceed its deceleration.
+        """
+        kinematics, most, now = self._kinematics, self._wheel_speed, self.twist
+        fitted = kinematics.saturate(twist, most)
+        if fitted is twist:
+            return twist
+        linear, angular = Twist(twist.linear), Twist(angular=twist.angular)
+        faster = abs(twist.linear) > abs(now.linear)
+        turns_faster = abs(twist.angular) > abs(now.angular)
+        if turns_faster and not faster:
+            share = kinematics.room(linear, angular, most)
+            fitted = Twist(twist.linear, twist.angular * share)
+        elif faster and not turns_faster:
+            share = kinematics.room(angular, linear, most)
+            fitted = Twist(twist.linear * share, twist.angular)
+        return kinematics.saturate(fitted, most)
 
     def coast(self, dt: float, stop: bool = False) -> Twist:
         """Slow down towards rest for `dt` s, and return the allowed twist.

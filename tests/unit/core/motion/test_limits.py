@@ -157,6 +157,52 @@ def test_no_wheel_is_ever_faster_than_its_limit(
         assert max(map(abs, speeds.as_tuple())) <= most * (1 + EPS)
 
 
+TALL = LimitsConfig(
+    linear_speed=1.0,
+    linear_acceleration=0.5,
+    linear_deceleration=0.4,
+    angular_acceleration=8.0,
+    angular_deceleration=8.0,
+    wheel_speed=20.0,
+)
+"""Limits of a robot that topples if it brakes hard, and whose wheels may turn no faster than at its
+linear speed."""
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_at_the_wheel_limit_a_turn_waits_until_the_robot_has_slowed_down(sign: float) -> None:
+    found = moving(1.0, 0.0, TALL)
+    first = found.follow(Twist(1.0, sign * 4.0), 0.1)
+    # 0.04 m/s of the rim are free when the robot has slowed down by 0.04 m/s.
+    assert pair(first) == approx(0.96, sign * 0.04 / 0.15)
+    last = followed(found, Twist(1.0, sign * 4.0), 2000)[-1]
+    assert pair(last) == approx(1.0 / 1.6, sign * 4.0 / 1.6)
+
+
+def test_at_the_wheel_limit_the_robot_speeds_up_as_its_turn_slows_down() -> None:
+    limits = msgspec.structs.replace(TALL, wheel_speed=12.0, angular_deceleration=0.8)
+    first = moving(0.0, 4.0, limits).follow(Twist(1.0, 0.0), 0.1)
+    assert pair(first) == approx(0.08 * 0.15, 3.92)
+
+
+corners = st.builds(Twist, st.sampled_from((-1.0, 0.0, 1.0)), st.sampled_from((-4.0, 0.0, 4.0)))
+
+
+@given(wishes=st.lists(st.tuples(corners, periods), max_size=40), start=corners)
+def test_at_the_wheel_limit_too_each_axis_changes_by_no_more_than_its_limit(
+    wishes: list[tuple[Twist, float]], start: Twist
+) -> None:
+    found = limiter(TALL)
+    before = found.follow(start, 1000.0)
+    for wish, dt in wishes:
+        after = found.follow(wish, dt)
+        assert abs(before.linear) - abs(after.linear) <= 0.4 * dt + EPS
+        assert abs(before.angular) - abs(after.angular) <= 8.0 * dt + EPS
+        assert abs(after.linear) - abs(before.linear) <= 0.5 * dt + EPS
+        assert abs(after.angular) - abs(before.angular) <= 8.0 * dt + EPS
+        before = after
+
+
 # acceleration and deceleration
 
 
