@@ -40,6 +40,9 @@ Such a board repeats its last speeds if it is asked again too soon, and the daem
 tell repeated speeds from new ones. With 16 to 96 counts, the simulated robot measured distances
 that were up to 20 % too short at 200 Hz and up to 29 % too long at 300 Hz."""
 
+LEAST_HZ = 0.001
+"""Lowest rate of publishing above 0, Hz: one message in 17 min."""
+
 MOST_VOLTS = 99.99
 """Highest voltage that a status line can express, V."""
 
@@ -178,6 +181,21 @@ def _count_problems(config: Config) -> list[str]:
         f"control periods ({lasts * 1000:.0f} ms); write "
         f"mcu.encoder_counts = {int(FIELD / 2 / fastest / lasts)} or less and make the firmware "
         "count fewer edges; or lower feedback.wheel_speed; or write mcu.encoder_counts = 0"
+    ]
+
+
+def _rate_problems(config: Config) -> list[str]:
+    rates = config.rates
+    each = {
+        "odom": rates.odom,
+        "wheel_states": rates.wheel_states,
+        "cmd_vel_out": rates.cmd_vel_out,
+    }
+    return [
+        f"rates.{name} = {hz:g} Hz: the rate must be 0 (every sample) or at least {LEAST_HZ:g} Hz; "
+        f"write rates.{name} = {LEAST_HZ:g} or more"
+        for name, hz in each.items()
+        if 0.0 < hz < LEAST_HZ
     ]
 
 
@@ -423,6 +441,7 @@ def _is_loopback(host: str) -> bool:
 
 
 RULES: tuple[Rule, ...] = (
+    _rate_problems,
     _wire_problems,
     _count_problems,
     _motor_problems,

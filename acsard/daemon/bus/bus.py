@@ -52,7 +52,7 @@ class ZenohBus:
         prefix = full_key(self._id, "")
         self._replies = Replies(prefix)
         sources = tuple(source.name for source in config.commands.sources)
-        self._inbox = Inbox(prefix, self._replies, sources, waker)
+        self._inbox = Inbox(prefix, self._replies, sources, waker, config.rate_hz)
         self._outlets, self._links = Outlets(), RouterLinks(config.bus)
         self._session: zenoh.Session
         self._kept: list[object] = []

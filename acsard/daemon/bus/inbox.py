@@ -115,8 +115,9 @@ class Replies:
 
 
 ARRIVALS = 16
-"""Size of the buffer of each command key, in samples. A newer sample displaces the oldest one. At
-100 steps a second, a sender at the limit of 1000 Hz puts 10 samples between two steps."""
+"""Size of the buffer of each command key at 100 steps a second, in samples. It is larger if the
+control rate is lower. A newer sample displaces the oldest one. A sender at the limit of 1000 Hz
+puts 10 samples between two steps."""
 
 SAMPLES = 64
 """Size of the buffer for gyro samples. A gyro at 400 Hz fills it if the control loop takes no
@@ -150,14 +151,24 @@ class Inbox:
     """Samples and queries of one robot, buffered until `take`."""
 
     def __init__(
-        self, prefix: str, replies: Replies, sources: tuple[str, ...], waker: Waker
+        self,
+        prefix: str,
+        replies: Replies,
+        sources: tuple[str, ...],
+        waker: Waker,
+        rate_hz: float = 100.0,
     ) -> None:
+        """Start with empty buffers.
+
+        `prefix` is the begin of the robot's keys, `sources` are the names of its command sources,
+        and `rate_hz` is the control rate. `waker` wakes the control loop.
+        """
         self.own_id: zenoh.TimestampId | None = None
         """The id in the timestamps that the daemon's session makes. The session stamps each sample
         that comes without a timestamp, so a timestamp with this id is not from the sender."""
         self._prefix, self._replies = prefix, replies
         self._arrivals: dict[str, Mailbox[Arrival]] = {
-            key: Mailbox(ARRIVALS, self._commanded)
+            key: Mailbox(max(ARRIVALS, round(ARRIVALS * 100.0 / rate_hz)), self._commanded)
             for key in (*source_keys(sources), *source_keys(sources, ALL), OTHERS)
         }
         # A gyro sample does not wake the control loop. It waits for the next feedback line.

@@ -6,6 +6,7 @@ import threading
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
 import zenoh
 
 from acsard.core.incoming.queries import Reply
@@ -40,9 +41,9 @@ def arrived(inbox: Inbox, *keys: str) -> None:
         inbox.on_sample(sample)
 
 
-def an_inbox() -> tuple[Inbox, Loop]:
+def an_inbox(rate_hz: float = 100.0) -> tuple[Inbox, Loop]:
     loop = Loop()
-    return Inbox("acsard/r7/", Replies("acsard/r7/"), ("app", "nav"), loop), loop
+    return Inbox("acsard/r7/", Replies("acsard/r7/"), ("app", "nav"), loop, rate_hz), loop
 
 
 def keys_of(inbox: Inbox) -> list[str]:
@@ -83,6 +84,17 @@ def test_a_flood_on_a_key_displaces_only_samples_of_that_key_and_is_counted() ->
     arrived(inbox, "cmd/app")
     taken = inbox.take(8)
     assert (taken.overrun, taken.overrun_sources) == (0, ())
+
+
+@pytest.mark.parametrize(("rate_hz", "room"), [(10.0, 160), (20.0, 80), (100.0, 16), (300.0, 16)])
+def test_a_slow_control_rate_has_larger_buffers_so_that_a_lawful_sender_loses_nothing(
+    rate_hz: float, room: int
+) -> None:
+    inbox, _ = an_inbox(rate_hz)
+    arrived(inbox, *["cmd/app"] * room)
+    assert inbox.take(8).overrun == 0
+    arrived(inbox, *["cmd/app"] * (room + 1))
+    assert inbox.take(8).overrun == 1
 
 
 def test_a_loop_that_wakes_up_finds_the_displaced_samples_counted() -> None:
