@@ -243,6 +243,14 @@ def test_rates_and_covariances_are_in_force_from_the_next_message_on(world: Worl
     assert last.pose.covariance[::7] == diagonal
 
 
+def test_a_rate_whose_period_is_no_number_is_refused(world: World) -> None:
+    reply = sets(world, rates__odom=1e-300)
+    assert not reply.success
+    assert "at least 0.001 Hz" in reply.message
+    world.run(0.5)
+    assert world.state.mode == "ready"
+
+
 def test_noise_set_higher_makes_the_pose_less_certain(world: World) -> None:
     def grows() -> float:
         before = world.odom.pose.covariance[0]
