@@ -425,7 +425,7 @@ def test_a_lost_link_is_reported_as_a_host_stall_or_as_a_silent_board(
     with world.mcu.mute():
         world.run(0.05)
         world.stall(0.2)
-        world.run(0.02)
+        world.run(0.05)
         assert world.state.link == "stale"
         assert world.state.reason.startswith("this computer did not run the daemon for 0.2")
     assert world.state.counters["link_lost_host_stall"] == world.state.counters["link_lost"] == 1
@@ -434,6 +434,23 @@ def test_a_lost_link_is_reported_as_a_host_stall_or_as_a_silent_board(
         world.run(0.2)
     assert world.state.counters["link_lost"] == 2
     assert world.state.counters["link_lost_host_stall"] == 1
+
+
+@pytest.mark.variations(3)
+@pytest.mark.parametrize("stall", [0.105, 0.15, 0.22])
+def test_a_stall_of_this_computer_does_not_stop_the_robot_without_a_ramp(stall: float) -> None:
+    """A command between two periods is sent at once, so that no answer waits for the next step."""
+    for wait_ms in range(10, 24):
+        world = World()
+        world.run(0.5)
+        world.drive(0.8, seconds=1.5)
+        world.run(0.05)
+        world.send(0.8)
+        world.run(wait_ms / 1000)
+        lines = len(world.port.sent)
+        world.stall(stall)
+        world.hold(0.8, seconds=0.3)
+        assert b"ap00.00" not in b"".join(line for _, line in list(world.port.sent)[lines:])
 
 
 def test_the_mcu_watchdog_is_fed_while_the_host_lives(world: World) -> None:

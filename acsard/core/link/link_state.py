@@ -80,6 +80,9 @@ class Link:
         self._silences = 0
         self._good_in_row = self._bad_in_row = 0
         self._heard_ns: int | None = None
+        self._waits_until_ns, self._waited = 0, False
+        """`_waits_until_ns` is the monotonic time until which the board may answer late, ns.
+        `_waited` is true if `wait` was called since the last good line."""
 
     def sign(self, sign: Sign) -> None:
         """Change the state as `TABLE` says for the input `sign`.
@@ -97,8 +100,13 @@ class Link:
             self.excuse()
 
     def silent(self, now_ns: int) -> bool:
-        """Return whether the last good line is older than `quiet_ns`, or no good line came yet."""
-        return self._heard_ns is None or now_ns - self._heard_ns > self.quiet_ns
+        """Return whether the last good line is older than `quiet_ns`, or no good line came yet.
+
+        The line is not too old while `wait` lets the board answer.
+        """
+        if self._heard_ns is None:
+            return True
+        return now_ns - self._heard_ns > self.quiet_ns and now_ns > self._waits_until_ns
 
     def good(self, at_ns: int) -> int | None:
         """Count a good line, which came at `at_ns` on the monotonic clock.
@@ -116,8 +124,18 @@ class Link:
                 self.sparse_s = since_ns / NS_PER_S if self._silences >= SPARSE else 0.0
         self._good_in_row += 1
         self._bad_in_row = 0
-        self._heard_ns = at_ns
+        self._heard_ns, self._waited = at_ns, False
         return since_ns
+
+    def wait(self, now_ns: int) -> None:
+        """Let the board answer for a third of `quiet_ns`, but only once after each good line.
+
+        The caller does this if it sent no line for a while, so that the board had nothing to
+        answer.
+        """
+        if self.state == "up" and not self._waited:
+            self._waited = True
+            self._waits_until_ns = now_ns + self.quiet_ns // 3
 
     def excuse(self) -> None:
         """Reset the count of silences in a row.

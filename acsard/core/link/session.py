@@ -22,7 +22,7 @@ from acsard.core.link.codec import Codec, FrameError
 from acsard.core.link.feedback import Feedback, Timeline
 from acsard.core.link.lines import LineReader
 from acsard.core.link.link_diagnosis import Lateness, SilenceDiagnosis
-from acsard.core.link.link_state import WATCHDOG_NS, Link
+from acsard.core.link.link_state import WATCHDOG_NS, WATCHDOG_S, Link
 from acsard.core.link.link_state import State as LinkState
 from acsard.core.link.negotiation import BLIND_PERIOD_NS, MENDS, Negotiation, Throttle
 from acsard.core.link.quantization import CountRecovery
@@ -166,6 +166,10 @@ class McuSession:
                 self._bad()
             if self.lateness.look(now.mono_ns, good=bool(feedback)):
                 self._link.excuse()
+            if 0.0 < self.lateness.step_s < WATCHDOG_S and not feedback:
+                # The board had nothing to answer while this computer sent nothing. If it has not
+                # stopped the motors yet, a stop without a ramp would only shake the robot.
+                self._link.wait(now.mono_ns)
             self._judge(now.mono_ns)
         if self._rejected:
             self._announce_rejects()

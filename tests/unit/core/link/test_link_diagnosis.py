@@ -117,7 +117,7 @@ def test_lines_that_the_host_read_late_give_no_advice_about_the_board(port: str)
     bench = Bench(McuConfig(port=port)).up()
     told = set()
     for _ in range(20):  # this computer runs a step late and finds the bytes that arrived meanwhile
-        bench.wait(200)
+        bench.wait(300)
         told.add(bench.session.words())
         bench.wait(10, GOOD)
         told.add(bench.session.words())
