@@ -32,8 +32,8 @@ Wheels = tuple[int, int, int, int]
 """Speeds of the motors a to d, in hundredths of rad/s."""
 
 _ZERO: Wheels = (0, 0, 0, 0)
-_HEX = b"0123456789ABCDEF"
 _COLUMNS = re.compile(rb"a([pn]\d\d\.\d\d),b([pn]\d\d\.\d\d),c([pn]\d\d\.\d\d),d([pn]\d\d\.\d\d)")
+_SEAL = re.compile(rb"#[0-9A-F]{2}[SH]?\*[0-9A-F]{4}\r\n")
 
 HALTED = ("stopped", "fault", "shutdown")
 """Modes in which the robot brakes at the stop deceleration."""
@@ -180,14 +180,11 @@ class Guard:
         - `*`, and the CRC-16/XMODEM of all characters before `*` as four hexadecimal digits
         - a carriage return and a line feed
         """
-        body, check = line[:-7], line[-7:]
-        comma, mark = self._stop[31:-2], body[31:]
-        digits = mark[len(comma) + 1 : len(comma) + 3]
+        comma = self._stop[31:-2]
         return (
-            mark in [comma + b"#" + digits + letter for letter in (b"", b"S", b"H")]
-            and len(digits) == 2
-            and all(digit in _HEX for digit in digits)
-            and check == b"*%04X\r\n" % _crc(body)
+            line[31:].startswith(comma)
+            and _SEAL.fullmatch(line, 31 + len(comma)) is not None
+            and line[-7:] == b"*%04X\r\n" % _crc(line[:-7])
         )
 
 
@@ -227,10 +224,17 @@ def _wheels(line: bytes) -> Wheels | None:
 
 
 def _crc(data: bytes) -> int:
-    """Return the CRC-16/XMODEM, computed with bit shifts as in the notes of avr-libc."""
+    """Return the CRC-16/XMODEM of `data`."""
     crc = 0
     for byte in data:
-        x = crc >> 8 ^ byte
-        x ^= x >> 4
-        crc = (crc << 8 ^ x << 12 ^ x << 5 ^ x) & 0xFFFF
+        crc = (crc << 8 & 0xFFFF) ^ _CRC_OF_BYTE[crc >> 8 ^ byte]
     return crc
+
+
+def _crc_of(byte: int) -> int:
+    """Return the CRC of one byte, computed with bit shifts as in the notes of avr-libc."""
+    x = byte ^ byte >> 4
+    return (x << 12 ^ x << 5 ^ x) & 0xFFFF
+
+
+_CRC_OF_BYTE = [_crc_of(byte) for byte in range(256)]

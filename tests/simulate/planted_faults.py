@@ -148,8 +148,8 @@ FAULTS = (
         "guard samples",
         "the guard refuses lines that ask for a sample",
         GUARD,
-        'for letter in (b"", b"S", b"H")',
-        'for letter in (b"", b"H")',
+        "{2}[SH]?",
+        "{2}H?",
     ),
     fault(
         "guard and latch",
