@@ -316,8 +316,8 @@ FAULTS = (
         "neutral place",
         "a sender whose stamps are in doubt loses the robot",
         NEUTRAL,
-        "            and now_ns - self._present_ns <= self._timeout_ns\n",
-        "            and False\n",
+        "(now_ns - self._present_ns <= timeout_ns and now_ns - arrived_ns <= PLACE_NS)",
+        "False",
     ),
     fault(
         "neutral set",
