@@ -231,7 +231,8 @@ class Robot:
         if inputs.commands or inputs.refusals:
             self._hear(inputs, events)
         self._choice = self._arbiter.choose(inputs.now.mono_ns)
-        if self._bumpers.limiting:
+        limiting = self._bumpers.limiting
+        if limiting:
             self._keep_away(inputs.now.mono_ns)
         self._life.command(self._choice.twist is not None)
         # A line may be sent at once after a new command, a change of the mode, or a press of the
@@ -243,7 +244,7 @@ class Robot:
         link = self.session.link
         # Use `_value_`, because the property `value` of an enum runs Python code.
         reason = self._reason()
-        if self._bumpers.limiting:
+        if limiting:
             reason = self._with_bumper(reason)
         status = (self._life.mode._value_, reason, link, self._choice.source)
         battery = self._battery.status

@@ -512,6 +512,8 @@ class PromptedTimes:
         the usual time between two reads, ns. `_losses` is the share of lost replies."""
         self._several = 0.0
         """Filtered share of the reads that have several lines."""
+        self._batched = False
+        """Whether an adapter holds replies back, so that one read contains several."""
         self._thinking = 0.0
         """Filtered share of the reads in which the reply delay varied more than USB and the
         scheduler cause, but less than an adapter causes."""
@@ -525,11 +527,6 @@ class PromptedTimes:
     def lossy(self) -> bool:
         """Whether an adapter batches the replies, and more of them are lost than `LOSSY` allows."""
         return self._batched and self._losses > LOSSY
-
-    @property
-    def _batched(self) -> bool:
-        """Whether an adapter holds replies back, so that one read contains several."""
-        return self._several > SEVERAL
 
     def left(self, at_ns: int) -> None:
         """Record that a command was written at `at_ns` on the monotonic clock."""
@@ -548,6 +545,7 @@ class PromptedTimes:
         alone, since = lines == 1, at_ns - self._at
         self._at, self._alone, self._since = at_ns, alone, since
         self._several += FAST * ((not alone) - self._several)
+        self._batched = self._several > SEVERAL
         varies = THOUGHT_NS < self._spread < BATCH_NS and not self._batched
         self._thinking += SLOW * (varies - self._thinking)
         if self._batched:
