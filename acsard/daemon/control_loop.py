@@ -261,7 +261,8 @@ class ControlLoop:
             self._turn_rates.clear()
         before = self._config
         outputs, went = self._decided(inputs)
-        self._step_answers = (*refused_sets, *self._step_answers)
+        if refused_sets:
+            self._step_answers = (*refused_sets, *self._step_answers)
         heard = bool(commands or refusals or requests)
         pace.note(inputs.tick, outputs.due, went, outputs.news, heard)
         self._publish(outputs)
@@ -282,9 +283,11 @@ class ControlLoop:
         """
         try:
             outputs = self.outputs = self.robot.step(inputs)
-            self._step_answers = self._speed.settle(
-                self.robot.config, outputs.answers, self._others
-            )
+            self._step_answers = outputs.answers
+            if outputs.answers or self.robot.config is not self._config:
+                self._step_answers = self._speed.settle(
+                    self.robot.config, outputs.answers, self._others
+                )
             self._handover.take(self._to_keep(outputs.latches))
             if self.robot.config is not self._config:
                 self._adopt(self.robot.config)
@@ -469,8 +472,9 @@ class ControlLoop:
         offered = self._port.offer(line, now)
         if offered == "sent":
             self._guard.left(line)
-            self._stopwatch.line(outputs, self._port.sent_ns, before_ns)
-            late_ns = self._port.sent_ns - now.mono_ns
+            sent_ns = self._port.sent_ns
+            self._stopwatch.line(outputs, sent_ns, before_ns)
+            late_ns = sent_ns - now.mono_ns
             self._late_ns = late_ns if late_ns >= LATE_NS else 0
             self.robot.counters["lines_sent"] += 1
             return line
