@@ -334,10 +334,9 @@ class Robot:
         if not feedback:
             return ()
         estimates: list[Estimate] = []
-        for line in feedback:
-            estimates += [
-                self._believe(one, now, events) for one in self._plausible(line, now, events)
-            ]
+        for received in feedback:
+            for line in self._plausible(received, now, events):
+                estimates.append(self._believe(line, now, events))
         return tuple(estimates)
 
     def _forget(self) -> None:
@@ -500,9 +499,10 @@ class Robot:
             self._life.caused_again(inputs.now.mono_ns)
         if inputs.shutting_down and self._life.mode is not Mode.SHUTDOWN:
             self._life.leave()
-        if not inputs.requests:
-            return ()
-        return tuple([self._answer(r, inputs.now, events) for r in inputs.requests])
+        answers: tuple[Answer, ...] = ()
+        for request in inputs.requests:
+            answers += (self._answer(request, inputs.now, events),)
+        return answers
 
     def _answer(self, request: Request, now: Instant, events: list[Event]) -> Answer:
         before = self._life.mode

@@ -454,9 +454,13 @@ class ControlLoop:
         """
         if self._settings_file is None:
             return ()
-        results = self._settings_file.results(now.mono_ns, self._others)
-        self._answers.extend((now.mono_ns, one) for one in results if isinstance(one, Answer))
-        return tuple([one for one in results if isinstance(one, Request)])
+        requests: list[Request] = []
+        for result in self._settings_file.results(now.mono_ns, self._others):
+            if isinstance(result, Answer):
+                self._answers.append((now.mono_ns, result))
+            else:
+                requests.append(result)
+        return tuple(requests)
 
     def _send(self, outputs: Outputs, now: Instant, tick: bool) -> bytes | None:
         """Let the guard check the line in `outputs`, and offer it to the port.
@@ -495,11 +499,9 @@ class ControlLoop:
             self._stopwatch.feedback(estimate, told_ns)
         if self._step_answers:
             file, now_ns = self._settings_file, outputs.now.mono_ns
-            self._answers.extend(
-                (now_ns, answer)
-                for answer in self._step_answers
-                if file is None or not file.obeyed(answer)
-            )
+            for answer in self._step_answers:
+                if file is None or not file.obeyed(answer):
+                    self._answers.append((now_ns, answer))
         if self._answers:
             self._answer(outputs.now)
         for event in outputs.events:
