@@ -74,7 +74,8 @@ class Guard:
         """
         self._stop = stop
         memory = memory or Memory()
-        self._last = memory.last
+        self._last, self._wheels = memory.last, _wheels(memory.last[:31])
+        """The last line that was written to the port, and its wheel speeds."""
         self._commanded_ns, self._halted_ns = memory.commanded_ns, memory.halted_ns
         self._longest = memory.ramp_ns, memory.stop_ramp_ns
         self.use(config)
@@ -99,7 +100,7 @@ class Guard:
 
     def left(self, line: bytes) -> None:
         """Record that this line was written to the port."""
-        self._last = line
+        self._last, self._wheels = line, _wheels(line[:31])
         self._note_limits()
 
     def check(self, outputs: Outputs) -> tuple[bytes | None, str]:
@@ -119,18 +120,18 @@ class Guard:
         line = outputs.line
         if line is None:
             return None, ""
-        trip = self._objection(line, outputs, _wheels(self._last) or _ZERO)
+        trip = self._objection(line, outputs, self._wheels or _ZERO)
         return (self._stop, trip) if trip else (line, "")
 
     def _note_limits(self) -> None:
-        if _wheels(self._last) == _ZERO:
+        if self._wheels == _ZERO:
             self._longest = self._ramps
         else:
             (ramp, stop_ramp), (now, stop_now) = self._longest, self._ramps
             self._longest = max(ramp, now), max(stop_ramp, stop_now)
 
     def _objection(self, line: bytes, outputs: Outputs, before: Wheels) -> str:
-        wheels = _wheels(line)
+        wheels = _wheels(line[:31])
         if wheels is None or not (line[31:] == self._stop[31:] or self._sealed(line)):
             return "the line is not complete, or does not have four wheel speeds"
         if wheels == _ZERO:
@@ -209,11 +210,15 @@ def _ramp_ns(config: Config, *, stop: bool) -> int:
     return int(max(linear / by[0], angular / by[1]) * NS_PER_S)
 
 
-# Each check decodes the last sent line again, so a cache of a few lines halves the work.
+# A steady command repeats the same columns in each line, so a cache of a few lines saves most work.
 @lru_cache(4)
-def _wheels(line: bytes) -> Wheels | None:
-    """Return the four speeds of a line in 0.01 rad/s, or None if a column is malformed."""
-    match = _COLUMNS.match(line)
+def _wheels(columns: bytes) -> Wheels | None:
+    """Return the four speeds in 0.01 rad/s, or None if a column is malformed.
+
+    `columns` are the first 31 bytes of a line: its wheel speeds, without the sequence number and
+    the checksum, which differ from line to line.
+    """
+    match = _COLUMNS.match(columns)
     if match is None:
         return None
     a, b, c, d = [
