@@ -91,7 +91,11 @@ class Guard:
         self._most = int(config.limits.wheel_speed * 100 + 1)
         self._timeouts = {s.name: s.timeout * 1e9 for s in config.commands.sources}
         self._ramps = _ramp_ns(config, stop=False), _ramp_ns(config, stop=True)
-        self._note_limits()
+        if self._wheels == _ZERO:
+            self._longest = self._ramps
+        else:
+            (ramp, stop_ramp), (now, stop_now) = self._longest, self._ramps
+            self._longest = max(ramp, now), max(stop_ramp, stop_now)
 
     @property
     def memory(self) -> Memory:
@@ -101,7 +105,8 @@ class Guard:
     def left(self, line: bytes) -> None:
         """Record that this line was written to the port."""
         self._last, self._wheels = line, _wheels(line[:31])
-        self._note_limits()
+        if self._wheels == _ZERO:
+            self._longest = self._ramps
 
     def check(self, outputs: Outputs) -> tuple[bytes | None, str]:
         """Return a pair: the line to send, and the reason why the guard replaced the robot's line.
@@ -122,13 +127,6 @@ class Guard:
             return None, ""
         trip = self._objection(line, outputs, self._wheels or _ZERO)
         return (self._stop, trip) if trip else (line, "")
-
-    def _note_limits(self) -> None:
-        if self._wheels == _ZERO:
-            self._longest = self._ramps
-        else:
-            (ramp, stop_ramp), (now, stop_now) = self._longest, self._ramps
-            self._longest = max(ramp, now), max(stop_ramp, stop_now)
 
     def _objection(self, line: bytes, outputs: Outputs, before: Wheels) -> str:
         wheels = _wheels(line[:31])

@@ -215,7 +215,8 @@ class ControlLoop:
             raise
 
     def _step(self, now: Instant, period: Period) -> Outputs:
-        ended, missed = period.expired > 0, max(0, period.expired - 1)
+        ended = period.expired > 0
+        missed = period.expired - 1 if ended else 0
         if ended:
             late_ns = now.mono_ns - period.due_ns
             self._stopwatch.period(now.mono_ns, late_ns, missed)

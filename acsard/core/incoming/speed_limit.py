@@ -114,8 +114,8 @@ class SpeedLimiter:
 
         After the limit is lifted, this stays True until the robot has the higher value again.
         """
-        lowest = min(self._limit.speed, self._robot.limits.linear_speed)
-        return lowest < self.settings.limits.linear_speed
+        setting = self.settings.limits.linear_speed
+        return self._limit.speed < setting or self._robot.limits.linear_speed < setting
 
     @property
     def text(self) -> str:
