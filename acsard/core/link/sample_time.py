@@ -191,7 +191,8 @@ class FreeRunningTimes:
         self._lossy += lost > 0
         if lost <= 0:
             ahead -= lost
-            self._least = min(self._least, ahead)
+            if ahead < self._least:
+                self._least = ahead
             if drained:
                 self._lag += 0.03 * (min(max(ahead, 0.0), 1.0) - self._lag)
         if since < 1.5 * self._batch * self.usual:
@@ -230,7 +231,7 @@ class FreeRunningTimes:
         time since the last read, both in slots. `lines` is the number of lines in the read.
         `drained` says whether the read took all data that the kernel held.
         """
-        lag = min(self._lag, 0.5)
+        lag = self._lag if self._lag < 0.5 else 0.5
         if ahead < -0.5 + 0.6 * lag:
             return -1
         if not drained:
@@ -244,7 +245,7 @@ class FreeRunningTimes:
             if prompt and alone and since < JUMP:
                 return -1 if ahead > 1 else 0  # the delay grew line by line, so no line is missing
         seen = ahead + 0.5 - 1.4 * lag if prompt else ahead - SURE - held
-        return max(0, math.floor(seen))
+        return math.floor(seen) if seen > 0.0 else 0
 
     # Finding the clock and following it.
 
@@ -589,7 +590,7 @@ class PromptedTimes:
         last, before = self._last, self._passed
         lost, self._passed, self._line = before > self._line, line, line
         at = line + (self._shift(line) if self._alone else 0)
-        self._last = at if last is None else max(last, at)
+        self._last = at if last is None or at > last else last
         due_ns = at + int(self._delay or self._soonest)
         if last is None:
             return Placed("prompts", due_ns)
@@ -735,11 +736,12 @@ class PromptedTimes:
         if delay is None or self._batched:
             return 0
         error = self._at - line - delay
-        if abs(error) >= max(delay, 4 * spread):
+        size = abs(error)
+        if size >= delay and size >= 4 * spread:
             return 0  # a host stall
         self._delay = delay + FAST * error
         self._least = min(self._least + LEAST * (delay - self._least), delay + error)
-        self._spread += FAST * (abs(error) - spread)
-        if not JITTER_NS < spread < BATCH_NS or abs(error) > 4 * spread:
+        self._spread += FAST * (size - spread)
+        if not JITTER_NS < spread < BATCH_NS or size > 4 * spread:
             return 0
         return int(error * (1 - (JITTER_NS / spread) ** 2))
