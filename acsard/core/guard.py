@@ -32,8 +32,8 @@ Wheels = tuple[int, int, int, int]
 """Speeds of the motors a to d, in hundredths of rad/s."""
 
 _ZERO: Wheels = (0, 0, 0, 0)
-_HEX = b"0123456789ABCDEF"
 _COLUMNS = re.compile(rb"a([pn]\d\d\.\d\d),b([pn]\d\d\.\d\d),c([pn]\d\d\.\d\d),d([pn]\d\d\.\d\d)")
+_SEAL = re.compile(rb"#[0-9A-F]{2}[SH]?\*[0-9A-F]{4}\r\n")
 
 HALTED = ("stopped", "fault", "shutdown")
 """Modes in which the robot brakes at the stop deceleration."""
@@ -74,7 +74,8 @@ class Guard:
         """
         self._stop = stop
         memory = memory or Memory()
-        self._last = memory.last
+        self._last, self._wheels = memory.last, _wheels(memory.last[:31])
+        """The last line that was written to the port, and its wheel speeds."""
         self._commanded_ns, self._halted_ns = memory.commanded_ns, memory.halted_ns
         self._longest = memory.ramp_ns, memory.stop_ramp_ns
         self.use(config)
@@ -90,7 +91,11 @@ class Guard:
         self._most = int(config.limits.wheel_speed * 100 + 1)
         self._timeouts = {s.name: s.timeout * 1e9 for s in config.commands.sources}
         self._ramps = _ramp_ns(config, stop=False), _ramp_ns(config, stop=True)
-        self._note_limits()
+        if self._wheels == _ZERO:
+            self._longest = self._ramps
+        else:
+            (ramp, stop_ramp), (now, stop_now) = self._longest, self._ramps
+            self._longest = max(ramp, now), max(stop_ramp, stop_now)
 
     @property
     def memory(self) -> Memory:
@@ -99,8 +104,9 @@ class Guard:
 
     def left(self, line: bytes) -> None:
         """Record that this line was written to the port."""
-        self._last = line
-        self._note_limits()
+        self._last, self._wheels = line, _wheels(line[:31])
+        if self._wheels == _ZERO:
+            self._longest = self._ramps
 
     def check(self, outputs: Outputs) -> tuple[bytes | None, str]:
         """Return a pair: the line to send, and the reason why the guard replaced the robot's line.
@@ -119,18 +125,11 @@ class Guard:
         line = outputs.line
         if line is None:
             return None, ""
-        trip = self._objection(line, outputs, _wheels(self._last) or _ZERO)
+        trip = self._objection(line, outputs, self._wheels or _ZERO)
         return (self._stop, trip) if trip else (line, "")
 
-    def _note_limits(self) -> None:
-        if _wheels(self._last) == _ZERO:
-            self._longest = self._ramps
-        else:
-            (ramp, stop_ramp), (now, stop_now) = self._longest, self._ramps
-            self._longest = max(ramp, now), max(stop_ramp, stop_now)
-
     def _objection(self, line: bytes, outputs: Outputs, before: Wheels) -> str:
-        wheels = _wheels(line)
+        wheels = _wheels(line[:31])
         if wheels is None or not (line[31:] == self._stop[31:] or self._sealed(line)):
             return "the line is not complete, or does not have four wheel speeds"
         if wheels == _ZERO:
@@ -180,14 +179,11 @@ class Guard:
         - `*`, and the CRC-16/XMODEM of all characters before `*` as four hexadecimal digits
         - a carriage return and a line feed
         """
-        body, check = line[:-7], line[-7:]
-        comma, mark = self._stop[31:-2], body[31:]
-        digits = mark[len(comma) + 1 : len(comma) + 3]
+        comma = self._stop[31:-2]
         return (
-            mark in [comma + b"#" + digits + letter for letter in (b"", b"S", b"H")]
-            and len(digits) == 2
-            and all(digit in _HEX for digit in digits)
-            and check == b"*%04X\r\n" % _crc(body)
+            line[31:].startswith(comma)
+            and _SEAL.fullmatch(line, 31 + len(comma)) is not None
+            and line[-7:] == b"*%04X\r\n" % _crc(line[:-7])
         )
 
 
@@ -212,11 +208,15 @@ def _ramp_ns(config: Config, *, stop: bool) -> int:
     return int(max(linear / by[0], angular / by[1]) * NS_PER_S)
 
 
-# Each check decodes the last sent line again, so a cache of a few lines halves the work.
+# A steady command repeats the same columns in each line, so a cache of a few lines saves most work.
 @lru_cache(4)
-def _wheels(line: bytes) -> Wheels | None:
-    """Return the four speeds of a line in 0.01 rad/s, or None if a column is malformed."""
-    match = _COLUMNS.match(line)
+def _wheels(columns: bytes) -> Wheels | None:
+    """Return the four speeds in 0.01 rad/s, or None if a column is malformed.
+
+    `columns` are the first 31 bytes of a line: its wheel speeds, without the sequence number and
+    the checksum, which differ from line to line.
+    """
+    match = _COLUMNS.match(columns)
     if match is None:
         return None
     a, b, c, d = [
@@ -227,10 +227,17 @@ def _wheels(line: bytes) -> Wheels | None:
 
 
 def _crc(data: bytes) -> int:
-    """Return the CRC-16/XMODEM, computed with bit shifts as in the notes of avr-libc."""
+    """Return the CRC-16/XMODEM of `data`."""
     crc = 0
     for byte in data:
-        x = crc >> 8 ^ byte
-        x ^= x >> 4
-        crc = (crc << 8 ^ x << 12 ^ x << 5 ^ x) & 0xFFFF
+        crc = (crc << 8 & 0xFFFF) ^ _CRC_OF_BYTE[crc >> 8 ^ byte]
     return crc
+
+
+def _crc_of(byte: int) -> int:
+    """Return the CRC of one byte, computed with bit shifts as in the notes of avr-libc."""
+    x = byte ^ byte >> 4
+    return (x << 12 ^ x << 5 ^ x) & 0xFFFF
+
+
+_CRC_OF_BYTE = [_crc_of(byte) for byte in range(256)]

@@ -231,7 +231,8 @@ class Robot:
         if inputs.commands or inputs.refusals:
             self._hear(inputs, events)
         self._choice = self._arbiter.choose(inputs.now.mono_ns)
-        if self._bumpers.limiting:
+        limiting = self._bumpers.limiting
+        if limiting:
             self._keep_away(inputs.now.mono_ns)
         self._life.command(self._choice.twist is not None)
         # A line may be sent at once after a new command, a change of the mode, or a press of the
@@ -243,7 +244,7 @@ class Robot:
         link = self.session.link
         # Use `_value_`, because the property `value` of an enum runs Python code.
         reason = self._reason()
-        if self._bumpers.limiting:
+        if limiting:
             reason = self._with_bumper(reason)
         status = (self._life.mode._value_, reason, link, self._choice.source)
         battery = self._battery.status
@@ -333,10 +334,9 @@ class Robot:
         if not feedback:
             return ()
         estimates: list[Estimate] = []
-        for line in feedback:
-            estimates += [
-                self._believe(one, now, events) for one in self._plausible(line, now, events)
-            ]
+        for received in feedback:
+            for line in self._plausible(received, now, events):
+                estimates.append(self._believe(line, now, events))
         return tuple(estimates)
 
     def _forget(self) -> None:
@@ -499,9 +499,10 @@ class Robot:
             self._life.caused_again(inputs.now.mono_ns)
         if inputs.shutting_down and self._life.mode is not Mode.SHUTDOWN:
             self._life.leave()
-        if not inputs.requests:
-            return ()
-        return tuple([self._answer(r, inputs.now, events) for r in inputs.requests])
+        answers: tuple[Answer, ...] = ()
+        for request in inputs.requests:
+            answers += (self._answer(request, inputs.now, events),)
+        return answers
 
     def _answer(self, request: Request, now: Instant, events: list[Event]) -> Answer:
         before = self._life.mode

@@ -215,7 +215,8 @@ class ControlLoop:
             raise
 
     def _step(self, now: Instant, period: Period) -> Outputs:
-        ended, missed = period.expired > 0, max(0, period.expired - 1)
+        ended = period.expired > 0
+        missed = period.expired - 1 if ended else 0
         if ended:
             late_ns = now.mono_ns - period.due_ns
             self._stopwatch.period(now.mono_ns, late_ns, missed)
@@ -261,7 +262,8 @@ class ControlLoop:
             self._turn_rates.clear()
         before = self._config
         outputs, went = self._decided(inputs)
-        self._step_answers = (*refused_sets, *self._step_answers)
+        if refused_sets:
+            self._step_answers = (*refused_sets, *self._step_answers)
         heard = bool(commands or refusals or requests)
         pace.note(inputs.tick, outputs.due, went, outputs.news, heard)
         self._publish(outputs)
@@ -282,9 +284,11 @@ class ControlLoop:
         """
         try:
             outputs = self.outputs = self.robot.step(inputs)
-            self._step_answers = self._speed.settle(
-                self.robot.config, outputs.answers, self._others
-            )
+            self._step_answers = outputs.answers
+            if outputs.answers or self.robot.config is not self._config:
+                self._step_answers = self._speed.settle(
+                    self.robot.config, outputs.answers, self._others
+                )
             self._handover.take(self._to_keep(outputs.latches))
             if self.robot.config is not self._config:
                 self._adopt(self.robot.config)
@@ -451,9 +455,13 @@ class ControlLoop:
         """
         if self._settings_file is None:
             return ()
-        results = self._settings_file.results(now.mono_ns, self._others)
-        self._answers.extend((now.mono_ns, one) for one in results if isinstance(one, Answer))
-        return tuple([one for one in results if isinstance(one, Request)])
+        requests: list[Request] = []
+        for result in self._settings_file.results(now.mono_ns, self._others):
+            if isinstance(result, Answer):
+                self._answers.append((now.mono_ns, result))
+            else:
+                requests.append(result)
+        return tuple(requests)
 
     def _send(self, outputs: Outputs, now: Instant, tick: bool) -> bytes | None:
         """Let the guard check the line in `outputs`, and offer it to the port.
@@ -469,8 +477,9 @@ class ControlLoop:
         offered = self._port.offer(line, now)
         if offered == "sent":
             self._guard.left(line)
-            self._stopwatch.line(outputs, self._port.sent_ns, before_ns)
-            late_ns = self._port.sent_ns - now.mono_ns
+            sent_ns = self._port.sent_ns
+            self._stopwatch.line(outputs, sent_ns, before_ns)
+            late_ns = sent_ns - now.mono_ns
             self._late_ns = late_ns if late_ns >= LATE_NS else 0
             self.robot.counters["lines_sent"] += 1
             return line
@@ -491,11 +500,9 @@ class ControlLoop:
             self._stopwatch.feedback(estimate, told_ns)
         if self._step_answers:
             file, now_ns = self._settings_file, outputs.now.mono_ns
-            self._answers.extend(
-                (now_ns, answer)
-                for answer in self._step_answers
-                if file is None or not file.obeyed(answer)
-            )
+            for answer in self._step_answers:
+                if file is None or not file.obeyed(answer):
+                    self._answers.append((now_ns, answer))
         if self._answers:
             self._answer(outputs.now)
         for event in outputs.events:

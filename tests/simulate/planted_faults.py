@@ -148,8 +148,8 @@ FAULTS = (
         "guard samples",
         "the guard refuses lines that ask for a sample",
         GUARD,
-        'for letter in (b"", b"S", b"H")',
-        'for letter in (b"", b"H")',
+        "{2}[SH]?",
+        "{2}H?",
     ),
     fault(
         "guard and latch",
@@ -316,8 +316,8 @@ FAULTS = (
         "neutral place",
         "a sender whose stamps are in doubt loses the robot",
         NEUTRAL,
-        "            and now_ns - self._present_ns <= self._timeout_ns\n",
-        "            and False\n",
+        "(now_ns - self._present_ns <= timeout_ns and now_ns - arrived_ns <= PLACE_NS)",
+        "False",
     ),
     fault(
         "neutral set",

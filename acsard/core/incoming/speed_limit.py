@@ -97,9 +97,10 @@ class SpeedLimiter:
         self._waiting: Limit | None = None
         """The limit of the newest message, until it is applied; None if no message waits."""
         self._changed_ns = 0
-        self._robot = self._settings = config
+        self._robot = self.settings = config
         """`_robot` is the robot's configuration, in which the speed limit has lowered the speed.
-        `_settings` is the same configuration as it would be without the speed limit."""
+        `settings` is the configuration that would be in force without the speed limit. It stays the
+        same object until a setting changes."""
         self._asked: tuple[Request, float] | None = None
         """A pair: the client's `set` request in this step that changes the highest speed, and the
         speed that it requests, m/s. None if this step has no such request."""
@@ -108,28 +109,20 @@ class SpeedLimiter:
         takes only one `set` request."""
 
     @property
-    def settings(self) -> Config:
-        """The configuration that would be in force without the speed limit.
-
-        It stays the same object until a setting changes.
-        """
-        return self._settings
-
-    @property
     def lowers(self) -> bool:
         """True while the robot's highest speed is below the setting because of a speed limit.
 
         After the limit is lifted, this stays True until the robot has the higher value again.
         """
-        lowest = min(self._limit.speed, self._robot.limits.linear_speed)
-        return lowest < self._settings.limits.linear_speed
+        setting = self.settings.limits.linear_speed
+        return self._limit.speed < setting or self._robot.limits.linear_speed < setting
 
     @property
     def text(self) -> str:
         """The limit in force with its sender, in words; "" if no limit lowers the highest speed."""
         if not self.lowers:
             return ""
-        setting = self._settings.limits.linear_speed
+        setting = self.settings.limits.linear_speed
         return (
             f"{self._limit.speed:.3g} m/s, set by {self._limit.by}; back to {setting:g} m/s when "
             "this limit ends"
@@ -178,7 +171,7 @@ class SpeedLimiter:
         Raises `ConfigError` if the requested settings would be invalid when the limit ends.
         """
         # Whether a change must wait until the robot stands is checked by the robot itself.
-        made, _ = changed(self._settings, request.settings, at_rest=True)
+        made, _ = changed(self.settings, request.settings, at_rest=True)
         if SETTING not in request.settings:
             return request
         wanted = made.limits.linear_speed
@@ -197,7 +190,7 @@ class SpeedLimiter:
             return ()
         new, self._waiting = self._waiting, None
         self._limit = NONE if math.isinf(new.speed) else new
-        lowest = min(self._settings.limits.linear_speed, new.speed)
+        lowest = min(self.settings.limits.linear_speed, new.speed)
         if lowest == self._robot.limits.linear_speed:
             return ()
         self._changed_ns = now_ns
@@ -213,7 +206,7 @@ class SpeedLimiter:
         speed will apply when the limit ends.
         """
         answers = tuple(answers)
-        speed = self._settings.limits.linear_speed
+        speed = self.settings.limits.linear_speed
         asked, self._asked = self._asked, None
         if asked is not None:
             request, wanted = asked
@@ -227,11 +220,11 @@ class SpeedLimiter:
                         text = f"{answer.message}; {text}"
                     told = replace(answer, message=text)
                     answers = tuple([told if one is answer else one for one in answers])
-        if robot is not self._robot or speed != self._settings.limits.linear_speed:
+        if robot is not self._robot or speed != self.settings.limits.linear_speed:
             self._robot = robot
             limited = self._limit is not NONE
             limits = replace(robot.limits, linear_speed=speed) if limited else robot.limits
-            self._settings = replace(robot, limits=limits) if limited else robot
+            self.settings = replace(robot, limits=limits) if limited else robot
         return answers
 
     @property

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import binascii
 import re
+import struct
 
 from msgspec import Struct
 
@@ -32,6 +33,8 @@ request letters, so a received line with this letter is an echo of a line of the
 # The pattern also restricts the characters of the plain part, because the CRC does not detect zero
 # bytes in front of a line.
 _REPLY = re.compile(rb"([a-dnp0-9., ]*)#([0-9A-F]{2})(?:@([0-9A-F]{20}))?\*([0-9A-F]{4})")
+
+_SAMPLE = struct.Struct(">5H")
 
 
 class Reading(Struct, frozen=True):
@@ -83,5 +86,5 @@ def unseal(line: bytes) -> Checked:
 
 
 def _reading(sample: bytes) -> Reading:
-    mcu_ms, a, b, c, d = (int(sample[start : start + 4], 16) for start in range(0, 20, 4))
+    mcu_ms, a, b, c, d = _SAMPLE.unpack(binascii.unhexlify(sample))
     return Reading(mcu_ms, (a, b, c, d))

@@ -122,7 +122,11 @@ class EchoDetector:
         for place in range(len(sent) - 1, max(0, len(sent) - LINES) - 1, -1):
             if sent[place] != line:
                 continue
-            run, known = self._continued(runs[place - 1] if place else None, wheels), runs[place]
+            before, known = runs[place - 1] if place else None, runs[place]
+            if known is None or (before is not None and known.lines <= before.lines):
+                run = self._continued(before, wheels)
+            else:
+                run = known  # a continued run would not be longer
             if known is None or known.lines < run.lines:
                 runs[place] = known = run
             elif known.slope == STEADY:

@@ -97,7 +97,7 @@ class Encoders:
         if self._most(max(host_ms, mcu_ms)) >= FIELD / 2:
             return "unknown"
         pairs = zip(reading.counts, before.counts, strict=True)
-        a, b, c, d = (_signed(now - then) for now, then in pairs)
+        a, b, c, d = [_signed(now - then) for now, then in pairs]
         if max(abs(a), abs(b), abs(c), abs(d)) > self._most(mcu_ms):
             return "leap"
         angle = self._angle

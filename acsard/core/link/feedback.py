@@ -237,7 +237,7 @@ class Timeline:
         before, end_ns = self._end_ns, at.mono_ns
         if following:
             end_ns -= wire_ns(following, self._baud_rate)
-        end_ns = self._end_ns = max(before, end_ns)
+        end_ns = self._end_ns = end_ns if end_ns > before else before
         self._at, self._rest = at, lines
         self._share_ns = (end_ns - before) / lines
         style, slots = self._style, self._slots
@@ -286,8 +286,9 @@ class Timeline:
         came_ns = self._at.mono_ns
         if following:
             came_ns -= wire_ns(following, self._baud_rate)
-        came_ns = max(came_ns, self._heard_ns)
-        since, self._heard_ns = (came_ns - self._heard_ns) / NS_PER_S, came_ns
+        before_ns = self._heard_ns
+        came_ns = came_ns if came_ns > before_ns else before_ns
+        since, self._heard_ns = (came_ns - before_ns) / NS_PER_S, came_ns
         placed = self._placed(asked_ns, came_ns)
         dt, bridged = self._since_last(placed)
         self._spoilt = False

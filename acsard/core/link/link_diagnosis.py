@@ -126,8 +126,8 @@ class Lateness:
         """
         before_ns, self._looked_ns = self._looked_ns, now_ns
         passed_ns = 0 if before_ns is None else now_ns - before_ns
-        self.step_s = passed_ns / NS_PER_S if passed_ns >= self._least_ns else 0.0
-        late_s = max(self.late_s, self.step_s)
+        step_s = self.step_s = passed_ns / NS_PER_S if passed_ns >= self._least_ns else 0.0
+        late_s = step_s if step_s > self.late_s else self.late_s
         self.late_s = 0.0 if good else late_s
         return good and (late_s > 0.0 or self._simulated)
 

@@ -191,7 +191,8 @@ class FreeRunningTimes:
         self._lossy += lost > 0
         if lost <= 0:
             ahead -= lost
-            self._least = min(self._least, ahead)
+            if ahead < self._least:
+                self._least = ahead
             if drained:
                 self._lag += 0.03 * (min(max(ahead, 0.0), 1.0) - self._lag)
         if since < 1.5 * self._batch * self.usual:
@@ -230,7 +231,7 @@ class FreeRunningTimes:
         time since the last read, both in slots. `lines` is the number of lines in the read.
         `drained` says whether the read took all data that the kernel held.
         """
-        lag = min(self._lag, 0.5)
+        lag = self._lag if self._lag < 0.5 else 0.5
         if ahead < -0.5 + 0.6 * lag:
             return -1
         if not drained:
@@ -244,7 +245,7 @@ class FreeRunningTimes:
             if prompt and alone and since < JUMP:
                 return -1 if ahead > 1 else 0  # the delay grew line by line, so no line is missing
         seen = ahead + 0.5 - 1.4 * lag if prompt else ahead - SURE - held
-        return max(0, math.floor(seen))
+        return math.floor(seen) if seen > 0.0 else 0
 
     # Finding the clock and following it.
 
@@ -512,6 +513,8 @@ class PromptedTimes:
         the usual time between two reads, ns. `_losses` is the share of lost replies."""
         self._several = 0.0
         """Filtered share of the reads that have several lines."""
+        self._batched = False
+        """Whether an adapter holds replies back, so that one read contains several."""
         self._thinking = 0.0
         """Filtered share of the reads in which the reply delay varied more than USB and the
         scheduler cause, but less than an adapter causes."""
@@ -525,11 +528,6 @@ class PromptedTimes:
     def lossy(self) -> bool:
         """Whether an adapter batches the replies, and more of them are lost than `LOSSY` allows."""
         return self._batched and self._losses > LOSSY
-
-    @property
-    def _batched(self) -> bool:
-        """Whether an adapter holds replies back, so that one read contains several."""
-        return self._several > SEVERAL
 
     def left(self, at_ns: int) -> None:
         """Record that a command was written at `at_ns` on the monotonic clock."""
@@ -548,6 +546,7 @@ class PromptedTimes:
         alone, since = lines == 1, at_ns - self._at
         self._at, self._alone, self._since = at_ns, alone, since
         self._several += FAST * ((not alone) - self._several)
+        self._batched = self._several > SEVERAL
         varies = THOUGHT_NS < self._spread < BATCH_NS and not self._batched
         self._thinking += SLOW * (varies - self._thinking)
         if self._batched:
@@ -591,7 +590,7 @@ class PromptedTimes:
         last, before = self._last, self._passed
         lost, self._passed, self._line = before > self._line, line, line
         at = line + (self._shift(line) if self._alone else 0)
-        self._last = at if last is None else max(last, at)
+        self._last = at if last is None or at > last else last
         due_ns = at + int(self._delay or self._soonest)
         if last is None:
             return Placed("prompts", due_ns)
@@ -737,11 +736,12 @@ class PromptedTimes:
         if delay is None or self._batched:
             return 0
         error = self._at - line - delay
-        if abs(error) >= max(delay, 4 * spread):
+        size = abs(error)
+        if size >= delay and size >= 4 * spread:
             return 0  # a host stall
         self._delay = delay + FAST * error
         self._least = min(self._least + LEAST * (delay - self._least), delay + error)
-        self._spread += FAST * (abs(error) - spread)
-        if not JITTER_NS < spread < BATCH_NS or abs(error) > 4 * spread:
+        self._spread += FAST * (size - spread)
+        if not JITTER_NS < spread < BATCH_NS or size > 4 * spread:
             return 0
         return int(error * (1 - (JITTER_NS / spread) ** 2))

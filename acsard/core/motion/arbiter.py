@@ -136,7 +136,10 @@ class _Source:
         senders. In each of these two groups, live senders come before senders that are not live,
         and otherwise the sender that began to send earlier comes first.
         """
-        present = [sender for sender in self.senders.values() if sender.present(now_ns)]
+        present = []
+        for sender in self.senders.values():
+            if sender.present(now_ns):
+                present.append(sender)
         if len(present) < 2:
             return present
         return sorted(

@@ -150,8 +150,9 @@ class Rolling:
         if not (self._skipped or bridged or line.gap or line.turned is not None):
             # Nearly every line takes this shortcut. The code below would give the same result.
             seen = times(speeds, dt)
-            pieces = _some(seen if line.counted is None else line.counted)
-            return Rolled(pieces, NOWHERE, seen, dt, 0.0, 0.0, dt)
+            moved = seen if line.counted is None else line.counted
+            arcs = () if moved == NOWHERE else (moved,)
+            return Rolled(arcs, NOWHERE, seen, dt, 0.0, 0.0, dt)
         # For implausible lines without counts, assume the speed of this line, unless they last too
         # long.
         guessed = self._lost <= MAX_LOST_S or self._skipped <= MAX_LOST

@@ -69,6 +69,8 @@ class Limiter:
         self._wished = self._goal = REST
         """`_wished` is the last requested twist. `_goal` is the same twist, scaled down to the
         speed limits."""
+        self._arrived: _State | None = None
+        """The state in which the robot has reached `_goal` and keeps this speed; None before."""
 
     @property
     def twist(self) -> Twist:
@@ -81,9 +83,11 @@ class Limiter:
         `wished` must be finite.
         """
         if wished is not self._wished:  # most steps have the same command as the step before
-            self._wished = wished
+            self._wished, self._arrived = wished, None
             self._goal = self._kinematics.saturate(self._within_speed(wished), self._wheel_speed)
         goal, now = self._goal, self.state
+        if now is self._arrived:
+            return now.twist
         linear, slope_v = _approach(
             now.twist.linear, goal.linear, now.linear_slope, dt, self._linear
         )
@@ -92,6 +96,8 @@ class Limiter:
         )
         twist = self._fitted(Twist(linear, angular))
         self.state = _State(twist, slope_v, slope_w)
+        if dt > 0.0 and twist == goal and slope_v == slope_w == 0.0:
+            self._arrived = self.state
         return twist
 
     def _fitted(self, twist: Twist) -> Twist:

@@ -102,10 +102,10 @@ class Sender:
         last accepted command: while it goes on sending commands with doubtful stamps, without a
         silence longer than the timeout, and for one timeout after a stall of the daemon.
         """
-        return self.live(now_ns) or (
-            self.arrived_ns is not None
-            and now_ns - self._present_ns <= self._timeout_ns
-            and now_ns - self.arrived_ns <= PLACE_NS
+        arrived_ns, timeout_ns = self.arrived_ns, self._timeout_ns
+        return arrived_ns is not None and (
+            now_ns - arrived_ns <= timeout_ns
+            or (now_ns - self._present_ns <= timeout_ns and now_ns - arrived_ns <= PLACE_NS)
         )
 
     def rank(self, now_ns: int) -> tuple[bool, int]:
@@ -123,7 +123,8 @@ class Sender:
 
     def armed(self, now_ns: int) -> bool:
         """Return whether the sender has sent the zero that lets it drive."""
-        self._settle(now_ns)
+        if self._zero_ns is not None:
+            self._settle(now_ns)
         return self._armed
 
     def require_neutral(self) -> None:

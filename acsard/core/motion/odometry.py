@@ -276,10 +276,13 @@ class Odometry:
         for each piece, with an effective track of `share` times the configured one.
         """
         believed, kinematics = self.checks.wheels.believed, self._kinematics
-        moved = [kinematics.moved(believed(one)) for one in pieces]
+        arcs = []
+        for piece in pieces:
+            distance, angle = kinematics.moved(believed(piece))
+            arcs.append((distance, angle / share))
         if gyro is not None:
-            return [(math.fsum([distance for distance, _ in moved]), gyro.angle)]
-        return [(distance, angle / share) for distance, angle in moved]
+            return [(math.fsum([distance for distance, _ in arcs]), gyro.angle)]
+        return arcs
 
     def _move(
         self,

@@ -88,10 +88,11 @@ class Sanity:
         jump is accepted after enough time. Each speed is a mean over the time that its line covers,
         so the change may have lasted from the middle of one such time to the middle of the next.
         """
-        since = max(feedback.dt, feedback.since)
+        dt, since = feedback.dt, feedback.since
+        since = dt if dt > since else since
         self._since += since
-        longest = max(0.0, self._longest - since)
-        self._longest = max(longest, since)
+        longest = self._longest - since if self._longest > since else 0.0
+        self._longest = longest if longest > since else since
         if feedback.gap:
             self._last = None
             self._rejected.clear()
@@ -126,7 +127,8 @@ class Sanity:
 
         `longest` is the longest time that one of the recent lines covers, s (see `_longest`).
         """
-        return self._settings.wheel_acceleration * max(since, (since + longest) / 2) + SLACK
+        mean = (since + longest) / 2
+        return self._settings.wheel_acceleration * (mean if mean > since else since) + SLACK
 
     def _agrees(self, line: Feedback, longest: float) -> bool:
         """Return whether a line agrees with one of the impossible lines in `_rejected`.

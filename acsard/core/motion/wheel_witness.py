@@ -94,7 +94,7 @@ class Expected:
         slow = self._slow = self._slow + (commanded - self._slow) * dt / (SLOWEST * lag + dt)
         self.commanded = commanded
         follows = speed * commanded > 0.0
-        self.clear = follows and min(abs(speed), abs(commanded)) >= COMMANDED
+        self.clear = follows and abs(speed) >= COMMANDED and abs(commanded) >= COMMANDED
         """Whether a healthy wheel must turn clearly in the direction of the command by now."""
         self.settled = follows and slow * commanded > 0.0
         """Whether even a slow wheel must turn in the direction of the command by now."""
@@ -172,7 +172,8 @@ class Witness:
         rests = self._rests(seen, dt, count) and turns <= SLACK
         driven = self.driven = not still or (self.driven and not rests)
         fastest, least = (size, wish) if size > wish else (wish, size)
-        due = self._due = max(fastest, self._due + (fastest - self._due) * share)
+        due = self._due + (fastest - self._due) * share
+        due = self._due = due if due > fastest else fastest
         moving = size > SLACK and expected.settled
         fast = driven and turns > 1.5 * due + SLACK
         against = moving and speed * goal < 0.0 and turns > 0.3 * size
