@@ -160,7 +160,10 @@ class Commander:
         """
         if self._lead:
             self._lead = False
-            return self._zero(now_ns)
+            # If the zero had a later stamp than the command behind it, the daemon would refuse the
+            # command. The command leaves `_gather_ns` after the zero. With this stamp both have the
+            # same delay, so the daemon need not test the delays of a new sender for longer.
+            return self._zero(self._came_ns - max(1, self._gather_ns))
         if self._wish is None or now_ns < self._hold_until_ns:
             return None
         wish, self._wish = self._wish, None
@@ -188,15 +191,15 @@ class Commander:
             return None
         return self._zero(now_ns)
 
-    def _zero(self, now_ns: int) -> Wish:
-        """Return a zero whose stamp is the present time on the sender's clock.
+    def _zero(self, at_ns: int) -> Wish:
+        """Return a zero whose stamp is the monotonic time `at_ns`, converted to the sender's clock.
 
         With a stamp from another clock, the daemon would assume that the sender's clock has jumped.
         If the sender sends no stamps, the zero does not get a stamp either.
         """
         stamp_ns = self._last.stamp_ns
         if stamp_ns is not None:
-            stamp_ns += now_ns - self._came_ns
+            stamp_ns += at_ns - self._came_ns
         return Wish(REST, stamp_ns, self._last.steady)
 
     @property

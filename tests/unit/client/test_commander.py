@@ -165,14 +165,22 @@ def test_a_sender_drives_while_its_newest_wish_has_a_speed(panel: Panel) -> None
     assert not panel.commander.drives(panel.now)
 
 
-def test_a_wish_keeps_its_stamp_and_added_zeros_are_stamped_by_the_same_clock(panel: Panel) -> None:
-    panel.commander.take(Wish(AHEAD, 1000), panel.now)
-    assert panel.commander.send(panel.now + 3) == Wish(REST, 1003)
+def test_a_wish_keeps_its_stamp_and_the_zero_before_it_is_stamped_earlier(panel: Panel) -> None:
+    stamp_ns = 1000 * NS_PER_S
+    panel.commander.take(Wish(AHEAD, stamp_ns), panel.now)
+    assert panel.commander.send(panel.now + 3) == Wish(REST, stamp_ns - GATHER_NS)
     panel.now += GATHER_NS
-    assert panel.commander.send(panel.now) == Wish(AHEAD, 1000)
-    panel.commander.take(Wish(LEFT, 1000 + 2 * GATHER_NS), panel.now)
-    assert panel.commander.send(panel.now) == Wish(LEFT, 1000 + 2 * GATHER_NS)
-    assert panel.commander.end(panel.now + 5) == Wish(REST, 1005 + 2 * GATHER_NS)
+    assert panel.commander.send(panel.now) == Wish(AHEAD, stamp_ns)
+    panel.commander.take(Wish(LEFT, stamp_ns + 2 * GATHER_NS), panel.now)
+    assert panel.commander.send(panel.now) == Wish(LEFT, stamp_ns + 2 * GATHER_NS)
+    assert panel.commander.end(panel.now + 5) == Wish(REST, stamp_ns + 5 + 2 * GATHER_NS)
+
+
+def test_a_zero_is_stamped_earlier_than_a_command_that_need_not_wait() -> None:
+    commander = Commander(leads=True)
+    commander.take(Wish(AHEAD, 1000), NS_PER_S)
+    assert commander.send(NS_PER_S + 3) == Wish(REST, 999)
+    assert commander.send(NS_PER_S + 3) == Wish(AHEAD, 1000)
 
 
 def test_a_sender_that_stopped_stamping_has_zeros_without_a_stamp(panel: Panel) -> None:
