@@ -16,7 +16,7 @@ from typing import Literal
 import msgspec
 import pytest
 
-from acsard.client.commander import Commander, Wish
+from acsard.client.commander import Commander, Wish, ends_hold
 from acsard.core.config.parsing import parse
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.schema import Header, JointState, Time, Twist, TwistStamped, Vector3
@@ -698,7 +698,7 @@ def test_ros2_control_that_sends_zeros_through_a_clear_is_armed_by_them(
 class Panel(Speaker):
     """The panel publishes a speed at 10 Hz while a button is held, and nothing when it is released.
 
-    `acsard foxglove` sends a zero of its own before the first speed after a silence of 0.3 s. If
+    `acsard foxglove` sends a zero of its own before the first speed after a silence of 1.5 s. If
     `stamped` is true, the panel's messages have stamps, as in a `TwistStamped`.
     """
 
@@ -734,8 +734,27 @@ def test_the_foxglove_panel_drives_when_its_button_is_released_and_pressed_again
     drives(world, lambda: panel.button(FAST, 1.0))
     stop_and_clear(world, lambda: panel.button(FAST, CLEAR_S))
     stands(world, lambda: panel.button(FAST, 2.0))
-    panel.release(0.4)
+    assert ends_hold(world.state, "app")
+    panel.release(2.0)
     drives(world, lambda: panel.button(FAST, 0.5))
+    assert not ends_hold(world.state, "app")
+
+
+@pytest.mark.parametrize(("period", "pause"), [(0.1, 0.35), (0.1, 1.2), (0.5, 0.7), (1.0, 0.2)])
+def test_a_pause_of_the_network_does_not_arm_a_panel_whose_button_is_held(
+    world: World, period: float, pause: float
+) -> None:
+    panel = Panel(world)
+    panel.button(FAST, 4.0, period)
+    assert moved(world, world.now_ns - NS_PER_S)
+    stop_and_clear(world, lambda: panel.button(FAST, 3.0, period))
+    since_ns = world.now_ns
+    for _ in range(3):
+        panel.button(FAST, 1.0, period)
+        panel.release(pause)
+    assert not moved(world, since_ns)
+    panel.release(2.0)
+    drives(world, lambda: panel.button(FAST, 0.2))
 
 
 @pytest.mark.parametrize("period", [0.1, 0.35, 0.5])

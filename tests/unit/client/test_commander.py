@@ -8,6 +8,7 @@ from acsard.client.commander import (
     DRIVES_NS,
     GATHER_NS,
     LONGEST_S,
+    RELEASED_NS,
     SILENCE_NS,
     STALE_NS,
     Commander,
@@ -61,11 +62,19 @@ def test_no_command_is_sent_without_a_new_wish(panel: Panel) -> None:
     assert panel.commander.due_ns() is None
 
 
-def test_the_first_command_after_a_silence_is_preceded_by_a_zero(panel: Panel) -> None:
+def test_the_first_command_after_a_release_is_preceded_by_a_zero(panel: Panel) -> None:
     panel.press(AHEAD)
-    panel.wait(SILENCE_NS)
+    panel.wait(RELEASED_NS)
     panel.press(LEFT)
     assert panel.gone == [REST, AHEAD, REST, LEFT]
+
+
+@pytest.mark.parametrize("every_ns", [SILENCE_NS + 50 * MS, NS_PER_S, 1400 * MS])
+def test_no_zero_is_added_to_the_commands_of_a_held_button_that_come_with_pauses(
+    panel: Panel, every_ns: int
+) -> None:
+    panel.press(AHEAD, times=4, every_ns=every_ns)
+    assert panel.gone == [REST, *[AHEAD] * 4]
 
 
 def test_a_delayed_burst_of_commands_does_not_move_the_robot(panel: Panel) -> None:
