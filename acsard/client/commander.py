@@ -50,6 +50,12 @@ SILENCE_NS = 3 * NS_PER_S // 10
 """Time without a command, ns, after which the robot is assumed to brake. It is a little longer than
 a source's default timeout of 0.25 s."""
 
+RELEASED_NS = 3 * NS_PER_S // 2
+"""Time without input, ns, after which a button or a key that was held counts as released. A shorter
+silence may be a pause of the network. A panel that publishes once a second, as a panel of Foxglove
+does by default, must not seem released between its messages. But the daemon forgets the zero of a
+new sender that is then silent for 2 s, so this time must be shorter."""
+
 GATHER_NS = NS_PER_S // 25
 """Time for which the first command after a silence waits, ns, to see whether a burst follows. A
 panel that sends at 20 Hz sends at most one command in this time. After a burst of more than `CROWD`
@@ -92,8 +98,10 @@ class Commander:
     At most one command waits to be sent. A newer command replaces the waiting command.
 
     Args:
-        leads: whether to send a zero before the first command after each silence. Set this for a
-            sender that sends no zeros of its own.
+        leads: whether to send a zero before the first command, and before the first command after
+            each silence longer than `RELEASED_NS`. Set this for a sender that sends no zeros of its
+            own. After a shorter silence a zero could let the robot drive by a button that was held
+            through a stop and a `clear`.
         gathers: whether the first command after a silence waits for `GATHER_NS`. If several
             commands arrive in this time, a congested link or a stalled process has delayed them. In
             this case, none of them is sent, except the last one if it is a zero. Set this for a
@@ -130,7 +138,7 @@ class Commander:
         """
         silence = None if self._heard_ns is None else now_ns - self._heard_ns
         begins = silence is None or silence > SILENCE_NS
-        if begins:
+        if silence is None or silence > RELEASED_NS:
             self._lead = self._leads
         if begins or (self._crowded and now_ns >= self._hold_until_ns):
             self._burst, self._crowded = 0, False
@@ -160,7 +168,10 @@ class Commander:
         """
         if self._lead:
             self._lead = False
-            return self._zero(now_ns)
+            # If the zero had a later stamp than the command behind it, the daemon would refuse the
+            # command. The command leaves `_gather_ns` after the zero. With this stamp both have the
+            # same delay, so the daemon need not test the delays of a new sender for longer.
+            return self._zero(self._came_ns - max(1, self._gather_ns))
         if self._wish is None or now_ns < self._hold_until_ns:
             return None
         wish, self._wish = self._wish, None
@@ -188,15 +199,15 @@ class Commander:
             return None
         return self._zero(now_ns)
 
-    def _zero(self, now_ns: int) -> Wish:
-        """Return a zero whose stamp is the present time on the sender's clock.
+    def _zero(self, at_ns: int) -> Wish:
+        """Return a zero whose stamp is the monotonic time `at_ns`, converted to the sender's clock.
 
         With a stamp from another clock, the daemon would assume that the sender's clock has jumped.
         If the sender sends no stamps, the zero does not get a stamp either.
         """
         stamp_ns = self._last.stamp_ns
         if stamp_ns is not None:
-            stamp_ns += now_ns - self._came_ns
+            stamp_ns += at_ns - self._came_ns
         return Wish(REST, stamp_ns, self._last.steady)
 
     @property
@@ -275,6 +286,17 @@ def no_command(source: str) -> str:
         f"the daemon receives no command of source {source}; `acsard top` shows whether the daemon "
         "refuses commands"
     )
+
+
+def ends_hold(state: RobotState, source: str) -> bool:
+    """Return whether a key that was pressed before `state` must not drive the robot any more.
+
+    The robot does not follow the commands of `source`, and an operator may not expect it to drive
+    when it can follow them again. The operator must press the key again.
+    """
+    ours = next((one for one in state.sources if one.name == source), None)
+    zero_first = ours is not None and "must send a zero" in ours.waits_for
+    return state.mode in NEVER or state.mode == "waiting" or zero_first
 
 
 def heard(state: RobotState, source: str) -> bool:

@@ -37,6 +37,10 @@ GONE = "daemon"
 """Id of the status message by which viewers learn that the daemon is gone."""
 
 
+RELEASE = "release the button for two seconds, and press it again"
+"""Advice to an operator whose panel must send a zero. See `commander.RELEASED_NS`."""
+
+
 class Bridge:
     def __init__(
         self,
@@ -183,7 +187,9 @@ class Bridge:
             if told.look(why, now_ns):
                 stays = f"drive {client}"
                 if told.told:
-                    words = f"your commands do not drive the robot: {told.told}"
+                    zero_first = "must send a zero" in told.told
+                    mend = f" ({RELEASE})" if zero_first else ""
+                    words = f"your commands do not drive the robot: {told.told}{mend}"
                     self._notices.say("warning", "drive", words, stays=stays)
                 else:
                     self._notices.over(stays)

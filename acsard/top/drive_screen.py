@@ -131,8 +131,8 @@ def refused(objection: str) -> str:
     `objection` is the reason. If the robot requires a zero command, the sentence also says how to
     send it with the keys.
     """
-    release = " (release the key, and press it again)" if "must send a zero" in objection else ""
-    return f"your keys do not drive the robot: {printable(objection)}{release}"
+    mend = " (press space, then press the key again)" if "must send a zero" in objection else ""
+    return f"your keys do not drive the robot: {printable(objection)}{mend}"
 
 
 def asked(seen: Teleop) -> str:

@@ -5,13 +5,29 @@ A terminal reports a key press but never its release. Each press therefore drive
 When the time of the last press or repeat is over, `acsard drive` sends three zero commands and then
 nothing. If this program was not running for more than 0.5 s, the keys that the operator typed in
 that time do not drive the robot.
+
+A key that was pressed before a stop must not drive the robot after the `clear`, even if an SSH
+connection pauses and the key seems to be released. So if the robot ceases to follow while a key is
+held, the key drives again only after a key that stops, or after 1.5 s without a driving key.
 """
 
 from __future__ import annotations
 
+import math
+
 from acsard.client import Client
-from acsard.client.commander import GRACE_S, ZEROS, Commander, Wish, objection
-from acsard.client.follower import Watch
+from acsard.client.commander import (
+    GRACE_S,
+    NEVER,
+    RELEASED_NS,
+    ZEROS,
+    Commander,
+    Wish,
+    ends_hold,
+    objection,
+)
+from acsard.client.driving import SETTLED_S
+from acsard.client.follower import Watch, restarted
 from acsard.core.values import NS_PER_S, REST, Twist
 from acsard.host import clock
 from acsard.top.drive_screen import Teleop
@@ -40,7 +56,8 @@ BURST_S = 0.2
 """Time after the arrival of delayed keys, s, in which all further keys count as delayed too. One
 read from the terminal may not return all the delayed keys."""
 
-STOP = " "
+OVER = "the robot did not follow while this key was held: press space, then press the key again"
+"""The reason why a key does not drive although the robot could follow."""
 
 _MOVES = {
     "i": (1, 0), "o": (1, -1), "u": (1, 1), "j": (0, 1), "l": (0, -1),
@@ -59,8 +76,12 @@ class Keyboard:
     def __init__(self, linear: float, angular: float) -> None:
         self.linear, self.angular = linear, angular
         self._move = (0, 0)
-        self._pressed, self._repeats = 0.0, 0
-        """Monotonic time of the last press of a driving key, s, and number of its repeats."""
+        self._pressed, self._repeats = -math.inf, 0
+        """Monotonic time of the last press of a driving key, s, and number of its repeats. After a
+        key that stops, the time is minus infinity."""
+        self._begun, self._over = 0.0, False
+        """Monotonic time at which the present hold began, s, and whether `end_hold` has ended it.
+        Driving keys belong to one hold if they are at most `RELEASED_NS` apart."""
         self._until = 0.0
         self._old_until = 0.0
         """Monotonic time until which all keys count as delayed and only stop the robot, s."""
@@ -78,7 +99,11 @@ class Keyboard:
         if len(keys) > BURST or waited > GRACE_S:
             self._old_until = now + BURST_S
         if now < self._old_until and (keys or now < self._until):
-            keys = [STOP]
+            if not self._over:
+                self._stop(now)
+            if keys:
+                self._pressed = now  # a key may have been held all the time
+            return
         for key in keys:
             self.press(key, now)
 
@@ -91,11 +116,35 @@ class Keyboard:
             repeated = self._move == _MOVES[key] and now - self._pressed < REPEAT_S
             self._repeats = self._repeats + 1 if repeated else 0
             hold = REPEAT_S if self._repeats >= REPEATS else HOLD_S
-            self._move, self._pressed = _MOVES[key], now
-            self._until, self._zeros = now + hold, ZEROS
+            if not self._held(now):
+                self._begun, self._over = now, False
+            self._pressed = now
+            if not self._over:
+                self._move, self._until, self._zeros = _MOVES[key], now + hold, ZEROS
         else:
             # Any other key stops the robot, as in teleop_twist_keyboard.
-            self._move, self._until, self._zeros = (0, 0), now, ZEROS
+            self._pressed, self._over = -math.inf, False
+            self._stop(now)
+
+    def end_hold(self, now: float) -> None:
+        """Stop the robot, and ignore the key that is held at `now` (monotonic clock, s).
+
+        Call this when a state that has just arrived shows that the robot does not follow. The call
+        has no effect if the state may be older than the hold.
+        """
+        if self._held(now) and not self._over and now - self._begun > SETTLED_S:
+            self._over = True
+            self._stop(now)
+
+    def ignores(self, now: float) -> bool:
+        """Return whether the key that is held at `now` (monotonic clock, s) has no effect."""
+        return self._over and self._held(now)
+
+    def _held(self, now: float) -> bool:
+        return now - self._pressed <= RELEASED_NS / NS_PER_S
+
+    def _stop(self, now: float) -> None:
+        self._move, self._until, self._zeros = (0, 0), now, ZEROS
 
     def wish(self, now: float) -> Twist | None:
         """Return the command to send at `now` (monotonic clock, s), or None to send nothing."""
@@ -132,13 +181,17 @@ class Ride:
         sent = self._commander.send(now_ns)
         if sent is not None:
             self._robot.send(sent.twist.linear, sent.twist.angular)
-        if sent is None or sent.twist == REST:
+        if (sent is None or sent.twist == REST) and not self._keyboard.ignores(now):
             self._fine = now
         self.take()
 
     def take(self) -> None:
         """Process the states that have arrived, and query the state if it is late."""
-        self._watch.look(clock.steady_s())
+        now, before = clock.steady_s(), self._watch.state
+        for state in self._watch.look(now):
+            if ends_hold(state, self._robot.source) or restarted(before, state):
+                self._keyboard.end_hold(now)
+            before = state
 
     def end(self) -> None:
         """Send the final zero commands, which stop the robot."""
@@ -150,6 +203,8 @@ class Ride:
         why = ""
         if watch.state is not None and now - self._fine > GRACE_S:
             why = objection(watch.state, robot.source, robot.sender)
+            if self._keyboard.ignores(now) and watch.state.mode not in (*NEVER, "waiting"):
+                why = OVER
         return Teleop(
             robot.where.robot_id,
             robot.where.endpoint,

@@ -468,6 +468,7 @@ def test_a_viewer_whose_commands_do_not_drive_sees_the_reason_until_they_do(
     with Panel(viewer, speed(0.2)):
         told = viewer.status("your commands do not drive the robot: stopped by unnamed (native) at")
         assert bus.get("srv/clear")["success"]
+        viewer.status("drive (release the button for two seconds, and press it again)")
     until(lambda: told["id"] in viewer.removed, 5.0, "it is over")
 
 

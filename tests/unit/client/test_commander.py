@@ -8,6 +8,7 @@ from acsard.client.commander import (
     DRIVES_NS,
     GATHER_NS,
     LONGEST_S,
+    RELEASED_NS,
     SILENCE_NS,
     STALE_NS,
     Commander,
@@ -61,11 +62,19 @@ def test_no_command_is_sent_without_a_new_wish(panel: Panel) -> None:
     assert panel.commander.due_ns() is None
 
 
-def test_the_first_command_after_a_silence_is_preceded_by_a_zero(panel: Panel) -> None:
+def test_the_first_command_after_a_release_is_preceded_by_a_zero(panel: Panel) -> None:
     panel.press(AHEAD)
-    panel.wait(SILENCE_NS)
+    panel.wait(RELEASED_NS)
     panel.press(LEFT)
     assert panel.gone == [REST, AHEAD, REST, LEFT]
+
+
+@pytest.mark.parametrize("every_ns", [SILENCE_NS + 50 * MS, NS_PER_S, 1400 * MS])
+def test_no_zero_is_added_to_the_commands_of_a_held_button_that_come_with_pauses(
+    panel: Panel, every_ns: int
+) -> None:
+    panel.press(AHEAD, times=4, every_ns=every_ns)
+    assert panel.gone == [REST, *[AHEAD] * 4]
 
 
 def test_a_delayed_burst_of_commands_does_not_move_the_robot(panel: Panel) -> None:
@@ -165,14 +174,22 @@ def test_a_sender_drives_while_its_newest_wish_has_a_speed(panel: Panel) -> None
     assert not panel.commander.drives(panel.now)
 
 
-def test_a_wish_keeps_its_stamp_and_added_zeros_are_stamped_by_the_same_clock(panel: Panel) -> None:
-    panel.commander.take(Wish(AHEAD, 1000), panel.now)
-    assert panel.commander.send(panel.now + 3) == Wish(REST, 1003)
+def test_a_wish_keeps_its_stamp_and_the_zero_before_it_is_stamped_earlier(panel: Panel) -> None:
+    stamp_ns = 1000 * NS_PER_S
+    panel.commander.take(Wish(AHEAD, stamp_ns), panel.now)
+    assert panel.commander.send(panel.now + 3) == Wish(REST, stamp_ns - GATHER_NS)
     panel.now += GATHER_NS
-    assert panel.commander.send(panel.now) == Wish(AHEAD, 1000)
-    panel.commander.take(Wish(LEFT, 1000 + 2 * GATHER_NS), panel.now)
-    assert panel.commander.send(panel.now) == Wish(LEFT, 1000 + 2 * GATHER_NS)
-    assert panel.commander.end(panel.now + 5) == Wish(REST, 1005 + 2 * GATHER_NS)
+    assert panel.commander.send(panel.now) == Wish(AHEAD, stamp_ns)
+    panel.commander.take(Wish(LEFT, stamp_ns + 2 * GATHER_NS), panel.now)
+    assert panel.commander.send(panel.now) == Wish(LEFT, stamp_ns + 2 * GATHER_NS)
+    assert panel.commander.end(panel.now + 5) == Wish(REST, stamp_ns + 5 + 2 * GATHER_NS)
+
+
+def test_a_zero_is_stamped_earlier_than_a_command_that_need_not_wait() -> None:
+    commander = Commander(leads=True)
+    commander.take(Wish(AHEAD, 1000), NS_PER_S)
+    assert commander.send(NS_PER_S + 3) == Wish(REST, 999)
+    assert commander.send(NS_PER_S + 3) == Wish(AHEAD, 1000)
 
 
 def test_a_sender_that_stopped_stamping_has_zeros_without_a_stamp(panel: Panel) -> None:

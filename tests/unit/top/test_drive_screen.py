@@ -66,11 +66,13 @@ def test_help_stays_on_a_screen_of_few_lines() -> None:
     assert shown[-len(HELP) :] == list(HELP)
 
 
-def test_a_refused_key_that_is_held_must_be_released() -> None:
+def test_a_refused_key_must_be_pressed_again_after_space() -> None:
     why = "send a zero first: teleop must send a zero before it can drive"
     told = " ".join(news(replace(SEEN, objection=why), 200))
-    assert f"your keys do not drive the robot: {why} (release the key, and press it again)" in told
-    assert "let go" not in " ".join(news(replace(SEEN, objection="stopped by anna"), 200))
+    assert (
+        f"your keys do not drive the robot: {why} (press space, then press the key again)" in told
+    )
+    assert "press space" not in " ".join(news(replace(SEEN, objection="stopped by anna"), 200))
 
 
 def test_keys_that_do_not_drive_are_reported() -> None:

@@ -11,13 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from acsard.client.commander import GRACE_S, ZEROS
+from acsard.client.commander import GRACE_S, RELEASED_NS, ZEROS
 from acsard.client.follower import SILENT_S
-from acsard.core.messages.schema import RobotState
+from acsard.core.messages.schema import RobotState, SourceState
 from acsard.core.values import NS_PER_S, REST, Twist
 from acsard.daemon.bus.address import Address
 from acsard.host import clock
-from acsard.top.keyboard import HOLD_S, REPEAT_S, Keyboard, Ride, split
+from acsard.top.keyboard import HOLD_S, OVER, REPEAT_S, Keyboard, Ride, split
 from tests.each import each
 from tests.unit.top.screens import STATE, sample_of
 
@@ -210,7 +210,7 @@ class Drive:
 def test_only_a_drive_after_a_silence_is_led_by_a_zero(monkeypatch: pytest.MonkeyPatch) -> None:
     robot = Robot()
     drive = Drive(robot, monkeypatch)
-    drive.step(times=20)
+    drive.step(times=40)
     assert robot.sent == [0.0] * ZEROS
     robot.sent.clear()
     drive.step("i", times=3)
@@ -324,6 +324,114 @@ def test_the_first_key_drives_however_long_the_bus_took_to_subscribe(
     assert robot.sent == [0.0, 0.5]
 
 
+STOPPED = replace(STATE, mode="stopped", reason="stopped by request", source="")
+ZERO_FIRST = replace(
+    STATE,
+    mode="ready",
+    reason="ready: send a zero first: teleop must send a zero before it can drive",
+    sources=[
+        SourceState("teleop", 10, 0.1, "send a zero first: teleop must send a zero before it can")
+    ],
+)
+RESTARTED = replace(STATE, counters={"lines": 0})
+
+NOT_FOLLOWING = [
+    *(replace(STOPPED, mode=mode) for mode in ("stopped", "fault", "inactive", "waiting")),
+    ZERO_FIRST,
+    RESTARTED,
+]
+
+
+class Held(Drive):
+    """A ride with a key that is held until a state shows that the robot does not follow."""
+
+    def __init__(self, why: RobotState, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.robot = Robot(replace(STATE, counters={"lines": 9}))
+        super().__init__(self.robot, monkeypatch)
+        self.step(times=5)
+        self.step("i", times=20)
+        assert self.robot.sent[-1] == 0.5
+        self.robot.said.append(sample_of(why))
+        self.step("i")
+        self.robot.sent.clear()
+
+    def drives(self, typed: str, times: int = 20) -> bool:
+        """Return whether a speed is sent while this is typed at each step."""
+        sent = len(self.robot.sent)
+        self.step(typed, times)
+        return any(self.robot.sent[sent:])
+
+
+@each("why", NOT_FOLLOWING)
+@each("pause", [0.0, 0.4, 1.0])
+def test_a_key_that_is_held_while_the_robot_ceases_to_follow_does_not_drive_after_a_pause(
+    why: RobotState, pause: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held = Held(why, monkeypatch)
+    assert not held.drives("i")
+    held.robot.said.append(sample_of(STATE))
+    assert not held.drives("", round(pause / 0.05))
+    assert not held.drives("i")
+
+
+def test_delayed_keys_do_not_release_a_key_that_no_longer_drives(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    held = Held(STOPPED, monkeypatch)
+    held.robot.said.append(sample_of(STATE))
+    held.step(times=60)
+    held.step(45 * "i")
+    assert not held.drives("i", 40)
+
+
+@each("key", [" ", "k"])
+def test_a_key_that_no_longer_drives_does_so_after_a_key_that_stops(
+    key: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held = Held(ZERO_FIRST, monkeypatch)
+    held.step("i", times=10)
+    held.robot.sent.clear()
+    held.step(key)
+    held.step("i", times=2)
+    assert held.robot.sent == [0.0, 0.5, 0.5]
+
+
+def test_a_key_that_no_longer_drives_does_so_after_its_release(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    held = Held(ZERO_FIRST, monkeypatch)
+    held.step("i", times=10)
+    held.step(times=round(RELEASED_NS / NS_PER_S / 0.05) + 2)
+    held.robot.sent.clear()
+    held.step("i", times=3)
+    assert held.robot.sent == [0.0, 0.5, 0.5]
+
+
+def test_a_state_from_before_a_press_does_not_end_the_hold(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    robot = Robot()
+    drive = Drive(robot, monkeypatch)
+    drive.step(times=50)
+    drive.step("i")
+    robot.said.append(sample_of(STOPPED))
+    drive.step("i", times=20)
+    assert robot.sent[-1] == 0.5
+
+
+def test_the_operator_is_informed_that_a_held_key_no_longer_drives(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    held = Held(STOPPED, monkeypatch)
+    held.step("i", times=12)
+    assert held.ride.seen().objection == "stopped by request"
+    held.robot.said.append(sample_of(replace(STATE, mode="ready", source="")))
+    held.step("i", times=12)
+    assert held.ride.seen().objection == OVER
+    held.step(" ")
+    assert held.ride.seen().objection == ""
+
+
 def test_a_space_stops_at_the_next_step(monkeypatch: pytest.MonkeyPatch) -> None:
     robot = Robot()
     drive = Drive(robot, monkeypatch)
@@ -346,7 +454,7 @@ def test_the_operator_is_informed_why_keys_have_no_effect(monkeypatch: pytest.Mo
     robot = Robot(stopped)
     drive = Drive(robot, monkeypatch)
     drive.step(times=10)
-    drive.step("i", times=round(GRACE_S / 0.05))
+    drive.step("i", times=round(GRACE_S / 0.05) - 2)
     assert drive.ride.seen().objection == ""
-    drive.step("i", times=3)
+    drive.step("i", times=4)
     assert drive.ride.seen().objection == "stopped by request"
