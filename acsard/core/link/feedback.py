@@ -369,6 +369,9 @@ class Timeline:
 
     def _compare(self, answered: Placed, slot: Placed) -> None:
         later_ns = answered.due_ns - slot.due_ns
+        if abs(later_ns) > self._quiet_ns / 4:
+            # After a stall, the line may answer another command than the oldest one.
+            return
         if slot.dt is None or self._last_placed.clock != "slots":
             self._later = float(later_ns)
         self._later += LATER * (later_ns - self._later)
