@@ -306,7 +306,7 @@ def test_a_host_stall_is_not_called_a_silence_of_the_board() -> None:
     with world.mcu.mute():
         world.run(0.05)
         world.stall(0.2)
-        world.run(0.02)
+        world.run(0.05)
     world.hold(0.5, seconds=1.0)
     with world.mcu.mute():
         world.run(0.2)

@@ -99,7 +99,7 @@ def test_a_host_stall_does_not_count_as_a_loss_of_the_link() -> None:
         world.drive(0.5, seconds=0.5)
         with world.mcu.mute():
             world.stall(0.2)
-            world.run(0.02)
+            world.run(0.05)
 
     report, _ = report_of(late)
     assert summary(report).endswith("no stops, 1 stall of the robot's computer.")

@@ -185,6 +185,15 @@ def test_at_the_wheel_limit_the_robot_speeds_up_as_its_turn_slows_down() -> None
     assert pair(first) == approx(0.08 * 0.15, 3.92)
 
 
+def test_the_wheel_limit_counts_also_if_both_axes_speed_up() -> None:
+    """The smaller left wheel turns faster straight ahead than in the curve to the left."""
+    kinematics = Kinematics(DriveConfig(left_wheel_radius_multiplier=0.5))
+    quick = msgspec.structs.replace(TALL, linear_acceleration=100.0, wheel_speed=30.0)
+    first = Limiter(quick, kinematics).follow(Twist(1.0, 3.0), 0.01)
+    assert max(map(abs, kinematics.wheel_speeds(first).as_tuple())) == pytest.approx(30.0)
+    assert first.linear < 1.0
+
+
 corners = st.builds(Twist, st.sampled_from((-1.0, 0.0, 1.0)), st.sampled_from((-4.0, 0.0, 4.0)))
 
 
