@@ -130,10 +130,14 @@ class Keyboard:
         """Stop the robot, and ignore the key that is held at `now` (monotonic clock, s).
 
         Call this when a state that has just arrived shows that the robot does not follow. The call
-        has no effect if the state may be older than the hold.
+        has no effect if the state may be older than the hold. If no key seems to be held, a network
+        may still delay the repeats of one, and these have no effect either.
         """
-        if self._held(now) and not self._over and now - self._begun > SETTLED_S:
-            self._over = True
+        held = self._held(now)
+        if self._over or (held and now - self._begun <= SETTLED_S):
+            return
+        self._over = True
+        if held:
             self._stop(now)
 
     def ignores(self, now: float) -> bool:

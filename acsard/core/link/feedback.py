@@ -205,6 +205,8 @@ class Timeline:
         self._later = 0.0
         """Mean difference between two times of the same line, ns: the time that `PromptedTimes`
         gives minus the time that `FreeRunningTimes` gives."""
+        self._compared = False
+        """Whether the last difference is part of this mean. The first one of a series starts it."""
         self.leaps = 0
         """Number of lines with impossible encoder counts. For such a line, the angle that a wheel
         turned is computed as speed times time."""
@@ -371,9 +373,10 @@ class Timeline:
         later_ns = answered.due_ns - slot.due_ns
         if abs(later_ns) > self._quiet_ns / 4:
             # After a stall, the line may answer another command than the oldest one.
+            self._compared = False
             return
-        if slot.dt is None or self._last_placed.clock != "slots":
-            self._later = float(later_ns)
+        if slot.dt is None or self._last_placed.clock != "slots" or not self._compared:
+            self._later, self._compared = float(later_ns), True
         self._later += LATER * (later_ns - self._later)
 
     def _late_ns(self, clock: str) -> float:

@@ -130,8 +130,9 @@ class Link:
     def wait(self, now_ns: int) -> None:
         """Let the board answer for a third of `quiet_ns`, but only once after each good line.
 
-        The caller does this if it sent no line for a while, so that the board had nothing to
-        answer.
+        The caller does this if it sent no line for a while, so that the board may have had nothing
+        to answer. So the link becomes stale at the latest `quiet_ns` plus the duration of the stall
+        plus `quiet_ns` / 3 after the last good line.
         """
         if self.state == "up" and not self._waited:
             self._waited = True

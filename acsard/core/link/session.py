@@ -75,6 +75,8 @@ class McuSession:
         self.codec = Codec(mcu.wheels, mcu.trailing_comma)
         self._rest = self.codec.stop.rstrip(b",\r\n")
         """The first bytes of every line, plain or checked, with speed zero for all wheels."""
+        self._answers = not mcu.reply_period
+        """Whether the board answers lines, so that it may be silent because it got none."""
         self._lines = LineReader()
         self._needs_check = mcu.link_check == "require"
         self.statuses: list[tuple[int, BoardStatus]] = []
@@ -166,9 +168,10 @@ class McuSession:
                 self._bad()
             if self.lateness.look(now.mono_ns, good=bool(feedback)):
                 self._link.excuse()
-            if 0.0 < self.lateness.step_s < WATCHDOG_S and not feedback:
-                # The board had nothing to answer while this computer sent nothing. If it has not
-                # stopped the motors yet, a stop without a ramp would only shake the robot.
+            if 0.0 < self.lateness.step_s < WATCHDOG_S and self._answers and not feedback:
+                # The board may have had nothing to answer, because this computer sent nothing. If
+                # its watchdog has not stopped the motors yet, a stop without a ramp would only
+                # shake the robot. `Robot` makes such a stop anyway after `UNHEARD_S`.
                 self._link.wait(now.mono_ns)
             self._judge(now.mono_ns)
         if self._rejected:

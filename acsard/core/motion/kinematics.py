@@ -87,9 +87,9 @@ class Kinematics:
         return Twist(twist.linear * scale, twist.angular * scale)
 
     def room(self, kept: Twist, added: Twist, wheel_speed: float) -> float:
-        """Return the largest share of `added`, 0 to 1, that `kept` leaves room for.
+        """Return the largest share of `added`, 0 to 1, that can be added to `kept`.
 
-        With a larger share, a wheel would exceed `wheel_speed` rad/s.
+        No wheel may exceed `wheel_speed` rad/s. The share is 0 if `kept` alone exceeds it.
         """
         first, second, share = self.wheel_speeds(kept), self.wheel_speeds(added), 1.0
         sides = (first.front_right, second.front_right), (first.front_left, second.front_left)

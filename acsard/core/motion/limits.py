@@ -105,7 +105,8 @@ class Limiter:
 
         Each axis changes at its own rate. In between, both axes together may need a faster wheel
         than at the start or at the goal. If one axis speeds up while the other one slows down, only
-        the former is reduced, because the latter would exceed its deceleration.
+        the former is reduced, because the latter would exceed its deceleration. If the radii of the
+        wheels differ, both axes may be reduced although both slow down.
         """
         kinematics, most, now = self._kinematics, self._wheel_speed, self.twist
         fitted = kinematics.saturate(twist, most)

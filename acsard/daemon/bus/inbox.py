@@ -160,8 +160,8 @@ class Inbox:
     ) -> None:
         """Start with empty buffers.
 
-        `prefix` is the begin of the robot's keys, `sources` are the names of its command sources,
-        and `rate_hz` is the control rate. `waker` wakes the control loop.
+        `prefix` is the beginning of the robot's keys, and `sources` are the names of its command
+        sources. `waker` wakes the control loop, which makes `rate_hz` steps a second.
         """
         self.own_id: zenoh.TimestampId | None = None
         """The id in the timestamps that the daemon's session makes. The session stamps each sample

@@ -384,6 +384,21 @@ def test_delayed_keys_do_not_release_a_key_that_no_longer_drives(
     assert not held.drives("i", 40)
 
 
+def test_delayed_keys_do_not_drive_if_the_robot_was_stopped_late_in_their_delay(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The connection stalls for 3 s with the key held. The stop and the clear come after 2 s."""
+    held = Held(STATE, monkeypatch)
+    held.step("i", times=10)
+    held.step(times=40)
+    held.robot.said.append(sample_of(STOPPED))
+    held.step(times=2)
+    held.robot.said.append(sample_of(STATE))
+    held.step(times=18)
+    held.step(90 * "i")
+    assert not held.drives("i", 40)
+
+
 @each("key", [" ", "k"])
 def test_a_key_that_no_longer_drives_does_so_after_a_key_that_stops(
     key: str, monkeypatch: pytest.MonkeyPatch

@@ -12,6 +12,7 @@ from acsard.core.config.settings import McuConfig, WheelMap
 from acsard.core.link.checked_line import Reading
 from acsard.core.link.codec import Codec
 from acsard.core.link.feedback import Feedback, ReplyStyle, Timeline
+from acsard.core.link.sample_time import Placed
 from acsard.core.values import Instant, WheelSpeeds
 
 MS = 1_000_000
@@ -338,6 +339,17 @@ def test_a_stall_counts_once_if_replies_name_their_line_and_many_are_lost() -> N
         total += bench.timeline.place(SPEEDS, None, 0, LENGTH, number == 100, left_ns).dt
         if number > 90:
             assert total == pytest.approx((left_ns - began_ns) / 1e9, abs=0.005), number
+
+
+def test_a_line_whose_two_times_are_a_stall_apart_leaves_their_mean_difference_as_it_is() -> None:
+    timeline = Bench().timeline
+    for later_ms, dt, mean_ms in (
+        (8.0, None, 8.0), (8.0, 0.01, 8.0), (-1100.0, 0.01, 8.0), (6.0, 0.01, 6.0), (6.0, 0.01, 6.0)
+    ):  # fmt: skip
+        slot = Placed("slots", 9000 * MS, dt)
+        timeline._compare(Placed("prompts", slot.due_ns + int(later_ms * MS)), slot)
+        timeline._last_placed = slot
+        assert timeline._late_ns("prompts") == pytest.approx(mean_ms * MS)
 
 
 def test_a_change_of_the_clock_neither_adds_nor_loses_time() -> None:

@@ -619,6 +619,13 @@ def test_an_mcu_that_restarted_gets_a_stop_without_delay() -> None:
     assert bench.line() == bench.session.codec.stop
 
 
+def test_a_board_that_reports_by_its_own_clock_gets_no_more_time_behind_a_late_step() -> None:
+    """Its lines wait for the late step, so a step without a line shows that it is silent."""
+    bench = Bench(McuConfig(reply_period=0.02)).up()
+    bench.wait(150)
+    assert bench.link() == "stale"
+
+
 def test_a_silent_mcu_gets_stops_at_ten_hertz() -> None:
     bench = Bench().up()
     for _ in range(3):
