@@ -667,11 +667,11 @@ class Inputs:
         battery, witness = self.battery, self._witness
         if not battery.bounds:
             return
+        self._emptied |= battery.may["stop"] or not battery.sure
         if not battery.sure:
             self._doubtful = True
             witness.perhaps_latched.add("clear")
             return
-        self._emptied |= battery.may["stop"]
         if battery.may["stop"] and seen.mode == "stopped" != self._mode and not witness.stops:
             witness.counts["battery empty"] += 1
             witness.stops.append(true_ns)
