@@ -327,7 +327,8 @@ class Inputs:
         the robot was last released. This outlasts a restart of the daemon."""
         self._emptied = False
         """Whether an empty battery may have stopped the robot. This outlasts a restart."""
-        self._field = b"volts" if config.get("battery", {}).get("measure") == "volts" else b"charge"
+        measure = config.get("battery", {}).get("measure", "volts")
+        self._field = b"volts" if measure == "volts" else b"charge"
         self.new_life()
 
     def new_life(self) -> None:
