@@ -173,6 +173,8 @@ class Rolling:
                 pieces = _some(line.counted, times(speeds, lost))
             if bridged:
                 first, second = before.as_tuple(), speeds
+                # A running daemon commands rest after `quiet`. After an earlier command to rest,
+                # the wheels also need about this time to slow down.
                 stops = max(self._quiet, driven)
                 doubtful = max(0.0, min(bridged, WATCHDOG_S) - stops)
                 if self._quiet < driven < bridged:
